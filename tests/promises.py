@@ -15,7 +15,7 @@ FLAWS = "tests/packages/test_known_flaws.py"
 MEMBERS = "tests/app/platform/test_json_members.py"
 PAGES, SIGN_IN = "tests/app/pages/test_page_roles.py", "tests/app/pages/test_sign_in_pages.py"
 SEALING, BACKUP = "tests/app/platform/upkeep/test_sealing.py", "tests/app/platform/upkeep/test_backup.py"
-DAMAGED = "tests/app/ingest/uploads/test_damaged_files.py"
+DAMAGED, INTERRUPTED = "tests/app/ingest/uploads/test_damaged_files.py", "tests/app/ingest/uploads/test_interrupted.py"
 LOCKS, LOCK_SIGNED = "tests/app/study/visits/test_visit_locks.py", "tests/app/study/visits/test_lock_signatures.py"
 PLANS, KEY = "tests/app/planning/plans/test_sign_off.py", "tests/app/planning/plans/test_sealed_key.py"
 RELEASES, MARGINS = "tests/app/planning/releases/test_releases.py", "tests/app/study/test_margin_signatures.py"
@@ -343,6 +343,45 @@ PROMISES = [
          f"{BACKUP}::test_the_doctor_finds_what_is_missing_damaged_or_standing_open"),
         ("the doctor sees folders that stand open", "f.is_dir() and f.stat().st_mode & 0o077]", "False]",
          f"{BACKUP}::test_the_doctor_finds_what_is_missing_damaged_or_standing_open"),
+    ),
+    *_of(
+        "ingest/uploads/service",
+        ("an upload that a full disk cut short is told so", "        if beneath is not None:\n            self.status,",
+         "        if False:\n            self.status,",
+         f"{INTERRUPTED}::test_a_fault_after_the_bytes_are_safe_tells_so_and_is_mended_without_a_restart"),
+        ("a full disk leaves no upload without sessions", "        if passing(fault) is not None:\n            raise  # they are made",
+         "        if False:\n            raise  # they are made",
+         f"{INTERRUPTED}::test_a_disk_that_stays_full_is_no_fault_of_the_file"),
+    ),
+    *_of(
+        "ingest/uploads/receiving",
+        ("a full disk is no fault of the file", "            if passing(fault) is not None:\n", "            if False:\n",
+         f"{INTERRUPTED}::test_a_disk_that_stays_full_is_no_fault_of_the_file"),
+    ),
+    *_of(
+        "ingest/uploads/in_progress",
+        ("a full disk counts against no file", "                take_back()\n", "                pass\n",
+         f"{INTERRUPTED}::test_a_disk_that_stays_full_is_no_fault_of_the_file"),
+        ("a database that dies hides nothing that is kept", "            with suppress(DBAPIError):\n", "            if True:\n",
+         f"{INTERRUPTED}::test_a_database_that_dies_during_an_upload_does_not_hide_what_is_kept"),
+    ),
+    *_of(
+        "platform/errors",
+        ("a full disk is told as one", "if isinstance(error, OSError) and error.errno in FULL:", "if False:",
+         "tests/app/platform/test_healing.py::test_what_fails_beneath_is_told_in_true_words"),
+        ("a database that is away is told as one", "    if invalidated or unreached or state[:2] in _AWAY or state[:3] in _AWAY:\n",
+         "    if False:\n", "tests/app/platform/test_healing.py::test_what_fails_beneath_is_told_in_true_words"),
+    ),
+    *_of(
+        "platform/logs",
+        ("a log on a full disk costs no answer", "        with suppress(OSError):\n            self._stream.write(text)\n",
+         "        self._stream.write(text)\n", "tests/app/platform/test_logs.py::test_a_log_on_a_full_disk_loses_lines_and_no_answers"),
+    ),
+    *_of(
+        "platform/jobs/children/child",
+        ("a step on a full disk says so", 'return "full" if error.errno in FULL else "error"', 'return "error"',
+         "tests/app/platform/jobs/test_children.py::test_a_full_disk_is_told_from_a_fault_of_the_step"),
+        at_start=True,
     ),
     *_of(
         "platform/web/middleware",

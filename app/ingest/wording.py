@@ -7,6 +7,7 @@ from typing import Any
 
 from app.ingest.models import ColumnMapping
 from app.ingest.proposals.evidence import Evidence, Reason, Source, stored_courses
+from app.platform.errors import BetaloopError, DatabaseAway, GivenUp, StorageFull
 from app.study.models import Recording
 from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern
 
@@ -60,11 +61,18 @@ def progress(file: int, files: int, share: float, doing: str) -> str:
     return f"{of}{doing}, {100 * share:.0f} %" if doing else f"{of}receiving"
 
 
-def cut_short(upload_id: int, kept: int, of: int) -> tuple[str, str]:
-    """What was kept of an upload that a fault of ours ended, and what becomes of it."""
+def cut_short(upload_id: int, kept: int, of: int, beneath: BetaloopError | None = None) -> tuple[str, str]:
+    """What was kept of an upload that a fault ended, ours or one `beneath` the service that passes, and what becomes of it."""
     what = f"Upload {upload_id} was cut short: the bytes of {kept} of its {of} file{'s' if of != 1 else ''} are kept."
     rest = "" if kept >= of else " Send the others again; what came before is recognised."
-    return what, f"What is kept is read by itself within some minutes: its report will be on /uploads/{upload_id}.{rest}"
+    if beneath is not None:
+        what = f"{beneath.detail} {what}"
+    if isinstance(beneath, StorageFull):
+        when = "Ask your administrator to make room. What is kept is read by itself within some minutes of that"
+    else:
+        away = isinstance(beneath, DatabaseAway) and not isinstance(beneath, GivenUp)
+        when = f"What is kept is read by itself within some minutes{' of its coming back' if away else ''}"
+    return what, f"{when}: its report will be on /uploads/{upload_id}.{rest}"
 
 
 MADE_ANEW = "What was kept of it was missing or damaged; these bytes took its place."

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, TypeVar
 
 import structlog
 
-from app.platform.errors import BetaloopError
+from app.platform.errors import RETRY_S, BetaloopError
 from app.settings import Settings, get_settings
 
 log = structlog.get_logger()
@@ -33,6 +33,7 @@ class StoreAway(BetaloopError):
 
     status = 503
     title = "The store of files is not available"
+    retry_after_s = RETRY_S
 
 
 def bucket() -> Bucket | None:

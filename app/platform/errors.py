@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 from typing import Any
+
+from sqlalchemy.exc import DBAPIError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
+
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""Of an OSError where no room is left, on the disk or for its user."""
+RETRY_S = 5
+"""Seconds after which somebody may try again what failed by a fault that passes."""
 
 
 class BetaloopError(Exception):
@@ -16,6 +25,8 @@ class BetaloopError(Exception):
 
     status = 400
     title = "The request cannot be carried out"
+    retry_after_s: int | None = None
+    """Seconds after which another try makes sense; None where time alone changes nothing."""
 
     def __init__(self, detail: str, hint: str = "", **extra: Any) -> None:
         super().__init__(f"{detail} {hint}".strip())
@@ -99,6 +110,13 @@ class DatabaseAway(BetaloopError):
 
     status = 503
     title = "The database is not available"
+    retry_after_s = RETRY_S
+
+
+class GivenUp(DatabaseAway):
+    """The database gave a transaction up for another one."""
+
+    title = "Another request stood in the way"
 
 
 class StorageFull(BetaloopError):
@@ -106,3 +124,42 @@ class StorageFull(BetaloopError):
 
     status = 507
     title = "The disk is full"
+
+
+_DISK_FULL = "53100"
+_IN_THE_WAY = {"40001", "40P01"}
+"""Of a transaction that was given up for another one: the same request may be sent again."""
+_AWAY = {"08", "57P", "533"}
+"""How states begin of a database that is away, restarting or out of connections."""
+
+
+def passing(error: BaseException) -> BetaloopError | None:
+    """A fault beneath the service that is nobody's input and ends without a change of ours, in words: its disk is full (507), the
+    database or the store of files is away, or a transaction was given up (503). None for every other error.
+    """
+    if isinstance(error, BetaloopError):
+        return error if error.status in (503, 507) else None
+    if isinstance(error, OSError) and error.errno in FULL:
+        return no_room()
+    if not isinstance(error, DBAPIError | PoolTimeout):
+        return None
+    state = getattr(getattr(error, "orig", None), "sqlstate", None) or ""
+    if state == _DISK_FULL:
+        return no_room()
+    if state in _IN_THE_WAY:
+        return GivenUp("Another request changed the same at the same moment.", "Look at what is stored, then send this again.")
+    invalidated = isinstance(error, DBAPIError) and error.connection_invalidated
+    unreached = isinstance(error, PoolTimeout) or (isinstance(error, OperationalError) and not state)
+    if invalidated or unreached or state[:2] in _AWAY or state[:3] in _AWAY:
+        return DatabaseAway(
+            "The database does not answer for the moment.",
+            "It comes back by itself. Wait a few seconds, look at what is stored, then try again.",
+        )
+    return None
+
+
+def no_room() -> StorageFull:
+    """What is said where the disk is full."""
+    return StorageFull(
+        "There is no room left on the disk.", "Ask your administrator to make room; what was stored before is safe. Then try again."
+    )

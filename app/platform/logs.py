@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 import sys
-from typing import Any
+from contextlib import suppress
+from typing import Any, TextIO, cast
 
 import structlog
 
@@ -44,4 +45,20 @@ def _console() -> structlog.dev.ConsoleRenderer:
 
 def _to_standard_error(*_: Any) -> structlog.PrintLogger:
     """Standard error as it is when a line is written: who redirects it later gets the lines too."""
-    return structlog.PrintLogger(sys.stderr)
+    return structlog.PrintLogger(cast(TextIO, _Forgiving(sys.stderr)))
+
+
+class _Forgiving:
+    """A stream that loses lines where they cannot be written, as the standard library's loggers do: the log may lie on the disk that is
+    full, and whoever is told so must not get an error of ours instead."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> None:
+        with suppress(OSError):
+            self._stream.write(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from sqlalchemy.exc import OperationalError
 
 from app.platform.database import database_place
-from app.platform.errors import BetaloopError, Conflict
+from app.platform.errors import FULL, BetaloopError, Conflict
 from app.settings import Settings, get_settings
 
 _WHY = {
@@ -69,11 +69,10 @@ def require_data_folder() -> None:
         with TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        if error.errno not in _FULL:
+        if error.errno not in FULL:
             raise type(error)(error.errno, error.strerror, str(folder)) from error
 
 
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 _NOT_REACHED = {None, "28P01", "28000", "3D000", "57P03", "53300"}
 """SQLSTATE of a server that is not there, refuses who asks, has no such database, starts, or has no connection left."""
 _DATABASE_HINT = (

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 
+import structlog
 from sqlalchemy import NullPool, create_engine, text
+from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from app.ingest import repository
 from app.platform.database import database_url
+from app.platform.errors import passing
+
+log = structlog.get_logger()
 
 LOCKS = 0x75706C64
 """First key of the advisory locks of uploads; the second is the upload's number."""
@@ -63,8 +68,31 @@ def in_progress(upload_id: int) -> Iterator[None]:
         finally:
             _progress.pop(upload_id, None)
             # The server frees it too once it notices that the connection is gone, which on a busy machine is a moment later.
-            connection.execute(text("select pg_advisory_unlock(:space, :upload)"), {"space": LOCKS, "upload": upload_id})
-            connection.commit()
+            # Where the database is away the lock is gone with the connection, and what ended the upload is to be told, not this.
+            with suppress(DBAPIError):
+                connection.execute(text("select pg_advisory_unlock(:space, :upload)"), {"space": LOCKS, "upload": upload_id})
+                connection.commit()
+
+
+@contextmanager
+def not_counted(db: Session, take_back: Callable[[], None]) -> Iterator[None]:
+    """What was begun, and counted as begun, for the case that it ends the process: a fault that passes did not, and counts for nothing.
+
+    Args:
+        take_back: sets the count in the rows of `db` to what it was. Where the database cannot store that either, the count stays.
+    """
+    try:
+        yield
+    except Exception as fault:
+        if passing(fault) is not None:
+            db.rollback()
+            try:
+                take_back()
+                db.commit()
+            except SQLAlchemyError as error:
+                db.rollback()
+                log.warning("a begin that a passing fault ended stays counted", error=type(error).__name__)
+        raise
 
 
 def interrupted(db: Session) -> list[int]:

@@ -19,7 +19,7 @@ from app.ingest.uploads.early_refusal import UploadRoute
 from app.ingest.uploads.in_progress import told
 from app.ingest.uploads.service import BetaStated, Incoming, UploadOutcome
 from app.platform.database import Db
-from app.platform.errors import BetaloopError, Invalid
+from app.platform.errors import BetaloopError, Invalid, passing
 from app.platform.web.forms import parse
 from app.platform.web.schemas import Int, RowId, Text
 from app.platform.web.templates import render
@@ -89,6 +89,8 @@ def upload(
         beta = BetaStated(form.beta_unit, form.beta_source, form.lfp_unit)
         outcome = service.receive(db, participant, stated, chosen, caller, beta)
     except BetaloopError as error:
+        if passing(error) is not None:
+            raise  # without a database, or room for it, there is no page to show it on
         db.rollback()
         return _page(request, db, participant, typed, None, error)
     return _page(request, db, participant, typed, outcome)

@@ -19,12 +19,12 @@ from app.ingest.models import PREVIEW, Upload, UploadFile
 from app.ingest.stated_beta import BetaStated, name_beta
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading, recordings
-from app.ingest.uploads.in_progress import tell
+from app.ingest.uploads.in_progress import not_counted, tell
 from app.ingest.uploads.incoming import Incoming
 from app.ingest.uploads.reading import ReaderEnded, ReaderFault, twice
 from app.ingest.uploads.reports import ASIDE, BEGUN, add_redaction, known_recordings, lasting, store_reports, stored_reports
 from app.platform import files, raw_bytes
-from app.platform.errors import TooLarge
+from app.platform.errors import TooLarge, passing
 from app.platform.jobs.children import child
 from app.platform.raw_bytes import RawFile
 from app.settings import get_settings
@@ -196,7 +196,8 @@ class Receiver:
         # committed before the file is read, so that it is known whom to blame when that ends the process
         row.report = {**lasting(row), BEGUN: row.report.get(BEGUN, 0) + 1}
         self.db.commit()
-        outcome = self.decode(row.name, row, replace(self._content(row), problem=CUT_SHORT if sealed else None))
+        with not_counted(self.db, lambda: _forget_begin(row)):
+            outcome = self.decode(row.name, row, replace(self._content(row), problem=CUT_SHORT if sealed else None))
         if not outcome.same_bytes:
             outcome.reports[0].understood.append(RESUMED)
             store_reports(row, outcome.reports, known_recordings(row))
@@ -294,6 +295,8 @@ class Receiver:
             self.db.rollback()
             return self._failed(name, row, content, error)
         except Exception as fault:
+            if passing(fault) is not None:
+                raise  # nothing is wrong with the file: it is read when the fault is over
             # a fault of ours must not take the other files of the upload with it; the bytes are safe for a better decoder
             self.db.rollback()
             places = fault.places if isinstance(fault, ReaderFault) else child.places(fault)
@@ -367,6 +370,10 @@ class Receiver:
         self._forget(sealed)
         self.db.commit()
         return FileOutcome(name, before, [report], duplicate=True, same_bytes=True, for_sender=problem.for_sender)
+
+
+def _forget_begin(row: UploadFile) -> None:
+    row.report = {**row.report, BEGUN: row.report.get(BEGUN, 1) - 1}
 
 
 def _harmless_name(name: str, kind: str) -> str:

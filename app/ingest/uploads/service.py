@@ -20,12 +20,12 @@ from app.ingest.sessions import StatedSession
 from app.ingest.stated_beta import BetaStated
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading
-from app.ingest.uploads.in_progress import in_progress, tell_file
+from app.ingest.uploads.in_progress import in_progress, not_counted, tell_file
 from app.ingest.uploads.incoming import Incoming, arrange
 from app.ingest.uploads.receiving import LETHAL, FileOutcome, Receiver
 from app.ingest.uploads.reports import alike_together, known_recordings, store_reports, stored_reports, unreadable_members
 from app.platform import files
-from app.platform.errors import BetaloopError, Conflict, Invalid, TooLarge
+from app.platform.errors import BetaloopError, Conflict, Invalid, TooLarge, passing
 from app.platform.jobs.children.child import places
 from app.platform.web.schemas import sensible_time
 from app.study import repository as study
@@ -41,10 +41,20 @@ log = structlog.get_logger()
 
 
 class CutShort(BetaloopError):
-    """A fault of ours ended an upload of which something was kept; `interrupted` takes it up again."""
+    """A fault ended an upload of which something was kept; `interrupted` takes it up again.
+
+    Args:
+        upload_id: the upload. kept, of: how many of its files are kept.
+        beneath: the fault, where it is one that passes (a full disk, a database that is away): its status is this error's.
+    """
 
     status = 500
     title = "Something went wrong on our side"
+
+    def __init__(self, upload_id: int, kept: int, of: int, beneath: BetaloopError | None) -> None:
+        super().__init__(*wording.cut_short(upload_id, kept, of, beneath))
+        if beneath is not None:
+            self.status, self.title, self.retry_after_s = beneath.status, beneath.title, beneath.retry_after_s
 
 
 SESSIONS_BEGUN = "sessions_begun"
@@ -150,7 +160,7 @@ def receive(
     `beta` says what the columns of a table are; the participant's unit and source are taken, and said, where it is silent.
 
     Raises:
-        TooLarge: every file exceeds the installation's limit. Invalid: no file. CutShort: a fault of ours, after something was kept.
+        TooLarge: every file exceeds the installation's limit. Invalid: no file. CutShort: a fault, after something was kept.
     """
     study_service.require(caller, can.UPLOAD, participant)
     if not incoming:
@@ -160,20 +170,20 @@ def receive(
     upload = Upload(participant_id=participant.id, created_by=caller.label, stated=said)
     db.add(upload)
     db.flush()
-    with in_progress(upload.id):
+    number = upload.id  # known whatever becomes of the database
+    with in_progress(number):
         arranged = arrange(incoming)
         receiver = Receiver(db, participant, upload, decode_options(participant, beta), beta)
         outcome = UploadOutcome(upload, participant, [], alike_together(arranged.asides))
         try:
             _take(receiver, outcome, arranged.incoming)
             finish(db, outcome, stated)
-        except BetaloopError:
-            raise
         except Exception as fault:
-            if not receiver.kept:
+            beneath = passing(fault)
+            if not receiver.kept or (isinstance(fault, BetaloopError) and beneath is None):
                 raise
-            log.error("upload cut short", upload=upload.id, kept=len(receiver.kept), places=places(fault))
-            raise CutShort(*wording.cut_short(upload.id, len(receiver.kept), len(arranged.incoming))) from fault
+            log.error("upload cut short", upload=number, kept=len(receiver.kept), places=places(fault))
+            raise CutShort(number, len(receiver.kept), len(arranged.incoming), beneath) from fault
     return outcome
 
 
@@ -196,14 +206,25 @@ def finish(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
     """What is done once all files of an upload are in: sessions, grasp tests, the report. Commits."""
     upload = outcome.upload
     begun = upload.stated.get(SESSIONS_BEGUN, 0)
-    if begun < LETHAL:
-        # committed before, so that sessions which end the process that makes them are not tried for ever
-        upload.stated = {**upload.stated, SESSIONS_BEGUN: begun + 1}
-        db.commit()
+    if begun >= LETHAL:
+        _leave_without_sessions(outcome)
+        _close(db, outcome)
+        return
+    # committed before, so that sessions which end the process that makes them are not tried for ever
+    upload.stated = {**upload.stated, SESSIONS_BEGUN: begun + 1}
+    db.commit()
+    with not_counted(db, lambda: _set_begun(upload, begun)):
         make_sessions(db, outcome, stated)
         attach_grasps_of(db, outcome, stated)
-    else:
-        _leave_without_sessions(outcome)
+        _close(db, outcome)
+
+
+def _set_begun(upload: Upload, begun: int) -> None:
+    upload.stated = {**upload.stated, SESSIONS_BEGUN: begun}
+
+
+def _close(db: Session, outcome: UploadOutcome) -> None:
+    upload = outcome.upload
     # a file that came before has its row in another upload; this one only points at it
     earlier = [o.row.id for o in outcome.files if o.same_bytes]
     upload.stated = {**upload.stated, "duplicates": earlier}
@@ -247,6 +268,8 @@ def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) ->
         with db.begin_nested():
             created = making.make_sessions(db, outcome.participant, outcome.upload, list(fresh.values()), stated)
     except Exception as fault:
+        if passing(fault) is not None:
+            raise  # they are made when it is over
         # the recordings are stored and safe; a fault of ours must not turn a whole upload away
         log.error("sessions could not be made", upload=outcome.upload.id, places=places(fault))
         trouble = f"No session could be made of it. It is stored; tell your administrator: upload {outcome.upload.id}."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import secrets
 import time
@@ -16,14 +15,14 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse
 from fastapi.routing import iter_route_contexts
 from prometheus_client import Counter, Histogram
-from sqlalchemy.exc import DBAPIError, OperationalError
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 from starlette.middleware.base import RequestResponseEndpoint
 from starlette.requests import ClientDisconnect
 from starlette.routing import compile_path
 
-from app.platform.errors import BetaloopError, Conflict, DatabaseAway, EntriesOfAnother, Forbidden, StorageFull, TooMany, Unauthorized
+from app.platform.errors import BetaloopError, Conflict, EntriesOfAnother, Forbidden, StorageFull, Unauthorized, passing
 from app.platform.json_members import UniqueMembers
 from app.platform.web.body_limit import BodyLimit, Judge
 from app.platform.web.compression import Compression
@@ -52,9 +51,9 @@ def install(app: FastAPI, judge: Judge) -> None:
     app.add_exception_handler(BetaloopError, _known_error)
     app.add_exception_handler(RequestValidationError, _bad_input)
     app.add_exception_handler(HTTPException, _http_error)
-    app.add_exception_handler(DBAPIError, _database_error)
-    app.add_exception_handler(PoolTimeout, _database_error)
-    app.add_exception_handler(OSError, _system_error)
+    app.add_exception_handler(DBAPIError, _fault_beneath)
+    app.add_exception_handler(PoolTimeout, _fault_beneath)
+    app.add_exception_handler(OSError, _fault_beneath)
     app.add_exception_handler(ClientDisconnect, _gone)
     app.add_exception_handler(Exception, _unknown_error)
 
@@ -107,7 +106,7 @@ def wants_page(request: Request) -> bool:
 
 async def _answer(request: Request, error: BetaloopError) -> Response:
     body = error.problem(request.url.path) | {"request_id": getattr(request.state, "request_id", None)}
-    headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, TooMany) else {}
+    headers = {"Retry-After": str(error.retry_after_s)} if error.retry_after_s is not None else {}
     if not wants_page(request):
         headers |= {"WWW-Authenticate": "Bearer"} if error.status == 401 else {}
         return JSONResponse(json.loads(json.dumps(body, default=str)), error.status, headers, "application/problem+json")
@@ -128,7 +127,7 @@ async def _refused_unread(request: Request, error: Exception) -> Response:
     if isinstance(error, BetaloopError):
         return await _answer(request, error)
     if isinstance(error, DBAPIError | PoolTimeout):
-        return await _database_error(request, error)
+        return await _fault_beneath(request, error)
     raise error
 
 
@@ -168,7 +167,7 @@ _HINTS = {
 async def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     if isinstance(error.__cause__, OSError):  # what the framework calls a body that cannot be read, where our disk could not take it
-        return await _system_error(request, error.__cause__)
+        return await _fault_beneath(request, error.__cause__)
     if wants_page(request) and getattr(request.state, "caller", None) is None:
         # no route asked who this is: the page of the error still has the way back for somebody who has signed in, if the database answers
         with suppress(BetaloopError, DBAPIError, PoolTimeout):
@@ -196,43 +195,22 @@ async def _gone(request: Request, error: Exception) -> Response:
     return await _answer(request, _PlainError(400, "The request ended before it was whole."))
 
 
-RETRY_S = 5
-_FULL = {errno.ENOSPC, errno.EDQUOT}
-_DISK_FULL = "53100"
 _FIRST = {"23505", "23503"}
 """Of a row that is there already, or is gone: somebody did it at the same moment, after both had looked."""
-_IN_THE_WAY = {"40001", "40P01"}
-"""Of a transaction that was given up for another one: the same request may be sent again."""
 
 
-class _GivenUp(DatabaseAway):
-    title = "Another request stood in the way"
-
-
-async def _database_error(request: Request, error: Exception) -> Response:
-    """503 where the database is away, restarting or out of connections, 507 where its disk is full, 409 where somebody else was first,
-    503 where this was given up for another request; anything else is an error of ours.
+async def _fault_beneath(request: Request, error: Exception) -> Response:
+    """503 where the database is away or gave the request up for another, 507 where a disk is full, 409 where somebody else was first;
+    anything else is an error of ours.
     """
     state = getattr(getattr(error, "orig", None), "sqlstate", None)
-    if state == _DISK_FULL:
-        return await _full(request, error)
     if state in _FIRST:
         return await _second(request, error)
-    invalidated = isinstance(error, DBAPIError) and error.connection_invalidated
-    unreached = isinstance(error, PoolTimeout) or (isinstance(error, OperationalError) and state is None)
-    if not (invalidated or unreached or state in _IN_THE_WAY or (state or "")[:2] == "08" or (state or "")[:3] in {"57P", "533"}):
+    if (known := passing(error)) is None:
         return await _unknown_error(request, error)
-    given_up = state in _IN_THE_WAY
-    event = "a request was given up for another" if given_up else "the database is away"
-    log.warning(event, path=request.url.path, error=type(error).__name__, sqlstate=state)
-    away = DatabaseAway(
-        "The database does not answer for the moment.",
-        "It comes back by itself. Wait a few seconds, look at what is stored, then try again.",
-    )
-    busy = _GivenUp("Another request changed the same at the same moment.", "Look at what is stored, then send this again.")
-    response = await _answer(request, busy if given_up else away)
-    response.headers["Retry-After"] = str(RETRY_S)
-    return response
+    tell = log.error if isinstance(known, StorageFull) else log.warning
+    tell("a request met a fault that passes", told=known.title, path=request.url.path, error=type(error).__name__, sqlstate=state)
+    return await _answer(request, known)
 
 
 async def _second(request: Request, error: Exception) -> Response:
@@ -245,22 +223,6 @@ async def _second(request: Request, error: Exception) -> Response:
         Conflict(
             "Another request changed the same at the same moment, and was first; or this one was sent twice.",
             "Look at what is stored now, then send what is missing.",
-        ),
-    )
-
-
-async def _system_error(request: Request, error: Exception) -> Response:
-    if isinstance(error, OSError) and error.errno in _FULL:
-        return await _full(request, error)
-    return await _unknown_error(request, error)
-
-
-async def _full(request: Request, error: Exception) -> Response:
-    log.error("the disk is full", path=request.url.path, error=type(error).__name__)
-    return await _answer(
-        request,
-        StorageFull(
-            "There is no room left on the disk.", "Ask your administrator to make room; what was stored before is safe. Then try again."
         ),
     )
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+import sys
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 import structlog
 import typer
 from fastapi.testclient import TestClient
 
-from app import cli
+from app import cli, main
 from app.main import create_app
 from app.platform import logs
 from app.settings import get_settings
@@ -64,3 +67,19 @@ def test_a_command_logs_an_error_with_a_plain_traceback(monkeypatch: pytest.Monk
     printed = capsys.readouterr()
     assert "in fail" in printed.err
     assert PATIENT not in printed.out + printed.err
+
+
+def test_a_log_on_a_full_disk_loses_lines_and_no_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    service = create_app()
+    monkeypatch.setattr(main, "check_connection", fails)
+    with open("/dev/full", "w", buffering=1) as full:
+        monkeypatch.setattr(sys, "stderr", full)
+        with pytest.raises(OSError):
+            print("this cannot be written", file=full)
+        answer = TestClient(service).get("/healthz")
+        with suppress(OSError):
+            full.close()
+    assert (answer.status_code, answer.json()["title"]) == (507, "The disk is full")

@@ -14,16 +14,18 @@ import json
 import math
 import os
 import resource
+import shutil
 import signal
 import sys
 import threading
 import time
 import traceback
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from app.platform.errors import BetaloopError
+from app.platform.errors import FULL, BetaloopError
 from app.platform.jobs.children.report import StepReport, pipe_sender, write_atomically
 from app.platform.jobs.errors import JobError
 from app.platform.jobs.registry import load_compute
@@ -40,8 +42,14 @@ _OOM_SCORE = "500"
 _AUTOGROUP, _AUTOGROUP_TRIES = Path("/proc/self/autogroup"), 50
 _AUTOGROUPS_ON = Path("/proc/sys/kernel/sched_autogroup_enabled")
 
-Cause = Literal["memory", "time", "killed", "error"]
-"""Why a call gave no result: it met its limit of memory or time, its process was killed or broke down, or its function raised."""
+Cause = Literal["memory", "time", "full", "killed", "error"]
+"""Why a call gave no result: it met its limit of memory or time, the disk is full, its process was killed or broke down, or its function
+raised."""
+LEAST_ROOM = 1 << 16
+"""Bytes: a disk with less is full."""
+NO_ROOM = 28
+"""Exit code of a child that met a full disk, on which not even that may have had room in result.json."""
+FULL_DISK = "There is no room left on the disk of the machine that computes. Make room there, then start this again."
 
 
 @dataclass(frozen=True)
@@ -86,7 +94,7 @@ def too_much_memory(limit_mb: int) -> str:
 
 
 def main(name: str, workdir: Path) -> int:
-    """Run one call; 0 when it gave a result, 1 when it failed: the reason stands in result.json."""
+    """Run one call; 0 when it gave a result, NO_ROOM where the disk is full, else 1: the reason stands in result.json."""
     die_with_parent()
     os.umask(0o077)  # checkpoints and results are of participants
     call = json.loads((workdir / "params.json").read_bytes())
@@ -100,13 +108,20 @@ def main(name: str, workdir: Path) -> int:
     except Exception as error:
         # memory to write the message with, when it was the memory that ran out
         resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-        # stderr is the step's log, which shows the traceback to those who can read one
-        if limits.quotes:
-            traceback.print_exc()
-        else:
-            sys.stderr.write(places(error))
-        outcome |= {"ok": False, "cause": "memory" if _lacked_memory(error) else "error", "message": _worded(error, limits)}
-    write_atomically(workdir / "result.json", json.dumps(outcome, allow_nan=False).encode())
+        # stderr is the step's log, which shows the traceback to those who can read one; it may lie on a disk that is full
+        with suppress(OSError):
+            if limits.quotes:
+                traceback.print_exc()
+            else:
+                sys.stderr.write(places(error))
+        cause = _cause(error, workdir)
+        outcome |= {"ok": False, "cause": cause, "message": FULL_DISK if cause == "full" else _worded(error, limits)}
+    try:
+        write_atomically(workdir / "result.json", json.dumps(outcome, allow_nan=False).encode())
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        return NO_ROOM
     if lock is not None:
         os.close(lock)
     return 0 if outcome["ok"] else 1
@@ -140,6 +155,16 @@ def _run(name: str, call: dict[str, Any], limits: ChildLimits, workdir: Path) ->
 
 def _lacked_memory(error: Exception) -> bool:
     return isinstance(error, MemoryError) or "can't allocate memory" in str(error)
+
+
+def _cause(error: Exception, workdir: Path) -> Cause:
+    if _lacked_memory(error):
+        return "memory"
+    if isinstance(error, OSError) and error.errno is not None:
+        return "full" if error.errno in FULL else "error"
+    # numpy and torch do not say why they could not write
+    unsaid = isinstance(error, OSError | RuntimeError) and shutil.disk_usage(workdir).free < LEAST_ROOM
+    return "full" if unsaid else "error"
 
 
 def _worded(error: Exception, limits: ChildLimits) -> str:

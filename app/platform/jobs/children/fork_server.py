@@ -19,6 +19,7 @@ import signal
 import socket
 import sys
 import traceback
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
@@ -131,11 +132,14 @@ class _Server:
             status = child.main(call["name"], Path(call["workdir"]))
         except BaseException as error:
             # in the log of the child: its places, not its values, which may be of a person
-            sys.stderr.write(child.places(error))
+            with suppress(OSError):
+                sys.stderr.write(child.places(error))
         finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(status)
+            try:
+                sys.stdout.flush()
+                sys.stderr.flush()
+            finally:
+                os._exit(status)  # also where the log lies on a full disk: the fork must not go on as a second server
 
 
 def _tell(order: socket.socket, words: dict[str, int]) -> None:

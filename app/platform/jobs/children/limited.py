@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+from app.platform.errors import no_room
 from app.platform.files import draft_folder
 from app.platform.jobs.children.child import Cause, ChildLimits
 from app.platform.jobs.children.forked import ForkedProcesses
@@ -60,7 +61,7 @@ def run_limited(
         who: calls of one name wait for each other's turn where there are more calls than may work at once.
 
     Raises:
-        ChildEnded: it met a limit, broke down or raised.
+        ChildEnded: it met a limit, broke down or raised. StorageFull: the disk had no room for what it wrote.
     """
     children, slots = _children()
     wall_s = None if limits.cpu_s is None else float(WALL_PER_CPU * limits.cpu_s)
@@ -82,6 +83,8 @@ def run_limited(
     if outcome["ok"]:
         result: dict[str, Any] = outcome["result"]
         return result
+    if outcome["cause"] == "full":
+        raise no_room()
     raise ChildEnded(outcome["cause"], limits, outcome["log"])
 
 

@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import psutil
 
-from app.platform.jobs.children.child import PARENT, Cause, ChildLimits, params_hash, stored_result, too_much_memory
+from app.platform.jobs.children.child import FULL_DISK, NO_ROOM, PARENT, Cause, ChildLimits, params_hash, stored_result, too_much_memory
 from app.platform.jobs.children.report import write_atomically
 from app.platform.jobs.context import StepOutcome
 from app.settings import private_folder
@@ -245,6 +245,8 @@ def _outcome(call: ComputeCall, returncode: int, outgrown: bool) -> StepOutcome:
     try:
         stored: dict[str, Any] = json.loads((call.workdir / "result.json").read_bytes())
     except FileNotFoundError:
+        if returncode == NO_ROOM:
+            return _failed("full", FULL_DISK)
         if returncode >= 0:
             return _failed("killed", f"The step's process ended with exit code {returncode} and without a result; see the step's log.")
         name = signal.Signals(-returncode).name

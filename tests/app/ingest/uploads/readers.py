@@ -31,6 +31,12 @@ def kill_once(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
     return kill(params, workdir, report)
 
 
+def full(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Write to a disk that is full."""
+    Path("/dev/full").write_bytes(b"decoded")
+    return {}
+
+
 def outgrow(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """Ask for 64 GiB, as the number of a file may tell one to."""
     return {"sum": float(np.ones(1 << 33).sum())}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import threading
 import time
@@ -9,7 +10,8 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import select
+from sqlalchemy import select, text
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
@@ -20,7 +22,7 @@ from app.ingest.sessions import StatedSession
 from app.ingest.uploads import reading, service
 from app.ingest.uploads.in_progress import in_progress, interrupted
 from app.ingest.uploads.interrupted import keep_resuming, resume
-from app.ingest.uploads.receiving import Receiver
+from app.ingest.uploads.receiving import LETHAL, Receiver
 from app.ingest.uploads.service import Incoming
 from app.platform.database import new_session
 from app.settings import get_settings
@@ -128,20 +130,38 @@ def until(found: Any, seconds: float = 60.0) -> Any:
     return answer
 
 
-def test_a_fault_after_the_bytes_are_safe_tells_so_and_is_mended_without_a_restart(
-    send: Send, client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
+NO_ROOM = OSError(errno.ENOSPC, "No space left on device")
+GONE = OperationalError("commit", {}, Exception("server closed the connection unexpectedly"))
+KEPT = "Upload 1 was cut short: the bytes of 2 of its 2 files are kept."
+READ = "What is kept is read by itself within some minutes"
+THERE = "its report will be on /uploads/1."
+CUT = {
+    "full": (NO_ROOM, 507, f"There is no room left on the disk. {KEPT}", f"Ask your administrator to make room. {READ} of that: {THERE}"),
+    "away": (GONE, 503, f"The database does not answer for the moment. {KEPT}", f"{READ} of its coming back: {THERE}"),
+    "ours": (ZeroDivisionError("ours"), 500, KEPT, f"{READ}: {THERE}"),
+}
+TWO = (("t.csv", steady(1)), ("grasp.csv", b"t_s,hand\n1,L\n1.5,L\n2,L\n"))
 
-    files = (("t.csv", steady(1)), ("grasp.csv", b"t_s,hand\n1,L\n1.5,L\n2,L\n"))
+
+def failing(fault: Exception) -> Any:
+    """A function that a fault befalls."""
+
+    def fails(*_: Any, **__: Any) -> None:
+        raise fault
+
+    return fails
+
+
+@pytest.mark.parametrize(("fault", "status", "detail", "hint"), CUT.values(), ids=CUT.keys())
+def test_a_fault_after_the_bytes_are_safe_tells_so_and_is_mended_without_a_restart(
+    send: Send, client: TestClient, monkeypatch: pytest.MonkeyPatch, fault: Exception, status: int, detail: str, hint: str
+) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(service, "finish", full)
-        answer = send(*files, visit=1, controller="cdbs")
-    assert answer.status_code == 500
+        patch.setattr(service, "make_sessions", failing(fault))
+        answer = send(*TWO, visit=1, controller="cdbs")
     body = answer.json()
-    assert body["detail"] == "Upload 1 was cut short: the bytes of 2 of its 2 files are kept."
-    assert body["hint"] == "What is kept is read by itself within some minutes: its report will be on /uploads/1."
+    assert (answer.status_code, body["status"], body["detail"], body["hint"]) == (status, status, detail, hint)
+    assert answer.headers.get("retry-after") == ("5" if status == 503 else None)
     assert client.get("/api/v1/uploads/1").json()["status"] == "received"
     stop = threading.Event()
     keeper = threading.Thread(target=keep_resuming, args=("test", stop, 0.1))
@@ -155,17 +175,76 @@ def test_a_fault_after_the_bytes_are_safe_tells_so_and_is_mended_without_a_resta
     assert upload["sessions"][0]["controller"] == "cdbs"
 
 
+@pytest.mark.parametrize("where", ["the reader", "the sessions"])
+def test_a_disk_that_stays_full_is_no_fault_of_the_file(
+    send: Send, client: TestClient, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    with monkeypatch.context() as patch:
+        if where == "the reader":
+            patch.setattr(reading, "DECODE", f"{readers.__name__}:full")
+        else:
+            patch.setattr(service.making, "make_sessions", failing(NO_ROOM))
+        answer = send(("t.csv", steady(1)), visit=1, controller="cdbs")
+        assert (answer.status_code, "the bytes of 1 of its 1 file are kept" in answer.json()["detail"]) == (507, True)
+        for _ in range(LETHAL + 1):
+            assert [t.done for t in resume("test")] == [False]
+    assert [t.done for t in resume("test")] == [True]
+    upload = client.get("/api/v1/uploads/1").json()
+    assert (upload["files"][0]["status"], [s["controller"] for s in upload["sessions"]]) == ("decoded", ["cdbs"])
+    assert not client.get("/api/v1/participants/P1/quarantine").json()
+
+
+def test_a_disk_that_fills_while_identity_is_taken_out_keeps_nothing(
+    send: Send, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(reading, "CLEAN", f"{readers.__name__}:full")
+        answer = send(("t.csv", steady(1)), visit=1, controller="cdbs")
+    assert (answer.status_code, answer.json()["detail"]) == (507, "There is no room left on the disk.")
+    assert not client.get("/api/v1/participants/P1/quarantine").json()
+    assert send(("t.csv", steady(1)), visit=1, controller="cdbs").status_code == 201
+
+
+def test_the_page_of_an_upload_that_a_full_disk_cut_short_says_what_is_kept(
+    client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service, "make_sessions", failing(NO_ROOM))
+    answer = client.post(
+        f"/participants/{enrolled}/upload",
+        data={"visit": "1", "controller": "cdbs"},
+        files={"file": ("t.csv", steady(1))},
+        headers={"accept": "text/html"},
+    )
+    assert answer.status_code == 507
+    assert "There is no room left on the disk. Upload 1 was cut short: the bytes of 1 of its 1 file are kept." in answer.text
+
+
+def test_a_database_that_dies_during_an_upload_does_not_hide_what_is_kept(
+    client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def dies(db: Session, *_: Any) -> None:
+        mine = "datname = current_database() and pid <> pg_backend_pid()"
+        db.execute(text(f"select pg_terminate_backend(pid) from pg_stat_activity where {mine} and usename = current_user"))
+        db.execute(text("select pg_terminate_backend(pg_backend_pid())"))
+
+    monkeypatch.setattr(service, "make_sessions", dies)
+    stated = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+    answer = client.post("/api/v1/uploads", data=stated, files=[("file", ("t.csv", steady(1)))])
+    assert (answer.status_code, answer.headers.get("retry-after")) == (503, "5")
+    assert "the bytes of 1 of its 1 file are kept" in answer.json()["detail"]
+
+
 def test_a_fault_between_two_files_says_how_many_are_kept(send: Send, monkeypatch: pytest.MonkeyPatch) -> None:
     real = Receiver.receive
 
     def second_fails(self: Receiver, one: Incoming) -> Any:
         if one.name == "b.csv":
-            raise OSError(28, "No space left on device")
+            raise NO_ROOM
         return real(self, one)
 
     monkeypatch.setattr(Receiver, "receive", second_fails)
     answer = send(("a.csv", steady(1)), ("b.csv", steady(1, beta=2.0)), visit=1, controller="cdbs")
-    assert (answer.status_code, "the bytes of 1 of its 2 files are kept" in answer.json()["detail"]) == (500, True)
+    assert (answer.status_code, "the bytes of 1 of its 2 files are kept" in answer.json()["detail"]) == (507, True)
     assert "Send the others again" in answer.json()["hint"]
 
 

@@ -7,9 +7,11 @@ import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel, Field
 from sqlalchemy import text
 from sqlalchemy.orm import Session
@@ -31,6 +33,21 @@ def prepare() -> None:
 def who_prepared(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """The processes that have prepared this module, the one that forked us, and how nice we are."""
     return {"prepared": PREPARED, "forked_by": os.getppid(), "nice": os.nice(0)}
+
+
+def write_to_a_full_disk(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Fail by it."""
+    Path("/dev/full").write_bytes(b"a checkpoint")
+    return {}
+
+
+def fill_the_disk(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Fail by a disk that this fills; numpy does not say why it cannot write."""
+    with suppress(OSError), (Path(params["disk"]) / "filler").open("ab", buffering=0) as out:
+        while True:
+            out.write(bytes(1))
+    np.save(workdir / "checkpoint.npy", np.zeros(1 << 16))
+    return {}
 
 
 class CountParams(BaseModel):

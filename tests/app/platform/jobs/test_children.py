@@ -7,9 +7,10 @@ import signal
 
 import pytest
 
-from app.platform.jobs.children.child import ChildLimits, params_hash
+from app.platform.jobs.children.child import FULL_DISK, ChildLimits, params_hash
 from app.platform.jobs.children.forked import ForkedProcesses
 from app.platform.jobs.children.supervisor import ComputeCall
+from tests.small_disks import small_disk
 
 
 def test_a_result_is_reused_for_equal_params_and_the_folder_emptied_for_others(kinds, tmp_path):
@@ -50,3 +51,22 @@ def test_the_module_of_a_step_is_imported_and_prepared_once_for_all_its_children
         assert again["prepared"] == [again["forked_by"]] != each[0]["prepared"], "another server, which has prepared it itself"
     finally:
         children.close()
+
+
+@pytest.mark.parametrize("quotes", [True, False])
+def test_a_full_disk_is_told_from_a_fault_of_the_step(kinds, tmp_path, quotes):
+    children = ForkedProcesses(learns=True)
+    call = ComputeCall("fill", "sample_job_kinds:write_to_a_full_disk", {}, tmp_path / "step", ChildLimits(1024, quotes=quotes))
+    outcome = children.run(call, lambda messages: None, lambda: None)
+    children.close()
+    assert (outcome["ok"], outcome["cause"], outcome["message"]) == (False, "full", FULL_DISK)
+    assert "OSError" in outcome["log"]
+
+
+def test_a_full_disk_is_told_where_there_is_no_room_to_write_that_down(kinds, tmp_path):
+    children = ForkedProcesses(learns=True)
+    with small_disk(tmp_path / "small", "128k") as disk:
+        call = ComputeCall("fill", "sample_job_kinds:fill_the_disk", {"disk": str(disk)}, disk / "step", ChildLimits(1024))
+        outcome = children.run(call, lambda messages: None, lambda: None)
+        children.close()
+    assert (outcome["ok"], outcome["cause"], outcome["message"]) == (False, "full", FULL_DISK)
