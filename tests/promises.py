@@ -14,6 +14,7 @@ ERROR_PAGES = "tests/app/pages/test_error_pages.py"
 FLAWS = "tests/packages/test_known_flaws.py"
 MEMBERS = "tests/app/platform/test_json_members.py"
 PAGES, SIGN_IN = "tests/app/pages/test_page_roles.py", "tests/app/pages/test_sign_in_pages.py"
+HEALING, DOCTOR = "tests/app/platform/test_healing.py", "tests/app/platform/upkeep/test_doctor.py"
 SEALING, BACKUP = "tests/app/platform/upkeep/test_sealing.py", "tests/app/platform/upkeep/test_backup.py"
 DAMAGED, INTERRUPTED = "tests/app/ingest/uploads/test_damaged_files.py", "tests/app/ingest/uploads/test_interrupted.py"
 LOCKS, LOCK_SIGNED = "tests/app/study/visits/test_visit_locks.py", "tests/app/study/visits/test_lock_signatures.py"
@@ -341,6 +342,12 @@ PROMISES = [
         ("the doctor reads hashes", "if not files.is_whole(row.sha256, row.size, hashes)]",
          "if not files.is_whole(row.sha256, row.size, False)]",
          f"{BACKUP}::test_the_doctor_finds_what_is_missing_damaged_or_standing_open"),
+        ("the doctor finds jobs that nobody works on", "    stuck = bool(live) and not workers\n", "    stuck = False\n",
+         f"{DOCTOR}::test_jobs_that_nobody_works_on_are_found"),
+        ("the doctor finds a disk that is nearly full", "    ok = free >= LEAST_FREE_MB\n", "    ok = True\n",
+         f"{DOCTOR}::test_a_disk_that_is_nearly_full_is_found"),
+        ("the doctor finds a clock that goes wrong", "    ok = apart <= MOST_CLOCK_DIFFERENCE_S\n", "    ok = True\n",
+         f"{DOCTOR}::test_a_clock_of_the_database_that_goes_wrong_is_found"),
         ("the doctor sees folders that stand open", "f.is_dir() and f.stat().st_mode & 0o077]", "False]",
          f"{BACKUP}::test_the_doctor_finds_what_is_missing_damaged_or_standing_open"),
     ),
@@ -368,9 +375,19 @@ PROMISES = [
     *_of(
         "platform/errors",
         ("a full disk is told as one", "if isinstance(error, OSError) and error.errno in FULL:", "if False:",
-         "tests/app/platform/test_healing.py::test_what_fails_beneath_is_told_in_true_words"),
+         f"{HEALING}::test_what_fails_beneath_is_told_in_true_words"),
         ("a database that is away is told as one", "    if invalidated or unreached or state[:2] in _AWAY or state[:3] in _AWAY:\n",
-         "    if False:\n", "tests/app/platform/test_healing.py::test_what_fails_beneath_is_told_in_true_words"),
+         "    if False:\n", f"{HEALING}::test_what_fails_beneath_is_told_in_true_words"),
+    ),
+    *_of(
+        "platform/upkeep/commands",
+        ("the doctor ends with exit code 1 where something is wrong", "    if not all(f.ok for f in findings):\n", "    if False:\n",
+         f"{DOCTOR}::test_the_exit_code_is_1_and_the_lines_say_what_is_wrong"),
+    ),
+    *_of(
+        "platform/database",
+        ("an answer stands whose database goes away", "        if passing(error) is None:\n            raise\n        log.warning",
+         "        raise\n        log.warning", f"{HEALING}::test_an_answer_stands_whose_database_goes_away_after_it_was_made"),
     ),
     *_of(
         "platform/logs",

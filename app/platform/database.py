@@ -13,11 +13,12 @@ from fastapi import Depends
 from psycopg.errors import UndefinedColumn, UndefinedTable
 from sqlalchemy import Connection, DateTime, Engine, MetaData, create_engine, event, make_url, text
 from sqlalchemy.dialects.postgresql import JSONB
-from sqlalchemy.exc import ProgrammingError
+from sqlalchemy.exc import DBAPIError, ProgrammingError
 from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 
 from app.platform.embedded import place
 from app.platform.embedded.server import EmbeddedPostgres
+from app.platform.errors import passing
 from app.settings import Settings, get_settings
 
 log = logging.getLogger(__name__)
@@ -153,8 +154,23 @@ def transaction(actor: str = "system") -> Iterator[Session]:
 
 def get_db() -> Iterator[Session]:
     """The session of one request; the endpoint commits, an error rolls back."""
-    with new_session() as db:
+    db = new_session()
+    try:
         yield db
+    finally:
+        _let_go(db)
+
+
+def _let_go(db: Session) -> None:
+    """Close a session, also where its database has gone since it was asked last: it rolls back by itself, and the answer stands, or is
+    on its way already."""
+    try:
+        db.close()
+    except DBAPIError as error:
+        if passing(error) is None:
+            raise
+        log.warning("the database went away before a request's session was closed: %s", type(error.orig).__name__)
+        db.invalidate()
 
 
 Db = Annotated[Session, Depends(get_db)]

@@ -6,19 +6,24 @@ import errno
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import httpx2 as httpx
 import psycopg
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError, OperationalError
 
 from app import main
+from app.platform.database import Db, get_engine, new_session
 from app.platform.embedded.server import EmbeddedPostgres
+from app.platform.errors import NotFound
 from app.settings import get_settings
+from benchmarks.installed.installation import PASSWORD, STARTED_S, Server, installation
 from tests.app.platform.test_stops import data as data
-from tests.app.platform.test_stops import free_port, start, wait_for
+from tests.app.platform.test_stops import start, wait_for
 
 HEALTHY_WITHIN_S = 10.0
 """On processors that have nothing else to do; `patience` gives more where others wait for them."""
@@ -30,28 +35,34 @@ def patience() -> float:
 
 
 @pytest.mark.slow
-def test_a_service_whose_database_was_killed_heals_by_itself(data: Path) -> None:
-    port = free_port()
-    service = start(data, "serve", "--port", str(port))
-    url = f"http://127.0.0.1:{port}/healthz"
-    try:
-        wait_for(data, "running on", service)
-        server = EmbeddedPostgres(data / "postgres", server_user=get_settings().server_user)
-        for _ in range(2):
-            assert httpx.get(url).status_code == 200
-            os.kill(server.pid(), signal.SIGKILL)
-            killed, answers = time.monotonic(), []
-            while not answers or answers[-1].status_code != 200:
-                assert time.monotonic() - killed < patience(), [a.text for a in answers[-1:]]
-                answers.append(httpx.get(url, timeout=patience()))
-                time.sleep(0.05)
-            refused = [a for a in answers if a.status_code != 200]
-            assert {a.status_code for a in refused} <= {503}
-            assert all(a.headers["retry-after"] == "5" for a in refused)
-        assert service.poll() is None
-    finally:
-        service.send_signal(signal.SIGTERM)
-        service.wait(30)
+@pytest.mark.timeout(300)
+def test_a_service_whose_database_was_killed_heals_by_itself() -> None:
+    with installation() as installed:
+        token = installed.add_people({"admin@clinic.example": "admin"})["admin@clinic.example"]
+        installed.start("web 1")
+        installed.wait_until("the first answer", installed.webs_are_ready, STARTED_S)
+        with httpx.Client(base_url=installed.bases[0], headers={"Accept": "text/html"}, timeout=patience()) as browser:
+            form = {"email": "admin@clinic.example", "password": PASSWORD}
+            assert browser.post("/sign-in", data=form, headers={"Sec-Fetch-Site": "same-origin"}).status_code == 303
+            bearer = {"Authorization": f"Bearer {token}", "Accept": "application/json", "Cookie": ""}
+            for path, headers in (("/healthz", {}), ("/", {}), ("/api/v1/participants", bearer)):
+                killed_and_healed(installed.database, lambda path=path, headers=headers: browser.get(path, headers=headers))
+        assert installed.processes["web 1"].poll() is None
+
+
+def killed_and_healed(server: Server, ask: Callable[[], httpx.Response]) -> None:
+    """Kill a database and ask until the answer is right again: meanwhile 503 in words with Retry-After, and at least once that."""
+    assert ask().status_code == 200
+    os.kill(server.pid(), signal.SIGKILL)
+    killed, refused = time.monotonic(), []
+    while (answer := ask()).status_code != 200 or not refused:
+        assert time.monotonic() - killed < patience(), answer.text
+        if answer.status_code != 200:
+            refused.append(answer)
+        time.sleep(0.02)
+    assert {a.status_code for a in refused} == {503}
+    assert all(a.headers["retry-after"] == "5" for a in refused)
+    assert all("The database does not answer for the moment." in a.text for a in refused)
 
 
 def test_a_server_that_lives_is_left_alone(tmp_path: Path) -> None:
@@ -105,6 +116,24 @@ def test_what_fails_beneath_is_told_in_true_words(
     assert ("retry-after" in answer.headers) == (status == 503)
     assert answer.headers["x-content-type-options"] == "nosniff"
     assert "select 1" not in answer.text
+
+
+@pytest.mark.parametrize("status", [200, 404])
+def test_an_answer_stands_whose_database_goes_away_after_it_was_made(fresh_database: str, status: int) -> None:
+    service = main.create_app()
+
+    @service.get("/read")
+    def read(db: Db) -> dict[str, int]:
+        pid = db.scalar(text("select pg_backend_pid()"))
+        with new_session() as other:
+            other.execute(text("select pg_terminate_backend(:pid, 5000)"), {"pid": pid})
+        if status == 404:
+            raise NotFound("There is none.")
+        return {"read": 1}
+
+    with TestClient(service) as browser:
+        assert [browser.get("/read").status_code for _ in range(3)] == [status] * 3
+        assert get_engine().pool.checkedout() == 0  # type: ignore[attr-defined]
 
 
 @pytest.mark.slow
