@@ -26,7 +26,19 @@ from _pytest.runner import runtestprotocol
 from tests.promises import PROMISES, Promise
 
 ROOT = Path(__file__).resolve().parents[1]
-COPIED = ("app", "ml", "migrations", "static", "tests", "benchmarks", "docs", "pyproject.toml", "alembic.ini")
+COPIED = (
+    "app",
+    "ml",
+    "migrations",
+    "static",
+    "tests",
+    "benchmarks",
+    "docs",
+    "pyproject.toml",
+    "alembic.ini",
+    "docker-compose.yml",
+    "Dockerfile",
+)
 
 
 def say(line: str) -> None:

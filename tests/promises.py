@@ -48,6 +48,9 @@ def _of(file: str, *broken: tuple[str, str, str, str], at_start: bool = False) -
 
 
 PROMISES = [
+    Promise("the compose file leaves cookies to HTTPS", "docker-compose.yml", "      BETALOOP_COOKIE_SECURE:\n",
+            "      BETALOOP_COOKIE_SECURE: ${BETALOOP_COOKIE_SECURE:-false}\n",
+            "tests/test_compose.py::test_people_sign_in_over_https_alone_unless_somebody_says_otherwise", at_start=True),
     Promise("known flaws of pinned packages fail the checks", "tests/packages/known_flaws.py", "return 1 if flaws else 0", "return 0",
             f"{FLAWS}::test_known_flaws_fail_and_are_named"),
     Promise("a server that is not the list is no clean answer", "tests/packages/known_flaws.py", "or not numbers[0]:", "or False:",

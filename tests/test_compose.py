@@ -50,12 +50,22 @@ def test_every_name_in_it_exists() -> None:
         assert {mount.split(":")[0] for mount in service["volumes"]} <= set(COMPOSE["volumes"]), name
         if name in OURS:
             assert set(service["build"]["args"]) <= set(re.findall(r"^ARG (\w+)$", IMAGE, re.MULTILINE)), name
-            assert set(service["environment"]) <= fields, name
+            assert set(service["environment"]) <= fields | {"FORWARDED_ALLOW_IPS"}, name
             assert "files:/data" in service["volumes"], "every service of ours reads and writes the same files and keys"
     asked = set(re.findall(r"\$\{(\w+):\?", (ROOT / "docker-compose.yml").read_text()))
     assert asked == {"POSTGRES_PASSWORD", "SERVICE_PASSWORD", "TORCH_INDEX"}
     told = (ROOT / "docker-compose.yml").read_text().split("services:")[0]
     assert all(name in told for name in asked), "the head of the file says what to put into .env"
+
+
+def test_people_sign_in_over_https_alone_unless_somebody_says_otherwise() -> None:
+    for name in OURS:
+        stated = SERVICES[name]["environment"]
+        assert stated.get("BETALOOP_COOKIE_SECURE") is None, f"{name}: the file itself says nothing, so the service's own default holds"
+    assert "BETALOOP_COOKIE_SECURE" in SERVICES["web"]["environment"], "it can be said in .env"
+    assert all(port.startswith("127.0.0.1:") for port in SERVICES["web"]["ports"]), "what is published is for this machine, or its proxy"
+    told = (ROOT / "docker-compose.yml").read_text().split("services:")[0]
+    assert all(word in told for word in ("TLS", "FORWARDED_ALLOW_IPS", "BETALOOP_COOKIE_SECURE=false"))
 
 
 def test_the_image_holds_what_runs_and_is_nobody_s_root() -> None:
@@ -112,6 +122,7 @@ def test_its_commands_run_in_their_order(empty: dict[str, str], tmp_path: Path) 
             time.sleep(0.2)
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=10) as answer:
             assert json.loads(answer.read())["status"] == "ready"
+            assert answer.headers["Strict-Transport-Security"], "with what the file says alone, browsers are told to use HTTPS"
     finally:
         for process in (web, worker):
             process.terminate()
