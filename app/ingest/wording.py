@@ -40,6 +40,8 @@ KIND_NAMES = {
 }
 """Kinds of files (`ml.formats.FileKind`, and `unknown` before a file is read) as people call them."""
 WAITS = "cut short: read again by itself"
+COMING = "being received"
+"""By another web service, which alone knows how far it is."""
 AFTER_READER_ENDED = (
     "It is kept encrypted. Send it again in smaller parts, or have BETALOOP_DECODE_MEMORY_MB or BETALOOP_DECODE_SECONDS raised and read it "
     "again on the page of the quarantine."

@@ -95,6 +95,15 @@ def not_counted(db: Session, take_back: Callable[[], None]) -> Iterator[None]:
         raise
 
 
+def coming(db: Session) -> set[int]:
+    """Numbers of the uploads that some process is receiving, this one or another on the same database."""
+    held = text(
+        "select objid::bigint from pg_locks where locktype = 'advisory' and granted and classid::bigint = :space and objsubid = 2"
+        " and database = (select oid from pg_database where datname = current_database())"
+    )
+    return set(db.scalars(held, {"space": LOCKS}))
+
+
 def interrupted(db: Session) -> list[int]:
     """Numbers of the uploads that were begun and that nobody is receiving, oldest first."""
     free = text("select pg_try_advisory_xact_lock(:space, :upload)")

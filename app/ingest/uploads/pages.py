@@ -16,7 +16,7 @@ from app.ingest.models import Upload
 from app.ingest.schemas import UploadForm
 from app.ingest.uploads import service
 from app.ingest.uploads.early_refusal import UploadRoute
-from app.ingest.uploads.in_progress import told
+from app.ingest.uploads.in_progress import coming, told
 from app.ingest.uploads.service import BetaStated, Incoming, UploadOutcome
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, passing
@@ -117,8 +117,8 @@ def report(request: Request, upload_id: RowId, db: Db, caller: CurrentCaller) ->
     )
 
 
-def _state(upload: Upload) -> tuple[str, str]:
-    """What became of an upload, in a few words, and their tone."""
+def _state(upload: Upload, coming_in: set[int]) -> tuple[str, str]:
+    """What became of an upload, in a few words, and their tone; `coming_in` are those that some web service is receiving."""
     if upload.status == "decoded":
         return "read", "good"
     if any(f.preview is not None for f in upload.files):
@@ -126,6 +126,8 @@ def _state(upload: Upload) -> tuple[str, str]:
     if upload.status == "failed":
         return "not usable", "bad"
     found = told(upload.id)
+    if found is None and upload.id in coming_in:
+        return wording.COMING, "info"
     return (wording.progress(found.file, found.files, found.share, found.doing), "info") if found else (wording.WAITS, "warn")
 
 
@@ -138,6 +140,8 @@ def _page(
     error: BetaloopError | None = None,
 ) -> HTMLResponse:
     visits, _ = study.visits(db, participant.id, 1000, 0)
+    uploads = repository.uploads_of_participant(db, participant.id)
+    coming_in = coming(db) if any(u.status == "received" for u in uploads) else set()
     known = dict.fromkeys(_LABELS, "") | typed
     page = render(
         request,
@@ -153,7 +157,7 @@ def _page(
         sessions=study.sessions_of_participant(db, participant.id, with_proposals=True),
         proposed=len(study.proposals_of_participant(db, participant.id)),
         held=sum(f.quarantine_sha256 is not None for f in repository.quarantined_files(db, participant.id)),
-        uploads=[(u, _state(u)) for u in repository.uploads_of_participant(db, participant.id)],
+        uploads=[(u, _state(u, coming_in)) for u in uploads],
         limit_mb=get_settings().upload_limit_mb,
         problem=error.problem(request.url.path) if error else None,
     )

@@ -158,5 +158,6 @@ def test_edited_bytes_of_real_recordings_are_decoded_or_refused_in_words(recordi
 @pytest.mark.parametrize("seed", [1, 2])
 def test_five_thousand_edits_of_real_recordings_are_decoded_or_refused_in_words(recordings: Path, tmp_path: Path, seed: int) -> None:
     told = readings(recordings, tmp_path, 2500 // len(SOURCES) + 1, seed)
+    print(dict(sorted(told.items())))  # noqa: T201 - for docs/reliability.md, shown by `pytest -s`
     assert told.total() >= 2500
     assert min(told["decoded"], told["refused"]) > 100

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from app.accounts.permissions import SYSTEM
 from app.cli import app as command_line
+from app.ingest import wording
 from app.ingest.models import Upload, UploadFile
 from app.ingest.sessions import StatedSession
 from app.ingest.uploads import reading, service
@@ -90,9 +91,14 @@ def test_what_the_sender_had_stated_holds_when_it_is_taken_up(
     assert (session["controller"], session["status"]) == ("random", "confirmed")
 
 
-def test_an_upload_that_is_still_coming_is_left_alone(enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_upload_that_is_still_coming_is_left_alone(
+    client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
     number = cut_short(db, monkeypatch, reading, "decode")
+    page = lambda: client.get("/participants/P1/upload", headers={"Accept": "text/html"}).text  # noqa: E731
+    assert (wording.WAITS in page(), wording.COMING in page()) == (True, False)
     with in_progress(number):
+        assert (wording.WAITS in page(), wording.COMING in page()) == (False, True), "as by another web service"
         assert interrupted(db) == []
         assert list(resume("test")) == []
     db.rollback()
