@@ -23,7 +23,8 @@ from types import CodeType, FunctionType
 import pytest
 from _pytest.runner import runtestprotocol
 
-from tests.promises import PROMISES, Promise
+from tests.promise import Promise
+from tests.promises import PROMISES
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = (

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from tests.promise import Promise
+from tests.promise import of as _of
+from tests.promises_of_faults import FAULTS
 
 CHAIN = "tests/app/platform/test_audit_chain.py"
 ROLE = "tests/app/platform/test_service_role.py"
@@ -14,9 +16,8 @@ ERROR_PAGES = "tests/app/pages/test_error_pages.py"
 FLAWS = "tests/packages/test_known_flaws.py"
 MEMBERS = "tests/app/platform/test_json_members.py"
 PAGES, SIGN_IN = "tests/app/pages/test_page_roles.py", "tests/app/pages/test_sign_in_pages.py"
-HEALING, DOCTOR = "tests/app/platform/test_healing.py", "tests/app/platform/upkeep/test_doctor.py"
 SEALING, BACKUP = "tests/app/platform/upkeep/test_sealing.py", "tests/app/platform/upkeep/test_backup.py"
-DAMAGED, INTERRUPTED = "tests/app/ingest/uploads/test_damaged_files.py", "tests/app/ingest/uploads/test_interrupted.py"
+DAMAGED = "tests/app/ingest/uploads/test_damaged_files.py"
 LOCKS, LOCK_SIGNED = "tests/app/study/visits/test_visit_locks.py", "tests/app/study/visits/test_lock_signatures.py"
 PLANS, KEY = "tests/app/planning/plans/test_sign_off.py", "tests/app/planning/plans/test_sealed_key.py"
 RELEASES, MARGINS = "tests/app/planning/releases/test_releases.py", "tests/app/study/test_margin_signatures.py"
@@ -28,29 +29,7 @@ PASSWORDS, NUMBERS = "tests/app/accounts/test_passwords.py", "tests/app/platform
 LIMITS, BODIES = "tests/app/platform/web/test_source_limits.py", "tests/app/platform/web/test_body_limit.py"
 OWNED, FIGURES = "tests/app/test_ids_belong_together.py", "tests/app/platform/web/test_figures.py"
 
-
-@dataclass(frozen=True)
-class Promise:
-    """What is promised, a change of the code that breaks it (a file, a text that stands in it once, another text), and the test."""
-
-    said: str
-    file: str
-    old: str
-    new: str
-    test: str
-    at_start: bool = False
-    """Whether it is kept when the databases of all tests are made, so that it must be broken before."""
-
-
-def _of(file: str, *broken: tuple[str, str, str, str], at_start: bool = False) -> list[Promise]:
-    """Promises that one file keeps: sentence, text, other text, test."""
-    return [Promise(said, f"app/{file}.py", old, new, test, at_start) for said, old, new, test in broken]
-
-
 PROMISES = [
-    Promise("the compose file leaves cookies to HTTPS", "docker-compose.yml", "      BETALOOP_COOKIE_SECURE:\n",
-            "      BETALOOP_COOKIE_SECURE: ${BETALOOP_COOKIE_SECURE:-false}\n",
-            "tests/test_compose.py::test_people_sign_in_over_https_alone_unless_somebody_says_otherwise", at_start=True),
     Promise("known flaws of pinned packages fail the checks", "tests/packages/known_flaws.py", "return 1 if flaws else 0", "return 0",
             f"{FLAWS}::test_known_flaws_fail_and_are_named"),
     Promise("a server that is not the list is no clean answer", "tests/packages/known_flaws.py", "or not numbers[0]:", "or False:",
@@ -345,63 +324,8 @@ PROMISES = [
         ("the doctor reads hashes", "if not files.is_whole(row.sha256, row.size, hashes)]",
          "if not files.is_whole(row.sha256, row.size, False)]",
          f"{BACKUP}::test_the_doctor_finds_what_is_missing_damaged_or_standing_open"),
-        ("the doctor finds jobs that nobody works on", "    stuck = bool(live) and not workers\n", "    stuck = False\n",
-         f"{DOCTOR}::test_jobs_that_nobody_works_on_are_found"),
-        ("the doctor finds a disk that is nearly full", "    ok = free >= LEAST_FREE_MB\n", "    ok = True\n",
-         f"{DOCTOR}::test_a_disk_that_is_nearly_full_is_found"),
-        ("the doctor finds a clock that goes wrong", "    ok = apart <= MOST_CLOCK_DIFFERENCE_S\n", "    ok = True\n",
-         f"{DOCTOR}::test_a_clock_of_the_database_that_goes_wrong_is_found"),
         ("the doctor sees folders that stand open", "f.is_dir() and f.stat().st_mode & 0o077]", "False]",
          f"{BACKUP}::test_the_doctor_finds_what_is_missing_damaged_or_standing_open"),
-    ),
-    *_of(
-        "ingest/uploads/service",
-        ("an upload that a full disk cut short is told so", "        if beneath is not None:\n            self.status,",
-         "        if False:\n            self.status,",
-         f"{INTERRUPTED}::test_a_fault_after_the_bytes_are_safe_tells_so_and_is_mended_without_a_restart"),
-        ("a full disk leaves no upload without sessions", "        if passing(fault) is not None:\n            raise  # they are made",
-         "        if False:\n            raise  # they are made",
-         f"{INTERRUPTED}::test_a_disk_that_stays_full_is_no_fault_of_the_file"),
-    ),
-    *_of(
-        "ingest/uploads/receiving",
-        ("a full disk is no fault of the file", "            if passing(fault) is not None:\n", "            if False:\n",
-         f"{INTERRUPTED}::test_a_disk_that_stays_full_is_no_fault_of_the_file"),
-    ),
-    *_of(
-        "ingest/uploads/in_progress",
-        ("a full disk counts against no file", "                take_back()\n", "                pass\n",
-         f"{INTERRUPTED}::test_a_disk_that_stays_full_is_no_fault_of_the_file"),
-        ("a database that dies hides nothing that is kept", "            with suppress(DBAPIError):\n", "            if True:\n",
-         f"{INTERRUPTED}::test_a_database_that_dies_during_an_upload_does_not_hide_what_is_kept"),
-    ),
-    *_of(
-        "platform/errors",
-        ("a full disk is told as one", "if isinstance(error, OSError) and error.errno in FULL:", "if False:",
-         f"{HEALING}::test_what_fails_beneath_is_told_in_true_words"),
-        ("a database that is away is told as one", "    if invalidated or unreached or state[:2] in _AWAY or state[:3] in _AWAY:\n",
-         "    if False:\n", f"{HEALING}::test_what_fails_beneath_is_told_in_true_words"),
-    ),
-    *_of(
-        "platform/upkeep/commands",
-        ("the doctor ends with exit code 1 where something is wrong", "    if not all(f.ok for f in findings):\n", "    if False:\n",
-         f"{DOCTOR}::test_the_exit_code_is_1_and_the_lines_say_what_is_wrong"),
-    ),
-    *_of(
-        "platform/database",
-        ("an answer stands whose database goes away", "        if passing(error) is None:\n            raise\n        log.warning",
-         "        raise\n        log.warning", f"{HEALING}::test_an_answer_stands_whose_database_goes_away_after_it_was_made"),
-    ),
-    *_of(
-        "platform/logs",
-        ("a log on a full disk costs no answer", "        with suppress(OSError):\n            self._stream.write(text)\n",
-         "        self._stream.write(text)\n", "tests/app/platform/test_logs.py::test_a_log_on_a_full_disk_loses_lines_and_no_answers"),
-    ),
-    *_of(
-        "platform/jobs/children/child",
-        ("a step on a full disk says so", 'return "full" if error.errno in FULL else "error"', 'return "error"',
-         "tests/app/platform/jobs/test_children.py::test_a_full_disk_is_told_from_a_fault_of_the_step"),
-        at_start=True,
     ),
     *_of(
         "platform/web/middleware",
@@ -450,4 +374,5 @@ PROMISES = [
         ("what one asks, another answers", "can.WRITE_STUDY if given.state is QueryState.ANSWERED else can.ASK_QUERIES", "can.READ",
          f"{PAGES}::test_every_form_against_every_role"),
     ),
+    *FAULTS,
 ]  # fmt: skip
