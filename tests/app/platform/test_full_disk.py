@@ -19,7 +19,7 @@ import pytest
 from benchmarks.installed.installation import PASSWORD, STARTED_S, Installation
 from benchmarks.installed.writers import PEOPLE, Writers, make_study, what_is_wrong
 from tests.app.platform.test_healing import patience
-from tests.small_disks import fill, grow, make_room, small_disk
+from tests.app.platform.upkeep.small_disks import fill, grow, make_room, small_disk
 
 ADMIN = next(iter(PEOPLE))
 SAID = {503: "The database does not answer for the moment.", 507: "There is no room left on the disk."}

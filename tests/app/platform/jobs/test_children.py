@@ -10,7 +10,7 @@ import pytest
 from app.platform.jobs.children.child import FULL_DISK, ChildLimits, params_hash
 from app.platform.jobs.children.forked import ForkedProcesses
 from app.platform.jobs.children.supervisor import ComputeCall
-from tests.small_disks import small_disk
+from tests.app.platform.upkeep.small_disks import small_disk
 
 
 def test_a_result_is_reused_for_equal_params_and_the_folder_emptied_for_others(kinds, tmp_path):

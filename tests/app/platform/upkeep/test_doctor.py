@@ -20,8 +20,8 @@ from app.platform.jobs.models import Worker
 from app.platform.jobs.service import STALE_S
 from app.platform.upkeep import doctor
 from app.settings import get_settings
+from tests.app.platform.upkeep.small_disks import small_disk
 from tests.conftest import close_connections
-from tests.small_disks import small_disk
 
 
 def found(exit_code: int) -> dict[str, dict[str, Any]]:
