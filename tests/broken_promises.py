@@ -23,7 +23,7 @@ from types import CodeType, FunctionType
 import pytest
 from _pytest.runner import runtestprotocol
 
-from tests.promise import Promise
+from tests.promised.promise import Promise
 from tests.promises import PROMISES
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from tests.promise import Promise
-from tests.promise import of as _of
-from tests.promises_of_faults import FAULTS
+from tests.promised.faults import FAULTS
+from tests.promised.promise import Promise
+from tests.promised.promise import of as _of
 
 CHAIN = "tests/app/platform/test_audit_chain.py"
 ROLE = "tests/app/platform/test_service_role.py"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from tests.promise import Promise
-from tests.promise import of as _of
+from tests.promised.promise import Promise
+from tests.promised.promise import of as _of
 
 INTERRUPTED = "tests/app/ingest/uploads/test_interrupted.py"
 HEALING, DOCTOR = "tests/app/platform/test_healing.py", "tests/app/platform/upkeep/test_doctor.py"
