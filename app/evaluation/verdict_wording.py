@@ -39,8 +39,24 @@ def plainly(reasons: Sequence[Flag], limit: float | None = None, limit_ma: float
     if limit is not None:
         return f"lower than two sessions ever held: not below {amplitude(limit, limit_ma)}"
     more = further_sessions(reasons)
-    found = [_PLAINLY[r.code](r) for r in reasons if r.code in _PLAINLY]
+    found = [_undecided(reasons) if r.code == "undecided" else _PLAINLY[r.code](r) for r in reasons if r.code in _PLAINLY]
     return "; ".join([*found[:2], *([more] if more else [])])
+
+
+def _undecided(reasons: Sequence[Flag]) -> str:
+    """What a test asks for and the policy does not reach; which of the two probabilities that every verdict states is too low."""
+    low = {r.code: r for r in reasons if r.code in _TEST_ASKS and r.value is not None and r.limit is not None and r.value < r.limit}
+    told = [f"a test asks for {percent(low[code].limit)} {words}" for code, words in _TEST_ASKS.items() if code in low]
+    return f"not sure enough: {', and '.join(told)}" if told else "whether it is no worse than cDBS is still open"
+
+
+def likely(within: float, *, defined: bool = False) -> str:
+    """The chance that no outcome is worse than its margin allows.
+
+    Args:
+        within: that probability. defined: whether words near by have said by how much something may be worse.
+    """
+    return f"{chance(within)} likely no worse than cDBS" + ("" if defined else " by more than the margins")
 
 
 def further_sessions(reasons: Sequence[Flag]) -> str:
@@ -52,19 +68,18 @@ def further_sessions(reasons: Sequence[Flag]) -> str:
     return f"{' '.join(told)} would tell"
 
 
-def effect(differences: Mapping[str, Difference], within: float | None = None) -> str:
+def effect(differences: Mapping[str, Difference], within: float | None = None, *, defined: bool = False) -> str:
     """What a policy is expected to change against cDBS, in one line.
 
     Args:
-        differences: by quantity, as the answer's rows have them. within: probability that all outcomes are within their margins.
+        differences: by quantity, as the answer's rows have them. within, defined: as `likely` has them; no word of it without `within`.
     """
     told = [
         change(name, scale * differences[quantity].value, digits, unit)
         for quantity, name, scale, digits, unit in _CHANGES
         if quantity in differences
     ]
-    likely = "" if within is None else f"; {chance(within)} likely within the margins"
-    return (", ".join(told) or "what it would change is not estimated") + likely
+    return (", ".join(told) or "what it would change is not estimated") + ("" if within is None else f"; {likely(within, defined=defined)}")
 
 
 def change(name: str, difference: float, digits: int, unit: str) -> str:
@@ -87,6 +102,7 @@ _CHANGES = (
 )
 """Of each quantity: name, scale, digits, unit."""
 
+_TEST_ASKS = {"within_margins": "likely no worse than cDBS", "saves_energy": "likely to use less energy"}
 _FURTHER = ("sessions_needed", "near_amplitude", "visits_needed")
 
 
@@ -95,7 +111,9 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "no_posterior": lambda f: "evaluated by an earlier betaloop: evaluate again",
     "adverse_event": lambda f: "serious adverse event, not cleared by a clinician",
     "nearly_off": lambda f: f"nearly off {percent(f.value)} of the time",
-    "beyond_margin": lambda f: f"{chance(number(f))} likely beyond a margin, most often that of {OUTCOME_NAMES[f.fact('outcome')]}",
+    "beyond_margin": lambda f: (
+        f"{chance(number(f))} likely worse than cDBS by more than a margin, most often that of {OUTCOME_NAMES[f.fact('outcome')]}"
+    ),
     "all_below_zero": lambda f: "its whole expected gain lies below that of cDBS",
     "few_near_sessions": lambda f: "hardly any session came near what it does",
     "few_near_visits": lambda f: "only one visit came near what it does",
@@ -106,10 +124,12 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "below_random_bound": lambda f: f"{percent(f.value)} of the time it goes lower than the random sessions did",
     "no_ordering_skill": lambda f: "the recordings so far cannot tell policies apart",
     "coverage_unchecked": lambda f: "what the recordings cover could not be checked",
-    "reference_missing": lambda f: "there is no estimate of cDBS to hold it against",
+    "reference_missing": lambda f: "nothing is known of cDBS to hold it against",
     "reference_unsupported": lambda f: "too few sessions of cDBS to hold it against",
     "outcomes_unknown": lambda f: "no session has grasp, rating or tremor",
-    "undecided": lambda f: "within the margins or beyond: still open",
+    "energy_unknown": lambda f: "whether it uses less energy is not known",
+    "undecided": lambda f: _undecided((f,)),
+    "acts_like_cdbs": lambda f: f"{percent(f.value)} of the cDBS amplitude away from it on average",
     "not_settled_by_sessions": lambda f: "more sessions near its amplitude would not settle it",
 }
 """For the first screen of the ranking, and for plans, by code; what is not here is told further down alone."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -115,23 +115,25 @@ class Choice:
     """A policy that may be planned, and what the ranking says of it.
 
     Attributes:
-        row: None for what no ranking holds. twins: policies that do the same by the ranking, such as its students.
+        row: its own; None for what no ranking holds. twins: policies that do the same by the ranking.
     """
 
     policy: Policy
     row: Row | None
-    twins: tuple[Policy, ...]
+    twins: tuple[Choice, ...] = ()
 
 
 def _choices(db: Session, participant: Participant, answered: Answer | None) -> list[Choice]:
     """Behaviours that may be planned, what to test first; policies that no ranking holds come last."""
-    rows = answered.everyone() if answered is not None else {}
+    rows, heads = (answered.everyone(), answered.heads()) if answered is not None else ({}, {})
     places = {i: k for k, i in enumerate(rows)}
     policies = sorted(learning.candidates(db, participant.id), key=lambda p: (places.get(p.id, len(places)), p.id))
-    known = {p.id for p in policies}
-    heads = {p.id: rows[p.id].one.policy.id if p.id in rows and rows[p.id].one.policy.id in known else p.id for p in policies}
-    twins = {head: tuple(p for p in policies if heads[p.id] == head and p.id != head) for head in heads.values()}
-    return [Choice(p, rows.get(p.id), twins[p.id]) for p in policies if heads[p.id] == p.id]
+    known = {p.id for p in policies}  # a retired one is in the ranking, and may not be planned
+    groups: dict[int, list[Choice]] = {}
+    for p in policies:
+        head = heads.get(p.id, p.id)
+        groups.setdefault(head if head in known else p.id, []).append(Choice(p, rows.get(p.id)))
+    return [replace(first, twins=tuple(others)) for first, *others in groups.values()]
 
 
 def _chosen(view: PlanView | None, values: FormData | None) -> Sequence[int]:

@@ -9,7 +9,6 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.evaluation import verdict_wording
-from app.evaluation.ranking.judged import own_row
 from app.evaluation.ranking.service import current
 from app.learning.deps import CurrentOwnPolicy
 from app.learning.models import Policy
@@ -33,7 +32,7 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
         judged = current(db, participant, caller)
     except NotFound:
         judged = None
-    row = own_row(judged.assessment, judged.answer, policy.id) if judged else None
+    row = judged.answer.everyone().get(policy.id) if judged else None
     below = below_bound(policy)
     page = render(
         request,

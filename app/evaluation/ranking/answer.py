@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.evaluation.ranking.assessment import Assessed, Assessment
+from app.evaluation.ranking.behaviours import behaviours, nearly_off
 from app.evaluation.ranking.decisions import Decided
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.verdict import interval, outcome_draws
 
 ORDER = ("test", "test_with_care", "cannot_tell", "not_advised", "unsafe", "same_as_cdbs")
 """Rows by what to do with them; within a verdict as the ranking has them."""
-
-SAME_BEHAVIOUR = 0.02
-"""A student whose mean amplitude and distance to cDBS differ from its teacher's by less does what its teacher does."""
 
 OFF_SHARE = 0.8
 """A policy that is nearly off in more than this share of its steps acts like no stimulation."""
@@ -41,13 +39,13 @@ class Row:
     """One behaviour among the candidates.
 
     Attributes:
-        twins: policies that do the same, such as its students. decided: the verdict.
+        twins: rows of the policies that do the same, each with its own numbers and without twins. decided: the verdict.
         differences: to cDBS, by quantity; a quantity is absent where it is not predicted.
         limit_ma: for a test with care, the lowest amplitude, mA (fraction in `limit` where the cDBS amplitude is not known).
     """
 
     one: Assessed
-    twins: tuple[Assessed, ...]
+    twins: tuple[Row, ...]
     decided: Decided
     differences: dict[str, Difference]
     limit: float | None
@@ -111,13 +109,23 @@ class Answer:
     @property
     def tested(self) -> bool:
         """Whether some candidate that was trained here ran in a session, so that a next generation can go on from it."""
-        everyone = (a for row in (*self.rows, *self.like_cdbs, *self.like_off) for a in (row.one, *row.twins))
+        everyone = (row.one for row in self.everyone().values())
         return any(a.tested is not None and a.policy.kind in ("trained", "distilled") for a in everyone)
 
+    @staticmethod
+    def counted(rows: Sequence[Row]) -> int:
+        """How many policies rows hold, those that do the same among them."""
+        return sum(1 + len(row.twins) for row in rows)
+
     def everyone(self) -> dict[int, Row]:
-        """Every candidate's row by the id of its policy, what to test first; twins have the row of what they do the same as."""
+        """Every candidate's own row by the id of its policy, what to test first, twins after what they do the same as."""
         rows = (*self.rows, *self.like_cdbs, *self.like_off)
-        return {a.policy.id: r for r in rows for a in (r.one, *r.twins)}
+        return {own.one.policy.id: own for r in rows for own in (r, *r.twins)}
+
+    def heads(self) -> dict[int, int]:
+        """By the id of every candidate that of the one whose row it is in."""
+        rows = (*self.rows, *self.like_cdbs, *self.like_off)
+        return {own.one.policy.id: r.one.policy.id for r in rows for own in (r, *r.twins)}
 
     @property
     def cheapest(self) -> list[Row]:
@@ -133,9 +141,9 @@ class Answer:
 
 def answer(found: Assessment) -> Answer:
     """What to say of an assessment's candidates."""
-    rows = _distinct(found)
+    rows = [_row(found, one, tuple(_row(found, twin) for twin in twins)) for one, *twins in behaviours(found)]
     rows.sort(key=lambda r: ORDER.index(r.decided.standing))  # stable: within a verdict as ranked
-    off = [r for r in rows if _like_off(r.one.posterior)]
+    off = [r for r in rows if nearly_off(r.one.posterior) > OFF_SHARE]
     same = [r for r in rows if r.decided.decision == "same_as_cdbs" and r not in off]
     return Answer(tuple(r for r in rows if r not in off and r not in same), tuple(same), tuple(off), found.ordered, _under_cdbs(found))
 
@@ -154,48 +162,13 @@ def differences(own: Estimate | None, cdbs: Estimate | None) -> dict[str, Differ
     return found
 
 
-def _distinct(found: Assessment) -> list[Row]:
-    """Candidates with the students that do the same folded under their teacher."""
-    candidates = [a for a in found.candidates if a.decided is not None]
-    by_id = {a.policy.id: a for a in candidates}
-    twins: dict[int, list[Assessed]] = {}
-    for a in candidates:
-        teacher = by_id.get(a.policy.teacher_id) if a.policy.teacher_id is not None else None
-        if teacher is not None and _same(a, teacher):
-            twins.setdefault(teacher.policy.id, []).append(a)
-    folded = {a.policy.id for group in twins.values() for a in group}
-    return [_row(found, a, twins.get(a.policy.id, ())) for a in candidates if a.policy.id not in folded]
-
-
-def _row(found: Assessment, one: Assessed, twins: Sequence[Assessed]) -> Row:
+def _row(found: Assessment, one: Assessed, twins: tuple[Row, ...] = ()) -> Row:
     if one.decided is None:
         raise ValueError(f"policy {one.policy.id} is a reference and has no verdict")
     limit = one.decided.limit
     cdbs = found.cdbs.posterior if found.cdbs else None
     ma = None if limit is None or found.cdbs_ma is None else limit * found.cdbs_ma
-    return Row(one, tuple(twins), one.decided, differences(one.posterior, cdbs), limit, ma)
-
-
-def _same(student: Assessed, teacher: Assessed) -> bool:
-    if student.decided is None or teacher.decided is None or student.decided.decision != teacher.decided.decision:
-        return False
-    if student.decided.needs_override != teacher.decided.needs_override:
-        return False
-    if (student.policy.retired_reason is None) != (teacher.policy.retired_reason is None):
-        return False
-    ours, theirs = _behaviour(student.posterior), _behaviour(teacher.posterior)
-    return bool(ours) and bool(theirs) and all(abs(a - b) < SAME_BEHAVIOUR for a, b in zip(ours, theirs, strict=True))
-
-
-def _behaviour(estimate: Estimate | None) -> tuple[float, ...]:
-    known = (estimate.details.get("behaviour") or {}) if estimate is not None else {}
-    names = ("mean_amplitude", "closeness_to_cdbs", "below_cdbs_20_percent")
-    return tuple(float(known[name]) for name in names) if all(known.get(name) is not None for name in names) else ()
-
-
-def _like_off(estimate: Estimate | None) -> bool:
-    known = (estimate.details.get("behaviour") or {}) if estimate is not None else {}
-    return float(known.get("below_cdbs_20_percent") or 0.0) > OFF_SHARE
+    return Row(one, twins, one.decided, differences(one.posterior, cdbs), limit, ma)
 
 
 def _held_back(row: Row) -> bool:

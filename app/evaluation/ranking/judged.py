@@ -122,7 +122,7 @@ class Judged:
         return random_sessions(self.sessions.rows, self.caller, settings, self.participant.margins_in_force, self.cdbs_ma)
 
     def picture(self, lower_bound: float, policy_id: int | None = None) -> Picture:
-        """The picture of the candidates that are neither cDBS nor off by another name, or of one candidate.
+        """The picture of the candidates, those that act like cDBS last, or of one candidate.
 
         Args:
             lower_bound: B, fraction of cDBS. policy_id: a candidate, which is drawn under its own name where it is a twin.
@@ -130,19 +130,11 @@ class Judged:
 
         def read() -> Picture:
             found, unit = self._answer_with_draws, self.db.get_one(BufferSnapshot, self.evaluation.snapshot_id).beta_unit
-            one = None if policy_id is None else own_row(self.with_draws, found, policy_id)
-            rows = [*found.rows, *found.like_off] if policy_id is None else [one] if one else []
+            one = None if policy_id is None else found.everyone().get(policy_id)
+            rows = [*found.rows, *found.like_off, *found.like_cdbs] if policy_id is None else [replace(one, twins=())] if one else []
             return picture(self.with_draws, rows, unit, lower_bound)
 
         return self.kept(("picture", lower_bound, policy_id), read)
-
-
-def own_row(found: Assessment, answered: Answer, policy_id: int) -> Row | None:
-    """A candidate's row under its own name, also where it is the twin of another; None where it is no candidate."""
-    row, own = answered.everyone().get(policy_id), found.of(policy_id)
-    if row is None or own is None or own.decided is None:
-        return None
-    return row if row.one is own else replace(row, one=own, decided=own.decided)
 
 
 def judged(
@@ -203,4 +195,4 @@ def _slim(estimate: Estimate) -> Estimate:
 
 
 def _row_without_draws(row: Row) -> Row:
-    return replace(row, one=_without_draws(row.one), twins=tuple(_without_draws(a) for a in row.twins))
+    return replace(row, one=_without_draws(row.one), twins=tuple(map(_row_without_draws, row.twins)))

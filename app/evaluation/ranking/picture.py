@@ -8,24 +8,24 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from app.evaluation.estimates.coverage import STORED
 from app.evaluation.ranking.answer import QUANTITIES, Row
 from app.evaluation.ranking.assessment import Assessed, Assessment
+from app.evaluation.ranking.behaviours import map_of
 from app.platform.web.charts import Cell, written
 from app.platform.web.svg import Plane, apart, drawing
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.verdict import interval, outcome_draws
 from ml.ope.support.behaviour_map import DOSES, BehaviourMap
 
-MAP = "map"
-"""Member of what `check_coverage` found."""
-
 MOST = 8
-"""Candidates that are drawn; more would hide each other, and stand in the table."""
+"""Behaviours that have a line; more would hide each other. Every candidate has its dot."""
 
-TONES = {"test": "good", "test_with_care": "warn", "unsafe": "bad", "not_advised": "bad", "cannot_tell": "accent", "same_as_cdbs": "cdbs"}
+TONES = {"test": "good", "test_with_care": "warn", "unsafe": "bad", "not_advised": "bad", "cannot_tell": "accent", "same_as_cdbs": "muted"}
+LIGHTEST, DARKEST = 0.10, 0.40
+"""Opacity of a cell of one recorded step, and of the one with most; over the darkest every line still has three times its luminance."""
 DASHES = ("", "8 4", "2 4", "10 3 2 3")
 """Of candidates with one colour, so that colour is never the only sign."""
+_GREY = TONES["same_as_cdbs"]
 SHAPES = ("circle", "diamond", "square", "up", "down")
 _PANELS = {
     "energy": ("Energy, % of cDBS", 100.0),
@@ -61,7 +61,11 @@ class Scale:
 
 @dataclass(frozen=True)
 class Drawn:
-    """One candidate as both figures draw it."""
+    """One candidate as both figures draw it.
+
+    Attributes:
+        twin: whether it does the same as another candidate: it has a dot, and no line of its own.
+    """
 
     name: str
     policy_id: int
@@ -70,6 +74,7 @@ class Drawn:
     shape: str
     estimate: Estimate | None
     limit: float | None
+    twin: bool
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,8 @@ class Picture:
     Attributes:
         behaviour: amplitude against beta; None where the evaluation is of before it was stored.
         doses: what each dose is expected to do; None without any.
-        behaviour_columns, behaviour_rows, dose_columns, dose_rows: tables. left_out: candidates that are in the tables alone.
+        behaviour_columns, behaviour_rows, dose_columns, dose_rows: tables.
+        lines, without_line: behaviours that have a line, and that have none. greyed: whether some act like cDBS, and are grey.
     """
 
     behaviour: Markup | None
@@ -88,7 +94,9 @@ class Picture:
     behaviour_rows: tuple[tuple[Cell, ...], ...]
     dose_columns: tuple[str, ...]
     dose_rows: tuple[tuple[Cell, ...], ...]
-    left_out: int
+    lines: int
+    without_line: int
+    greyed: bool
 
 
 def picture(found: Assessment, rows: Sequence[Row], unit: str, lower_bound: float) -> Picture:
@@ -99,22 +107,23 @@ def picture(found: Assessment, rows: Sequence[Row], unit: str, lower_bound: floa
     """
     scale = Scale.of(found.cdbs_ma)
     everyone = _drawn(rows)
-    shown = everyone[:MOST]
-    stored = (found.evaluation.diagnostics.get(STORED) or {}).get(MAP)
-    known = BehaviourMap.from_json(stored) if stored else None
-    named = {str(d.policy_id): d.name for d in everyone}
+    behaviours = [d for d in everyone if not d.twin]
+    known = map_of(found.evaluation)
+    named = {str(d.policy_id): d.name for d in behaviours}
     references = sorted(
         (a for a in found.references if a.reference in ("cdbs", "constant", "best_constant") and _dose(a.posterior) is not None),
         key=lambda a: _dose(a.posterior) or 0.0,
     )
     return Picture(
-        behaviour=_behaviour(known, shown, scale, unit, lower_bound) if known else None,
-        doses=_doses(shown, references, scale),
+        behaviour=_behaviour(known, behaviours[:MOST], scale, unit, lower_bound) if known else None,
+        doses=_doses(everyone, references, scale),
         behaviour_columns=(f"Beta from ({unit})", f"to ({unit})", "Recorded steps", *(f"{n} ({scale.unit})" for n in named.values())),
         behaviour_rows=_behaviour_rows(known, list(named), scale) if known else (),
         dose_columns=("Policy", f"Mean amplitude ({scale.unit})", *(t for t, _ in _PANELS.values())),
         dose_rows=tuple(_dose_row(name, e, scale) for name, e in _listed(everyone, references)),
-        left_out=max(0, len(everyone) - MOST),
+        lines=min(MOST, len(behaviours)),
+        without_line=max(0, len(behaviours) - MOST),
+        greyed=any(d.tone == _GREY for d in everyone),
     )
 
 
@@ -124,9 +133,10 @@ def _drawn(rows: Sequence[Row]) -> list[Drawn]:
         tone = TONES[row.decided.standing]
         nth = seen[tone]
         seen[tone] += 1
-        policy = row.one.policy
-        look = DASHES[nth % len(DASHES)], SHAPES[nth % len(SHAPES)]
-        found.append(Drawn(policy.name, policy.id, tone, *look, row.one.posterior, row.limit))
+        look = tone, DASHES[nth % len(DASHES)], SHAPES[nth % len(SHAPES)]
+        for own in (row, *row.twins):
+            policy = own.one.policy
+            found.append(Drawn(policy.name, policy.id, *look, own.one.posterior, own.limit, twin=own is not row))
     return found
 
 
@@ -136,7 +146,7 @@ def _behaviour(known: BehaviourMap, shown: Sequence[Drawn], scale: Scale, unit: 
     for k, column in enumerate(known.tried):
         for row, n in enumerate(column):
             if n:
-                dark = 0.10 + 0.45 * float(np.log1p(n) / np.log1p(most))
+                dark = LIGHTEST + (DARKEST - LIGHTEST) * float(np.log1p(n) / np.log1p(most))
                 low, high = row / DOSES * scale.factor, (row + 1) / DOSES * scale.factor
                 plane.cell(known.edges[k], known.edges[k + 1], low, high, "muted", dark)
     plane.axes(f"Beta, mean of the policy's window ({written(unit)})", f"Amplitude ({scale.unit})")
@@ -144,12 +154,12 @@ def _behaviour(known: BehaviourMap, shown: Sequence[Drawn], scale: Scale, unit: 
     plane.level(lower_bound * scale.factor, f"lowest of random sessions {scale.words(lower_bound)}", "muted", "2 3")
     centres = [(a + b) / 2 for a, b in zip(known.edges[:-1], known.edges[1:], strict=True)]
     ends: list[tuple[Drawn, float]] = []
-    for d in shown:
+    for d in reversed(shown):  # what matters first lies on top
         curve = known.policies.get(str(d.policy_id))
         if curve is None:
             continue
         values = [None if v is None else v * scale.factor for v in curve.middle]
-        plane.line(list(zip(centres, values, strict=True)), d.tone, 2.5, d.dash)
+        plane.line(list(zip(centres, values, strict=True)), d.tone, 1.5 if d.tone == _GREY else 2.5, d.dash)
         last = next((v for v in reversed(values) if v is not None), None)
         if last is not None:
             ends.append((d, plane.at_y(last)))
@@ -163,7 +173,7 @@ def _behaviour(known: BehaviourMap, shown: Sequence[Drawn], scale: Scale, unit: 
         )
         plane.mark(right + 16, at, d.tone, d.shape)
         plane.text(right + 25, at + 4, d.name, colour=d.tone, weight=600)
-    told = "; ".join(d.name for d, _ in ends)
+    told = "; ".join(d.name for d in shown)
     return drawing(W, H, "Amplitude against beta", f"Lines: {told}. Grey: where recorded sessions have been.", [plane])
 
 
@@ -182,7 +192,7 @@ def _doses(shown: Sequence[Drawn], references: Sequence[Assessed], scale: Scale)
         plane.line([(x, p[0] * factor) for x, p in held], "cdbs", 1.5, "4 3")
         for x, p in held:
             plane.dot(x, p[0] * factor, "cdbs", "ring", f"held at {x:.3g} {scale.unit}: {p[0] * factor:.3g}")
-        for d in shown:
+        for d in reversed(shown):
             dose, span = _dose(d.estimate), _predicted(d.estimate, name)
             if dose is not None and span is not None:
                 value, low_end, high_end = (v * factor for v in span)

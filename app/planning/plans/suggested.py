@@ -74,7 +74,7 @@ def _portfolio(found: Assessment, slots: int) -> tuple[Suggested, ...]:
         if ours.size == theirs.size >= FEWEST_DRAWS:
             differences[str(row.one.policy.id)] = ours - theirs
             policies[str(row.one.policy.id)] = row.one.policy
-            if any(one.tested is not None for one in (row.one, *row.twins)):
+            if any(own.one.tested is not None for own in (row, *row.twins)):
                 tested.add(str(row.one.policy.id))
     # of a session's difference to the visit's cDBS, of which a plan holds two sessions or more; evaluations of before do not say it
     noise = float(found.cdbs.posterior.details.get("return_noise") or 0.0) * math.sqrt(1 + 1 / CDBS_SESSIONS)

@@ -14,7 +14,7 @@ from app.evaluation import repository as evaluations
 from app.evaluation import wording
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.answer import Row
-from app.evaluation.ranking.judged import Judged, judged, own_row
+from app.evaluation.ranking.judged import Judged, judged
 from app.evaluation.ranking.service import evaluation_notes
 from app.evaluation.ranking.staleness import stale_reasons
 from app.learning.models import Policy
@@ -169,7 +169,7 @@ def view_of(db: Session, plan: Plan, visit: Visit) -> PlanView:
     for item in plan.items:
         estimate = estimates.get(item.policy_id) if item.policy_id else None
         policy = policies.get(item.policy_id) if item.policy_id else None
-        row = own_row(found.assessment, found.answer, policy.id) if found and policy else None
+        row = found.answer.everyone().get(policy.id) if found and policy else None
         lines.append(PlanLine(item, start, policy, estimate, row, _energy(item, estimate), _design(visit, item)))
         start += item.minutes + item.washout_minutes + item.break_minutes
     stale = _stale_reasons(db, visit.participant, evaluation)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from app.evaluation.verdict_wording import STANDING_NAMES, effect, plainly
-from app.evaluation.wording import chance
+from app.evaluation.verdict_wording import STANDING_NAMES, effect, likely, plainly
 from app.planning import wording
 from app.planning.plans.view import PlanLine, PlanView
 from app.planning.sheet.ink import clock, printed_name, printed_warning, shade
@@ -63,12 +62,12 @@ def _bundle(line: PlanLine, sha256: str | None) -> str:
 
 
 def _verdict(line: PlanLine) -> str:
-    """The ranking's verdict with its reason and the chance of being within the margins; empty of what was not ranked."""
+    """The ranking's verdict with its reason and the chance of being no worse than cDBS; empty of what was not ranked."""
     if line.row is None:
         return ""
     why = plainly(line.row.decided.hazards or line.row.decided.reasons, line.row.limit, line.row.limit_ma)
-    likely = "" if line.row.within is None else f"; {chance(line.row.within)} likely within the margins"
-    return STANDING_NAMES[line.row.decided.standing] + (f": {why}" if why else "") + likely
+    chance = "" if line.row.within is None else f"; {likely(line.row.within)}"
+    return STANDING_NAMES[line.row.decided.standing] + (f": {why}" if why else "") + chance
 
 
 def _expected(line: PlanLine) -> str:

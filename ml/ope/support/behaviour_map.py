@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -44,11 +44,19 @@ class BehaviourMap:
         edges: of the columns, mean beta of a window, in its unit, [COLUMNS + 1].
         tried: recorded steps by column and row of amplitude, [COLUMNS][DOSES]; row i holds the fractions from i / DOSES on.
         policies: by name.
+        apart: mean absolute difference of the amplitudes of two policies over the recorded windows, fraction of cDBS, each pair once, under
+            the name that comes first; empty in a map of before it was stored.
     """
 
     edges: tuple[float, ...]
     tried: tuple[tuple[int, ...], ...]
     policies: dict[str, Curve]
+    apart: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    def distance(self, one: str, other: str) -> float | None:
+        """How far two policies are apart, fraction of cDBS, as `apart` has it; None where it was not stored."""
+        found = self.apart.get(one, {}).get(other)
+        return found if found is not None else self.apart.get(other, {}).get(one)
 
     def to_json(self) -> dict[str, Any]:
         """As stored; `from_json` takes it back."""
@@ -58,7 +66,8 @@ class BehaviourMap:
     def from_json(cls, stored: Mapping[str, Any]) -> BehaviourMap:
         """A stored map."""
         curves = {name: Curve(*(tuple(c[member]) for member in ("middle", "low", "high"))) for name, c in stored["policies"].items()}
-        return cls(tuple(stored["edges"]), tuple(tuple(column) for column in stored["tried"]), curves)
+        tried = tuple(tuple(column) for column in stored["tried"])
+        return cls(tuple(stored["edges"]), tried, curves, {name: dict(to) for name, to in stored.get("apart", {}).items()})
 
 
 def behaviour_map(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> BehaviourMap:
@@ -77,8 +86,19 @@ def behaviour_map(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> Behav
     dose = np.clip((table.actions * DOSES + 1e-9).astype(np.int64), 0, DOSES - 1)
     tried = np.zeros((COLUMNS, DOSES), dtype=np.int64)
     np.add.at(tried, (column, dose), 1)
-    curves = {name: _curve(np.clip(policy.act(table.states), 0.0, 1.0), column) for name, policy in policies.items()}
-    return BehaviourMap(tuple(map(float, edges)), tuple(tuple(map(int, row)) for row in tried), curves)
+    asked = {name: np.clip(policy.act(table.states), 0.0, 1.0) for name, policy in policies.items()}
+    curves = {name: _curve(actions, column) for name, actions in asked.items()}
+    return BehaviourMap(tuple(map(float, edges)), tuple(tuple(map(int, row)) for row in tried), curves, _apart(asked))
+
+
+def _apart(asked: Mapping[str, NDArray[np.float64]]) -> dict[str, dict[str, float]]:
+    names = list(asked)
+    table = np.stack([asked[name] for name in names]) if names else np.zeros((0, 0))
+    found: dict[str, dict[str, float]] = {}
+    for k, name in enumerate(names[:-1]):
+        gaps = np.abs(table[k + 1 :] - table[k]).mean(1)
+        found[name] = {other: round(float(gap), 4) for other, gap in zip(names[k + 1 :], gaps, strict=True)}
+    return found
 
 
 def _curve(actions: NDArray[np.float64], column: NDArray[np.int64]) -> Curve:

@@ -18,8 +18,12 @@ from app.evaluation.models import EstimateRow, Evaluation
 from app.platform.kept import forget
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag, distinct
+from ml.ope.posterior.verdict import Levels, verdict
 from ml.ope.support.coverage import thin
+from ml.qoc import Margins
 from tests.app.evaluations import estimate, judged
+from tests.app.words import methods_named
+from tests.ml.ope.posterior.draws import N, cdbs, constructed
 
 RANKING = "/api/v1/participants/P1/ranking"
 NEARLY_OFF = {"below_cdbs_20_percent": 0.5}
@@ -43,7 +47,7 @@ def test_reworded_sentences_change_no_rank_support_or_decision(
     page = client.get("/participants/P1/ranking").text
     for words in (wording, verdict_wording):
         for name, _ in inspect.getmembers(words, inspect.isfunction):
-            monkeypatch.setattr(words, name, lambda *_: "x")
+            monkeypatch.setattr(words, name, lambda *_, **__: "x")
     monkeypatch.setattr(wording, "_SENTENCES", {})
     monkeypatch.setattr(verdict_wording, "_PLAINLY", {})
     forget()  # other words are other code, which begins with nothing in memory
@@ -108,7 +112,11 @@ def test_the_reasons_of_a_verdict_read_as_one_sentence_and_plainly() -> None:
         "neither likely enough to be within the margins nor likely enough to be beyond one; 70 % likely within the "
         "margins of grasp, rating and tremor (a test asks for 80 %); 3 sessions held near 1.8 mA would tell"
     )
-    assert verdict_wording.plainly(reasons) == "within the margins or beyond: still open; 3 sessions held near 1.8 mA would tell"
+    assert verdict_wording.plainly(reasons) == (
+        "not sure enough: a test asks for 80 % likely no worse than cDBS; 3 sessions held near 1.8 mA would tell"
+    )
+    unsure = [Flag("undecided"), Flag("within_margins", 0.9, 0.8, "probability"), Flag("saves_energy", 0.7, 0.9, "probability")]
+    assert verdict_wording.plainly(unsure) == "not sure enough: a test asks for 90 % likely to use less energy"
     assert verdict_wording.plainly([Flag("extrapolates", 0.4, 0.5)], 0.5, 1.5) == "lower than two sessions ever held: not below 1.5 mA"
     assert (
         verdict_wording.plainly([Flag("extrapolates", 0.4, 0.5)], 0.5)
@@ -120,6 +128,53 @@ def test_draws_show_no_probability_of_nothing_or_of_certainty() -> None:
     assert [wording.chance(p) for p in (0.0, 0.004, 0.5, 0.987, 1.0)] == ["< 1 %", "< 1 %", "50 %", "99 %", "> 99 %"]
 
 
-def test_every_plain_reason_is_a_code_that_has_a_sentence_too() -> None:
-    later = {"few_near_visits"}  # of `ml.ope.posterior.support`
-    assert set(verdict_wording._PLAINLY) - later <= set(wording._SENTENCES)
+SILENT = {"within_margins", "saves_energy", "extrapolates"}
+"""Codes that need no sentence of their own on a first screen: columns have both chances, and a test with care says its lowest amplitude."""
+FACTS = {
+    "outcome": "tremor_percent",
+    "text": "the file is gone",
+    "reasons": ("no_better_than_equal",),
+    "low": 0.3,
+    "high": 1.0,
+    "times": 2.0,
+}
+
+
+def codes_of_verdicts() -> set[str]:
+    """Every code that a verdict may rest on, by the sources that make them."""
+    root = Path(wording.__file__).parents[2]
+    sources = ["ml/ope/posterior/verdict.py", "ml/ope/posterior/support.py", "app/evaluation/ranking/decisions.py"]
+    made = {code for path in sources for code in re.findall(r'(?:Flag|Flag\.of)\(\s*"([a-z_]+)"', (root / path).read_text())}
+    refusing = re.findall(r'Flag\.of\(\s*"([a-z_]+)"[^\n]*refuses=True', (root / "ml/ope/support/diagnostics.py").read_text())
+    return made | set(refusing) | {"thin"}
+
+
+def test_every_reason_of_a_verdict_is_told_in_a_clinicians_words() -> None:
+    codes = codes_of_verdicts()
+    assert {"adverse_event", "nearly_off", "few_near_visits", "not_settled_by_sessions", "outside_range", "energy_unknown"} <= codes
+    assert set(verdict_wording._PLAINLY) - {"unseen_dose", "below_random_bound"} <= codes, "what no verdict rests on needs no words here"
+    told = {}
+    for code in sorted(codes - SILENT - set(verdict_wording._FURTHER)):
+        flag = Flag.of(code, 0.42, 0.8, "share", **FACTS)
+        told[code] = verdict_wording.plainly([flag])
+        assert verdict_wording.decision([flag]), code
+    assert [code for code, words in told.items() if not words] == []
+    assert [words for words in told.values() if methods_named(words) or re.search(r"_|nan|None|step|estimat|probab|simulat", words)] == []
+    assert len(set(told.values())) == len(told), "no two codes read the same"
+    assert told["nearly_off"] == "nearly off 42 % of the time"
+    further = [Flag("sessions_needed", 3.0, None, "sessions"), Flag("near_amplitude", 1.8, None, "mA"), Flag("visits_needed", 2.0)]
+    assert verdict_wording.plainly(further) == "3 sessions held near 1.8 mA on 2 visits would tell"
+
+
+def test_the_strongest_reason_stands_first() -> None:
+    off = {"below_cdbs_20_percent": 0.42}
+    own = constructed(behaviour=off, outcome_draws={"tremor_percent": [45.0] * N})
+    found = verdict(own, cdbs(), Margins(0.1, 1.0, 10.0), Levels(), adverse_event=True)
+    assert [reason.code for reason in found.hazards] == ["adverse_event", "nearly_off", "beyond_margin"]
+    assert verdict_wording.plainly(found.hazards).startswith(
+        "serious adverse event, not cleared by a clinician; nearly off 42 % of the time"
+    )
+    without = verdict(own, cdbs(), Margins(0.1, 1.0, 10.0), Levels())
+    assert verdict_wording.plainly(without.hazards) == (
+        "nearly off 42 % of the time; > 99 % likely worse than cDBS by more than a margin, most often that of tremor"
+    )

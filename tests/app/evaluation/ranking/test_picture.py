@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 
 from fastapi.testclient import TestClient
 
-from app.evaluation.ranking.picture import SHAPES
+from app.evaluation.ranking import picture
+from app.evaluation.ranking.picture import DARKEST, MOST, SHAPES, TONES
+from app.learning.policies.baselines import constant_onnx
 from app.platform.web.svg import Plane
 from ml.ope.support.behaviour_map import COLUMNS, DOSES, BehaviourMap, Curve
 from tests.app.evaluations import judged
@@ -48,3 +51,67 @@ def test_candidates_of_one_verdict_have_shapes_of_their_own() -> None:
 def test_a_ranking_of_before_says_how_to_get_the_figure(client: TestClient, policies: list[int], judge: Callable[..., int]) -> None:
     judge({policies[0]: judged(50.0)})
     assert "evaluate again to see it" in client.get(PAGE).text
+
+
+def more_policies(client: TestClient, wanted: int) -> list[int]:
+    """Ids of further policies made elsewhere, named q0 and on."""
+    files = [(f"q{k}", {"file": (f"q{k}.onnx", constant_onnx(0.30 + 0.01 * k, 10))}) for k in range(wanted)]
+    answers = [client.post("/api/v1/participants/P1/policies", data={"name": name}, files=file) for name, file in files]
+    return [int(answer.json()["id"]) for answer in answers]
+
+
+def test_every_candidate_has_its_dot_and_interval_and_those_like_cdbs_are_grey(
+    client: TestClient, policies: list[int], judge: Callable[..., int]
+) -> None:
+    everyone = [*policies, *more_policies(client, MOST)]
+    alike, *others = everyone
+    posterior = {i: judged(50.0 - k, behaviour={"mean_amplitude": 0.3 + 0.05 * k}) for k, i in enumerate(others)}
+    posterior[alike] = judged(60.0, behaviour={"mean_amplitude": 0.98, "closeness_to_cdbs": 0.02})
+    twins = {str(others[0]): {str(others[1]): 0.01}}
+    found = stored_map(others[0])["map"]
+    curve = found["policies"][str(others[0])]  # type: ignore[index]
+    drawn = {**found, "policies": {str(i): curve for i in everyone}, "apart": twins}  # type: ignore[dict-item]
+    judge(posterior, coverage={"policies": {}, "map": drawn})
+    page = client.get(PAGE).text
+    behaviour, doses = re.findall(r'<svg class="drawing".*?</svg>', page, re.S)[:2]
+    names = re.findall(r"<title>([pq]\d): [0-9.]+ \([0-9.]+ to [0-9.]+\)</title>", doses)
+    panels = 4
+    assert {name: names.count(name) for name in names} == dict.fromkeys(("p0", "p1", "p2", *(f"q{k}" for k in range(MOST))), panels)
+    assert len(re.findall(r'<line [^>]*stroke-width="1.5"/>', doses)) == panels * len(everyone), "an interval with every dot"
+    assert len(re.findall(r'<(?:path|circle|rect)[^>]*fill="var\(--c-muted\)"[^>]*><title>p0:', doses)) == panels, "p0 acts like cDBS"
+    assert "grey marks: candidates that act like cDBS" in page
+    lines = re.findall(r'<path [^>]*stroke-width="(?:2.5|1.5)" stroke-linejoin', behaviour)
+    assert len(lines) == MOST
+    assert "lines of the first 8 behaviours, 2 more in the table and as dots" in page, "11 candidates, two of which do the same"
+
+
+def test_candidates_like_cdbs_are_drawn_where_there_are_no_others(
+    client: TestClient, policies: list[int], judge: Callable[..., int]
+) -> None:
+    judge({policies[0]: judged(60.0, behaviour={"closeness_to_cdbs": 0.02})}, coverage=stored_map(policies[0]))
+    behaviour = re.findall(r'<svg class="drawing".*?</svg>', client.get(PAGE).text, re.S)[0]
+    assert 'stroke="var(--c-muted)" stroke-width="1.5" stroke-linejoin' in behaviour
+    assert ">p0</text>" in behaviour
+
+
+def luminance(colour: tuple[float, ...]) -> float:
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def contrast(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    high, low = sorted((luminance(one), luminance(other)), reverse=True)
+    return (high + 0.05) / (low + 0.05)
+
+
+def test_lines_and_names_stand_out_in_both_themes_and_on_paper() -> None:
+    static = Path(picture.__file__).parents[3] / "static"
+    assert "color-scheme: light !important" in (static / "print.css").read_text(), "paper has the light colours"
+    pairs = re.findall(r"--c-([a-z_-]+): light-dark\((#[0-9a-f]{6}), (#[0-9a-f]{6})\)", (static / "app.css").read_text())
+    for theme in (1, 2):
+        colours = {pair[0]: tuple(int(pair[theme][i : i + 2], 16) / 255 for i in (1, 3, 5)) for pair in pairs}
+        paper = colours["surface"]
+        cell = tuple(DARKEST * a + (1 - DARKEST) * b for a, b in zip(colours["muted"], paper, strict=True))
+        for tone in {*TONES.values(), "cdbs"}:
+            assert contrast(colours[tone], paper) >= 4.5, f"{tone}: its name is text"
+            assert contrast(colours[tone], cell) >= 3.0, f"{tone}: a line over the darkest cell"

@@ -117,7 +117,7 @@ def test_the_first_screen_says_what_to_test_why_and_at_what_risk_without_a_word_
     assert (
         "minutes each (expected against cDBS): p0 : energy \N{MINUS SIGN}29 %, grasp \N{MINUS SIGN}0.2 Hz, rating unchanged, tremor +4 "
         "percentage points; "
-        "85 % likely within the margins." in words
+        "85 % likely no worse than cDBS by more than the margins." in words
     )
     assert re.search(r"Worth a test, \d+ minutes each \(", words)
     assert re.search(r"Worth a test with care, \d+ minutes, one of them at a visit \(expected against cDBS\): p2 , not below 1.5 mA", words)
@@ -149,7 +149,7 @@ def test_a_plan_says_of_its_policies_what_the_ranking_says(client: TestClient, p
     assert methods_named(words) == []
     pages = PdfReader(io.BytesIO(client.get(f"/api/v1/visits/{visit}/plan.pdf").content)).pages
     sheet = " ".join(" ".join(page.extract_text() for page in pages).split())
-    assert "Verdict test; 85 % likely within the margins" in sheet
+    assert "Verdict test; 85 % likely no worse than cDBS by more than the margins" in sheet
     assert re.search(r"Against cDBS energy .29 %, grasp .0.2 Hz, rating unchanged, tremor \+4 percentage points", sheet)
 
 
@@ -179,9 +179,9 @@ def test_behaviours_that_are_cdbs_or_no_stimulation_by_another_name_are_folded(
         {a: judged(50.0), b: judged(60.0, behaviour={"closeness_to_cdbs": 0.01}), c: judged(9.0, behaviour={"below_cdbs_20_percent": 0.95})}
     )
     page = client.get(PAGE).text
-    assert "1 acts like cDBS" in page
-    assert "1 acts like no stimulation" in page
-    table = page[page.index("Candidates against cDBS") : page.index("1 acts like cDBS")]
+    assert "1 policy acts like cDBS" in page
+    assert "1 policy acts like no stimulation" in page
+    table = page[page.index("Candidates against cDBS") : page.index("1 policy acts like cDBS")]
     assert {i: f'/policies/{i}"' in table for i in policies} == {a: True, b: False, c: False}
 
 
@@ -194,7 +194,9 @@ def test_a_ranking_with_nothing_to_test_says_so_why_and_what_to_do(client: TestC
         "No policy is worth a visit yet. 1 acts like cDBS, so that a session would show nothing new; the rest is not advised. "
         "Further policies are needed: train some . At the next visit: random and cDBS sessions," in words
     )
-    assert "p0 : unsafe, > 99 % likely beyond a margin, most often that of tremor; to expect: energy \N{MINUS SIGN}40 %" in words
+    assert (
+        "p0 : unsafe, > 99 % likely worse than cDBS by more than a margin, most often that of tremor; to expect: energy \N{MINUS SIGN}40 %"
+    ) in words
     assert "tremor +25 percentage points" in words, "what it would cost the patient"
     assert "p2 : acts like no stimulation, nearly off more than 80 % of the time" in words
     assert "To expect under cDBS itself: grasp 2.0 Hz, rating 7.0 of 10 (10 is best), tremor 20 % of the time." in words

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pytest
 
+from ml.ope.fqe.steps import usable_steps
 from ml.ope.support.behaviour_map import COLUMNS, DOSES, BehaviourMap, behaviour_map
 from ml.policies.policy import ConstantPolicy
 from ml.trajectories import ReplayBuffer
@@ -33,3 +35,15 @@ def test_curves_and_cloud_are_those_of_the_recorded_windows(buffer: ReplayBuffer
             least, most = np.clip([found.edges[k] / 200, found.edges[k + 1] / 200], 0, 1)
             assert least - 1e-9 <= curve.low[k] <= curve.middle[k] <= curve.high[k] <= most + 1e-9
     assert BehaviourMap.from_json(json.loads(json.dumps(found.to_json()))) == found
+
+
+def test_policies_are_as_far_apart_as_their_answers_to_the_recorded_windows(buffer: ReplayBuffer) -> None:
+    policies = {"low": ConstantPolicy(0.25), "high": ConstantPolicy(0.75), "following": Following()}
+    found = behaviour_map(buffer, policies)
+    assert found.distance("low", "high") == found.distance("high", "low") == 0.5
+    states = usable_steps(buffer).states
+    gaps = [abs(float(Following().act(row[None])[0]) - 0.75) for row in states]
+    assert found.distance("following", "high") == pytest.approx(sum(gaps) / len(gaps), abs=1e-4)
+    assert found.distance("low", "nobody") is None
+    before = {name: value for name, value in found.to_json().items() if name != "apart"}
+    assert BehaviourMap.from_json(before).distance("low", "high") is None, "a map of before distances were stored"
