@@ -10,6 +10,8 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.evaluation import verdict_wording
 from app.evaluation.ranking.service import current
+from app.evaluation.replay.preselected import other_than
+from app.learning import repository as learning
 from app.learning.deps import CurrentOwnPolicy
 from app.learning.models import Policy
 from app.learning.policies.curves import curve_charts
@@ -34,6 +36,7 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
         judged = None
     row = judged.answer.everyone().get(policy.id) if judged else None
     below = below_bound(policy)
+    answered = judged.answer if judged else None
     page = render(
         request,
         "learning/policy.html",
@@ -46,6 +49,7 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
         config={k: v for k, v in policy.config.items() if not k.endswith("_every")},
         row=row,
         picture=judged.picture(participant.current_settings.lower_bound, policy.id) if judged and row else None,
+        other=other_than(policy, learning.candidates(db, participant.id), answered),
         plainly=verdict_wording.plainly,
         standing_names=verdict_wording.STANDING_NAMES,
         may_write=may(caller, can.WRITE_POLICIES, participant),

@@ -12,7 +12,8 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.evaluation.replay import wording
 from app.evaluation.replay.figure import LOOKS, figure, frame
-from app.evaluation.replay.service import MOST, replay, sessions_to_replay
+from app.evaluation.replay.preselected import TWO, best_first
+from app.evaluation.replay.service import MOST, fitting, recorded, replay_over, sessions_to_replay
 from app.learning import repository as learning
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
@@ -34,15 +35,22 @@ def compare(
     policy: Annotated[list[RowId] | None, Query(max_length=20)] = None,
     at: Annotated[int, Query(ge=0, le=10**6)] = 0,
 ) -> HTMLResponse:
-    """Two or three policies over a session: what each would have asked; a session and the first candidates where none are named."""
+    """Two or three policies over a session: what each would have asked; the newest session and the two best of the ranking that take its
+    beta where none are named."""
     sessions = sessions_to_replay(db, participant)
     available = list(learning.candidates(db, participant.id))
-    wanted = list(dict.fromkeys(policy or [p.id for p in available[:2]]))[:MOST]
+    best = best_first(db, participant, available, caller) if not policy else []
+    wanted = list(dict.fromkeys(policy or [p.id for p in best[:TWO]]))[:MOST]
     chosen = session if session is not None else (sessions[0].id if sessions else None)
     found, problem, status = None, None, 200
     if chosen is not None and wanted:
         try:
-            found = replay(db, participant, chosen, learning.policies_named(db, participant.id, wanted), caller)
+            data = recorded(db, participant, chosen, caller)
+            if fit := fitting(db, participant, data, best)[:TWO]:
+                wanted = [p.id for p in fit]
+            named = learning.policies_named(db, participant.id, wanted)
+            available += [p for p in named if p not in available]  # one that was retired may be looked at too
+            found = replay_over(db, participant, data, named)
         except BetaloopError as error:
             problem, status = error.problem(request.url.path), error.status
     step = min(at, len(found.t_s) - 1) if found else 0

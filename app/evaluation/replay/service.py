@@ -22,7 +22,7 @@ from app.study import repository as study_repository
 from app.study import service as study
 from app.study.blinding import require_known
 from app.study.models import Participant, StudySession, Trace
-from app.study.sessions.data import session_data
+from app.study.sessions.data import SessionData, session_data
 from app.study.traces import StepTable
 from ml.energy import relative_energy
 from ml.ope.posterior.verdict import NEARLY_OFF, SAME_AMPLITUDE
@@ -54,12 +54,28 @@ def replay(db: Session, participant: Participant, session_id: int, policies: Seq
         NotFound: no such session. Forbidden: what ran is hidden from the caller. Invalid: none or too many policies, a session without
             beta or too long, beta of another unit or source than a policy learned from, or a file that cannot be run.
     """
+    return replay_over(db, participant, recorded(db, participant, session_id, caller), policies)
+
+
+def recorded(db: Session, participant: Participant, session_id: int, caller: Caller) -> SessionData:
+    """A session over which policies may be run. Raises NotFound and Forbidden as `replay` does."""
     session = study_repository.session(db, session_id, caller)
     study.require_own(participant, session.visit, f"session {session_id}")
     require_known(session.visit, caller)
+    return session_data(db, session)
+
+
+def fitting(db: Session, participant: Participant, data: SessionData, policies: Sequence[Policy]) -> list[Policy]:
+    """Of some policies those that take beta as the session has it, in the same order; all of them where it has none."""
+    trace = data.table.beta_trace
+    return [p for p in policies if trace is None or _signal(db, participant, p) == (trace.unit, trace.source)]
+
+
+def replay_over(db: Session, participant: Participant, data: SessionData, policies: Sequence[Policy]) -> ReplayOut:
+    """The same over a session that `recorded` gave. Raises Invalid as `replay` does."""
     if not 1 <= len(policies) <= MOST:
         raise Invalid(f"{len(policies)} policies cannot be compared.", f"Choose one to {MOST}.")
-    data = session_data(db, session)
+    session, session_id = data.session, data.session.id
     table, window, period = data.table, data.settings.window, data.settings.period_s
     trace = table.beta_trace
     if trace is None or not np.isfinite(table.beta).any():
@@ -117,10 +133,15 @@ def _run(policies: Sequence[Policy], rows: Floats, window: int, period_s: float)
     return {int(i): np.array([np.nan if v is None else v for v in values]) for i, values in found["asked"].items()}
 
 
-def _require_signal(db: Session, participant: Participant, policy: Policy, trace: Trace) -> None:
+def _signal(db: Session, participant: Participant, policy: Policy) -> tuple[str | None, str | None]:
+    """Unit and source of the beta that a policy takes; the participant's own for one that was made elsewhere."""
     snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id is not None else None
     settings = participant.current_settings
-    unit, source = (snapshot.beta_unit, snapshot.beta_source) if snapshot else (settings.beta_unit, settings.beta_source)
+    return (snapshot.beta_unit, snapshot.beta_source) if snapshot else (settings.beta_unit, settings.beta_source)
+
+
+def _require_signal(db: Session, participant: Participant, policy: Policy, trace: Trace) -> None:
+    unit, source = _signal(db, participant, policy)
     if (unit, source) != (trace.unit, trace.source):
         raise Invalid(
             f"Policy '{policy.name}' takes beta in {unit or 'no stated unit'} from {source or 'no stated source'}; the session's is in "

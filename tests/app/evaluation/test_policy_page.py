@@ -24,9 +24,9 @@ def test_it_shows_what_the_policy_does_and_where_it_comes_from(
     db.commit()
     page = client.get(f"/participants/P1/policies/{b}")
     words = above_fold(page.text)
-    assert "beyond a margin, most often that of tremor" in words
+    assert "by more than a margin, most often that of tremor" in words
     assert "Amplitude (mA)" in words
-    assert f'href="/participants/P1/compare?policy={b}"' in page.text
+    assert f'href="/participants/P1/compare?policy={b}&amp;policy={a}"' in page.text
     assert methods_named(words) == []
     child = above_fold(client.get(f"/participants/P1/policies/{a}").text)
     assert "Fine-tuned from p1 Fine-tuned from p2" in child, "the whole line, the nearest first"

@@ -30,6 +30,7 @@ from ml.population.virtual import world
 from ml.qoc import Qoc
 from ml.returns import Gain
 from ml.trajectories import ReplayBuffer
+from tests.app.words import above_fold
 
 Upload = Callable[..., int]
 Store = Callable[..., Sweep]
@@ -291,3 +292,13 @@ def test_each_policy_is_a_line_from_its_hyper_parameters_to_its_standing(store: 
 
 def test_one_policy_alone_is_compared_with_nothing(store: Store, db: Session) -> None:
     assert parallel.parallel(candidates(store(metrics(9.0, 8.0, 2.0, 0.0))), wording.STANDINGS) is None
+
+
+def test_the_page_of_a_trained_policy_leads_back_to_its_sweep_and_its_snapshot(store: Store, client: TestClient) -> None:
+    sweep = store(metrics(4.0, 2.0, -1.0, 0.0))
+    policy = client.get("/api/v1/participants/P1/policies", params={"kind": "trained"}).json()["items"][0]
+    page = client.get(f"/participants/P1/policies/{policy['id']}")
+    assert f"Sweep {sweep.name} Snapshot Snapshot {sweep.snapshot_id} " in above_fold(page.text)
+    for path, words in ((f"/sweeps/{sweep.id}", policy["name"]), (f"/snapshots/{sweep.snapshot_id}", f"Snapshot {sweep.snapshot_id}")):
+        assert f'<dd><a href="{path}">' in page.text
+        assert words in client.get(path).text
