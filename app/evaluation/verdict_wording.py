@@ -102,7 +102,7 @@ _CHANGES = (
 )
 """Of each quantity: name, scale, digits, unit."""
 
-_TEST_ASKS = {"within_margins": "likely no worse than cDBS", "saves_energy": "likely to use less energy"}
+_TEST_ASKS = {"within_margins": "likely no worse", "saves_energy": "likely to use less energy"}
 _FURTHER = ("sessions_needed", "near_amplitude", "visits_needed")
 
 
@@ -112,7 +112,8 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "adverse_event": lambda f: "serious adverse event, not cleared by a clinician",
     "nearly_off": lambda f: f"nearly off {percent(f.value)} of the time",
     "beyond_margin": lambda f: (
-        f"{chance(number(f))} likely worse than cDBS by more than a margin, most often that of {OUTCOME_NAMES[f.fact('outcome')]}"
+        f"{chance(number(f))} likely that grasp, rating or tremor is worse by more than its margin, "
+        f"most often {OUTCOME_NAMES[f.fact('outcome')]}"
     ),
     "all_below_zero": lambda f: "its whole expected gain lies below that of cDBS",
     "few_near_sessions": lambda f: "hardly any session came near what it does",

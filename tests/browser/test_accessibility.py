@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from app.learning.policies.baselines import constant_onnx
 from app.settings import get_settings
-from ml.ope.support.behaviour_map import COLUMNS, DOSES, BehaviourMap, Curve
 from tests.app.evaluations import judge as judge
 from tests.app.evaluations import judged
 from tests.browser import tour
-from tests.ml.ope.posterior.draws import N, constructed
+from tests.browser.rankings import behaviour, made_elsewhere, predicted
+from tests.ml.ope.posterior.draws import constructed
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -53,6 +52,8 @@ RANKED = {
     "plan/visit": "/visits/{visit}",
 }
 """Of a participant who has a ranking, and a draft of a plan with its best policy."""
+DOSES = {"rl-01": 0.82, "rl-02": 0.68, "rl-03": 0.45, "rl-04": 0.04}
+"""Of the ranking's policies, fraction of cDBS."""
 RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]}
 SHIFTS = """() => new Promise((done) => {
   let sum = 0;
@@ -165,33 +166,16 @@ def looked_at(watched: Any, addresses: dict[str, str], for_the_tour: bool = Fals
 @pytest.fixture
 def policies(client: TestClient, studied: list[int]) -> list[int]:
     """Ids of four policies made elsewhere, for the participant whom `studied` made."""
-    files = [(f"rl-0{k}", {"file": (f"rl-0{k}.onnx", constant_onnx(0.8 - 0.15 * k, 10))}) for k in range(1, 5)]
-    answers = [client.post("/api/v1/participants/P1/policies", data={"name": name}, files=file) for name, file in files]
-    return [int(answer.json()["id"]) for answer in answers]
+    return made_elsewhere(client, DOSES)
 
 
 @pytest.fixture
 def ranked(client: TestClient, policies: list[int], judge: Callable[..., int]) -> dict[str, int]:
     """A ranking of which one policy is worth a test, one with care, one is unsafe and one nearly off; a draft with the best."""
     rng = np.random.default_rng(5)
-    doses = dict(zip(policies, (0.82, 0.68, 0.45, 0.04), strict=True))
-
-    def of(dose: float) -> dict[str, Any]:
-        middle = {"energy": dose**2, "grasp_hz": 2.4 - 0.9 * (1 - dose) ** 2, "rating": 7.2 - 2 * (1 - dose) ** 2}
-        middle["tremor_percent"] = 8 + 60 * (1 - dose) ** 2
-        spread = {"energy": 0.02, "grasp_hz": 0.05, "rating": 0.3, "tremor_percent": 2.0}
-        return {
-            "outcome_draws": {k: np.abs(rng.normal(m, spread[k], N)).round(3).tolist() for k, m in middle.items()},
-            "behaviour": {"mean_amplitude": dose, "closeness_to_cdbs": 1 - dose, "below_cdbs_20_percent": float(dose < 0.2)},
-        }
-
-    centre = [1.0 + 0.1 * k for k in range(COLUMNS)]
-    tried = tuple(tuple(int(30 * (row % 4 == 0 and row > 6) / (1 + k)) for row in range(DOSES)) for k in range(COLUMNS))
-    curves = {str(i): [float(np.clip(d + 0.1 * (b - 2.0), 0, 1)) for b in centre] for i, d in doses.items()}
-    shapes = {i: Curve(tuple(c), tuple(v - 0.05 for v in c), tuple(v + 0.05 for v in c)) for i, c in curves.items()}
-    held = BehaviourMap((*centre, centre[-1] + 0.1), tried, shapes)
-    posterior = {i: judged(50.0 * d, supported=d != 0.68, **of(d)) for i, d in doses.items()}
-    judge(posterior, constructed("cdbs", **of(1.0)).to_json(), coverage={"policies": {}, "map": held.to_json()})
+    doses = dict(zip(policies, DOSES.values(), strict=True))
+    posterior = {i: judged(50.0 * d, supported=d != 0.68, **predicted(d, rng)) for i, d in doses.items()}
+    judge(posterior, constructed("cdbs", **predicted(1.0, rng)).to_json(), coverage=behaviour(doses))
     visit = client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": "2046-04-06"}).json()["id"]
     assert client.post(f"/api/v1/visits/{visit}/plan", json={"policy_ids": policies[:1]}).status_code == 201
     return {"policy": policies[0], "visit": visit}

@@ -9,8 +9,10 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.evaluation import verdict_wording
+from app.evaluation.ranking.answer import Answer
 from app.evaluation.ranking.service import current
 from app.evaluation.replay.preselected import other_than
+from app.evaluation.repository import PolicyHead
 from app.learning import repository as learning
 from app.learning.deps import CurrentOwnPolicy
 from app.learning.models import Policy
@@ -50,11 +52,19 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
         row=row,
         picture=judged.picture(participant.current_settings.lower_bound, policy.id) if judged and row else None,
         other=other_than(policy, learning.candidates(db, participant.id), answered),
+        same=_same(policy, answered) if answered else [],
         plainly=verdict_wording.plainly,
+        effect=verdict_wording.effect,
         standing_names=verdict_wording.STANDING_NAMES,
         may_write=may(caller, can.WRITE_POLICIES, participant),
     )
     return HTMLResponse(page)
+
+
+def _same(policy: Policy, answered: Answer) -> list[PolicyHead]:
+    """The other policies of its row in the ranking."""
+    heads = answered.heads()
+    return [row.one.policy for i, row in answered.everyone().items() if i != policy.id and heads[i] == heads.get(policy.id)]
 
 
 def _lineage(db: Session, policy: Policy) -> list[tuple[str, Policy]]:

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from app.evaluation.ranking.answer import QUANTITIES, Row
+from app.evaluation.ranking.answer import QUANTITIES, Row, map_of
 from app.evaluation.ranking.assessment import Assessed, Assessment
-from app.evaluation.ranking.behaviours import map_of
 from app.platform.web.charts import Cell, written
 from app.platform.web.svg import Plane, apart, drawing
 from ml.ope.estimate import Estimate

@@ -113,7 +113,7 @@ def test_the_reasons_of_a_verdict_read_as_one_sentence_and_plainly() -> None:
         "margins of grasp, rating and tremor (a test asks for 80 %); 3 sessions held near 1.8 mA would tell"
     )
     assert verdict_wording.plainly(reasons) == (
-        "not sure enough: a test asks for 80 % likely no worse than cDBS; 3 sessions held near 1.8 mA would tell"
+        "not sure enough: a test asks for 80 % likely no worse; 3 sessions held near 1.8 mA would tell"
     )
     unsure = [Flag("undecided"), Flag("within_margins", 0.9, 0.8, "probability"), Flag("saves_energy", 0.7, 0.9, "probability")]
     assert verdict_wording.plainly(unsure) == "not sure enough: a test asks for 90 % likely to use less energy"
@@ -176,5 +176,5 @@ def test_the_strongest_reason_stands_first() -> None:
     )
     without = verdict(own, cdbs(), Margins(0.1, 1.0, 10.0), Levels())
     assert verdict_wording.plainly(without.hazards) == (
-        "nearly off 42 % of the time; > 99 % likely worse than cDBS by more than a margin, most often that of tremor"
+        "nearly off 42 % of the time; > 99 % likely that grasp, rating or tremor is worse by more than its margin, most often tremor"
     )

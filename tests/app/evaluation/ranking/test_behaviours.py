@@ -11,7 +11,7 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation.ranking.behaviours import behaviours
+from app.evaluation.ranking.answer import behaviours
 from app.evaluation.ranking.service import current
 from app.study.repository import participant_by_code
 from tests.app.evaluation.ranking.test_picture import stored_map
@@ -101,7 +101,10 @@ def test_each_keeps_its_own_numbers_where_it_is_planned_or_looked_at(client: Tes
     }
     judge(posterior, coverage=apart(policies, 0.01))
     assert rows(client) == {"p0": ["p1"]}
-    assert "not below 1.8 mA" in above_fold(client.get(f"/participants/P1/policies/{b}").text), "0.6 of 3 mA, not 0.5"
+    words = above_fold(client.get(f"/participants/P1/policies/{b}").text)
+    assert "not below 1.8 mA" in words, "0.6 of 3 mA, not 0.5"
+    assert "Expected against cDBS: energy \N{MINUS SIGN}40 %, grasp unchanged" in words
+    assert "In one row of the ranking with p0 : it asks for the same, within 5 % of the cDBS amplitude on average." in words
     visit = client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": "2046-04-06"}).json()["id"]
     plan = client.get(f"/visits/{visit}/plan").text
     assert {i: re.search(rf'name="limit_{i}"[^>]*value="([0-9.]+)"', plan)[1] for i in (a, b)} == {a: "0.5000", b: "0.6000"}  # type: ignore[index]

@@ -100,7 +100,8 @@ def test_without_ordering_skill_there_are_no_ranks_and_nothing_is_proposed(clien
     assert {(p["rank"], p["probability_best"], p["decision"]) for p in body["policies"]} == {(None, None, "cannot_tell")}
     assert [p["name"] for p in body["policies"]] == ["p0", "p1", "p2"], "by name, not by value"
     words = first_screen(client)
-    assert "No policy is worth a visit yet. The recordings so far cannot tell policies apart." in words
+    assert "No policy is worth a visit yet. At the next visit: random and cDBS sessions, by which policies may be told apart." in words
+    assert "Why: The recordings so far cannot tell policies apart." in words
     assert "Not advised: p2 : nearly off 42 % of the time" in words
     assert re.search(r"p2 \w+ not advised nearly off 42 %", words), "the table says the same as the sentence above it"
     assert len(re.findall(r"p[01] \w+ cannot tell", words)) == 2
@@ -191,11 +192,13 @@ def test_a_ranking_with_nothing_to_test_says_so_why_and_what_to_do(client: TestC
     judge({a: judged(50.0, **WORSE), b: judged(60.0, behaviour={"closeness_to_cdbs": 0.01}), c: judged(9.0, **off)})
     words = first_screen(client)
     assert (
-        "No policy is worth a visit yet. 1 acts like cDBS, so that a session would show nothing new; the rest is not advised. "
-        "Further policies are needed: train some . At the next visit: random and cDBS sessions," in words
+        "No policy is worth a visit yet. At the next visit: random and cDBS sessions, from which better policies can be learned. Why: "
+        "1 acts like cDBS, so that a session would show nothing new; the rest is not advised. Further policies are needed: train some ."
+        in words
     )
     assert (
-        "p0 : unsafe, > 99 % likely worse than cDBS by more than a margin, most often that of tremor; to expect: energy \N{MINUS SIGN}40 %"
+        "p0 : unsafe, > 99 % likely that grasp, rating or tremor is worse by more than its margin, most often tremor; "
+        "to expect: energy \N{MINUS SIGN}40 %"
     ) in words
     assert "tremor +25 percentage points" in words, "what it would cost the patient"
     assert "p2 : acts like no stimulation, nearly off more than 80 % of the time" in words

@@ -98,7 +98,7 @@ def test_verdicts_are_asked_again_at_approval(
     assert draft(client, visit, policies[0]).status_code == 201
     client.put("/api/v1/participants/P1/margins", json={"margins": {"tremor_points": 5}, "reason": "she fears tremor most"})
     answer = sign_plan(visit)
-    assert (answer.status_code, "likely beyond a margin, most often that of tremor" in answer.json()["detail"]) == (409, True)
+    assert (answer.status_code, "is worse by more than its margin, most often tremor" in answer.json()["detail"]) == (409, True)
 
 
 def test_a_reason_for_what_is_not_unsafe_is_not_kept_and_one_for_what_is_not_planned_is_refused(
