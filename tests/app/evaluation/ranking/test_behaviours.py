@@ -71,7 +71,7 @@ def test_another_verdict_or_more_time_nearly_off_is_another_row(policies: list[i
     judge({a: judged(50.0), b: judged(60.0, **off), c: judged(40.0)}, coverage=apart(policies, 0.01, 0.01, 0.01))
     assert groups(db) == [["p1"], ["p0", "p2"]]
     off = {"behaviour": {"below_cdbs_20_percent": 0.3}}
-    judge({a: judged(50.0, **off), b: judged(60.0, **WORSE), c: judged(40.0)}, coverage=apart(policies, 0.01, 0.01, 0.01))
+    judge({a: judged(50.0, **off), b: judged(60.0, **WORSE, **off), c: judged(40.0)}, coverage=apart(policies, 0.01, 0.01, 0.01))
     assert groups(db) == [["p2"], ["p1"], ["p0"]], "both are unsafe, for different reasons"
 
 

@@ -57,6 +57,7 @@ def test_from_a_policy_it_stands_beside_the_best_other_behaviour(
     judge({a: judged(70.0), b: judged(50.0), c: judged(60.0)}, coverage=apart(policies, 0.2, 0.01))
     assert compared(client, link(client, page.format(b)))[1] == ["p1", "p0"]
     assert compared(client, link(client, page.format(a)))[1] == ["p0", "p1"], "p2 is better, and does what p0 does"
+    assert compared(client, link(client, page.format(c)))[1] == ["p2", "p1"], "nor is what stands for it"
     assert client.patch(f"/api/v1/policies/{a}", json={"retired_reason": "replaced"}).status_code == 200
     assert compared(client, link(client, page.format(a)))[1] == ["p0", "p2"], "a retired one may be looked at, and is no choice"
 
