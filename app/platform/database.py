@@ -39,6 +39,10 @@ class Base(DeclarativeBase):
     type_annotation_map = {datetime: DateTime(timezone=True), dict[str, Any]: JSONB, list[Any]: JSONB}
 
 
+ONE_STANDING: dict[str, Any] = {"unique": True, "postgresql_where": text("removed_at is null")}
+"""Of an index: of the rows that were not marked as removed, one alone may have these values."""
+
+
 def now() -> datetime:
     """The present, UTC."""
     return datetime.now(UTC)

@@ -23,10 +23,7 @@ KEPT: dict[str, frozenset[str]] = {
 
 DELETED_FROM = frozenset(
     {
-        "cdbs_amplitude",
         "counted_time",
-        "dose",
-        "grasp_test",
         "membership",
         "plan",
         "plan_item",
@@ -36,14 +33,13 @@ DELETED_FROM = frozenset(
         "sign_in_attempt",
         "sign_on_link",
         "stored_file",
-        "tremor_series",
         "upload_file",
         "visit",
         "worker",
     }
 )
-"""Tables of which the service deletes rows: proposals and drafts that were given up, doses taken back with a reason, what a newer reading
-replaced, its own upkeep. Rows of audited tables stay in the trail."""
+"""Tables of which the service deletes rows: proposals (a trigger refuses it of a confirmed session), drafts of plans and the planned visits
+in which nothing was done, its own upkeep. Rows of audited tables stay in the trail. What was entered or measured is marked as removed."""
 
 ENGINE_SCHEMA = "dbos"
 SCHEMAS = ("public", ENGINE_SCHEMA)

@@ -11,7 +11,7 @@ from sqlalchemy import CheckConstraint, ForeignKey, Index, LargeBinary, SmallInt
 from sqlalchemy.orm import Mapped, column_property, mapped_column, relationship
 
 from app.accounts.models import Site
-from app.platform.database import Base
+from app.platform.database import ONE_STANDING, Base
 from app.study.characteristics.models import CharacteristicsVersion
 from app.study.doses.models import Dose
 from app.study.margins.models import MarginsLock, MarginsVersion
@@ -43,6 +43,8 @@ class Hemisphere(StrEnum):
 
 TIME_CHECK = "started_at >= '1990-01-01Z' and started_at < '2201-01-01Z'"
 HEMISPHERE_CHECK = "hemisphere in ('left', 'right')"
+_AMPLITUDES = "and_(CdbsAmplitude.visit_id == Visit.id, CdbsAmplitude.removed_at.is_(None))"
+_DOSES = "and_(Dose.visit_id == Visit.id, Dose.removed_at.is_(None))"
 
 
 class Participant(Base):
@@ -146,21 +148,23 @@ class SettingsVersion(Base):
 
 
 class CdbsAmplitude(Base):
-    """The clinician's cDBS amplitude in force at a visit, per hemisphere and program; fractions are derived from it."""
+    """The clinician's cDBS amplitude in force at a visit, per hemisphere and program, whence fractions. A removed one counts no more."""
 
     __tablename__ = "cdbs_amplitude"
     __table_args__ = (
-        UniqueConstraint("visit_id", "hemisphere", "program"),
+        Index("uq_cdbs_amplitude_visit_id_hemisphere_program", "visit_id", "hemisphere", "program", **ONE_STANDING),
+        CheckConstraint("visit_id is not null or removed_at is not null", name="belongs"),
         CheckConstraint("amplitude_ma > 0", name="amplitude"),
         CheckConstraint("program between 0 and 3", name="program"),
         CheckConstraint(HEMISPHERE_CHECK, name="hemisphere"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    visit_id: Mapped[int] = mapped_column(ForeignKey("visit.id"), index=True)
+    visit_id: Mapped[int | None] = mapped_column(ForeignKey("visit.id", ondelete="SET NULL"), index=True)
     hemisphere: Mapped[Hemisphere] = mapped_column(String(5))
     program: Mapped[int] = mapped_column(SmallInteger)
     amplitude_ma: Mapped[float]
+    removed_at: Mapped[datetime | None]
 
 
 class Device(Base):
@@ -189,8 +193,8 @@ class Visit(Base):
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     participant: Mapped[Participant] = relationship(back_populates="visits")
     sessions: Mapped[list[StudySession]] = relationship(back_populates="visit", order_by="StudySession.ordinal")
-    cdbs_amplitudes: Mapped[list[CdbsAmplitude]] = relationship(lazy="selectin")
-    doses: Mapped[list[Dose]] = relationship(lazy="selectin", order_by=(Dose.taken_at, Dose.id))
+    cdbs_amplitudes: Mapped[list[CdbsAmplitude]] = relationship(lazy="selectin", primaryjoin=_AMPLITUDES)
+    doses: Mapped[list[Dose]] = relationship(lazy="selectin", order_by=(Dose.taken_at, Dose.id), primaryjoin=_DOSES)
     locks: Mapped[list[VisitLock]] = relationship(back_populates="visit", order_by="VisitLock.id", lazy="selectin")
     if TYPE_CHECKING:  # mapped below, where the class that they belong to is there
         sealed: Mapped[bool]
@@ -297,9 +301,8 @@ class StudySession(Base):
 
 
 _ITEMS = sa.table("plan_item", sa.column("id"), sa.column("label"))
-StudySession.letter = column_property(
-    sa.select(_ITEMS.c.label).where(_ITEMS.c.id == StudySession.plan_item_id).correlate(StudySession.__table__).scalar_subquery()
-)
+_LETTER = sa.select(_ITEMS.c.label).where(_ITEMS.c.id == StudySession.plan_item_id)
+StudySession.letter = column_property(_LETTER.correlate(StudySession.__table__).scalar_subquery())
 
 
 class Recording(Base):

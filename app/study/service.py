@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.platform.database import set_reason
+from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import blinding, repository
 from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision, SettingsVersion, StudySession, Visit
@@ -54,6 +54,11 @@ def change_settings(
     return add_settings(db, participant, values, caller, reason)
 
 
+def withdrawn_codes(participants: Iterable[Participant]) -> frozenset[str]:
+    """Codes of those among participants who have withdrawn, for lists that mark them."""
+    return frozenset(p.code for p in participants if p.status == WITHDRAWN)
+
+
 def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Caller) -> Visit:
     """Add a visit. Raises Conflict when its number is taken, Unusual for an amplitude outside the usual that nobody has confirmed."""
     require(caller, can.WRITE_STUDY, participant)
@@ -87,12 +92,12 @@ def change_visit(db: Session, visit: Visit, change: VisitChange, caller: Caller)
         for row in list(visit.cdbs_amplitudes):
             amplitude = stated.pop((row.hemisphere, row.program), None)
             if amplitude is None:
-                visit.cdbs_amplitudes.remove(row)
-                db.delete(row)
+                row.removed_at = now()
             else:
                 row.amplitude_ma = amplitude
         visit.cdbs_amplitudes += [CdbsAmplitude(hemisphere=h, program=p, amplitude_ma=ma) for (h, p), ma in stated.items()]
     db.flush()
+    db.refresh(visit, ["cdbs_amplitudes"])
     return visit
 
 

@@ -167,8 +167,7 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
         )
         made.append(new)
     set_reason(db, f"cut into sessions {', '.join(str(s.id) for s in made)}")
-    db.delete(session)
-    db.flush()
+    _delete(db, session)
     return made
 
 
@@ -176,6 +175,12 @@ def discard(db: Session, session: StudySession, version: int, reason: str, calle
     """Drop a proposal that is no session; its recordings stay. Raises Conflict as `change`."""
     locked(db, session, version, caller)
     set_reason(db, reason)
+    _delete(db, session)
+
+
+def _delete(db: Session, session: StudySession) -> None:
+    """Delete a session that was never confirmed; the trail keeps it, and its grasp tests stay as removed rows."""
+    outcomes_intake.give_up(db, session)
     db.delete(session)
     db.flush()
 

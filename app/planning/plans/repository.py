@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session, selectinload
 
 from app.evaluation.models import Evaluation
 from app.planning.plans.models import Plan, PlanItem
+from app.platform.database import now
 from app.study.adverse_events.models import AdverseEvent
 from app.study.doses.models import Dose
 from app.study.models import Hemisphere, Recording, StudySession, Visit, VisitLock
@@ -100,7 +101,7 @@ def what_holds(db: Session, visit_id: int) -> list[str]:
     locks = db.scalar(select(func.count()).select_from(VisitLock).where(VisitLock.visit_id == visit_id)) or 0
     doses = db.scalar(select(func.count()).select_from(Dose).where(Dose.visit_id == visit_id)) or 0
     counted = {"sessions or proposals": sessions, "a plan that was signed": signed, "adverse events": events, "locks": locks}
-    counted["doses of medication"] = doses
+    counted["doses of medication"] = doses  # those that were taken back too: they stay, and tell that something was done
     return [what for what, count in counted.items() if count]
 
 
@@ -116,12 +117,13 @@ def swap(db: Session, one: PlanItem, other: PlanItem) -> None:
 
 
 def delete_visit(db: Session, visit: Visit) -> None:
-    """Remove a visit with its plans and its cDBS amplitudes."""
+    """Remove a visit with its plans; its cDBS amplitudes stay as removed ones."""
     for plan in db.scalars(select(Plan).where(Plan.visit_id == visit.id)):
         db.delete(plan)
     for amplitude in visit.cdbs_amplitudes:
-        db.delete(amplitude)
+        amplitude.removed_at = now()
     db.flush()
+    db.expire(visit, ["cdbs_amplitudes"])
     db.delete(visit)
 
 

@@ -13,6 +13,6 @@ from app.study.outcomes.models import GraspTest
 
 def sessions_with_grasp_tests(db: Session, participant_id: int) -> Sequence[StudySession]:
     """Confirmed sessions of a participant that have a grasp test from a file, by number."""
-    tested = select(GraspTest.session_id)
+    tested = select(GraspTest.session_id).where(GraspTest.removed_at.is_(None))
     mine = (Visit.participant_id == participant_id) & (StudySession.status == "confirmed") & StudySession.id.in_(tested)
     return db.scalars(select(StudySession).join(StudySession.visit).where(mine).order_by(StudySession.id)).all()

@@ -13,8 +13,8 @@ from app.study.repository import visit
 
 
 def dose_with_visit(db: Session, dose_id: int, caller: Caller) -> tuple[Dose, Visit]:
-    """A dose and its visit. Raises NotFound."""
-    row = db.scalar(select(Dose).where(Dose.id == dose_id))
+    """A dose that was not removed, and its visit. Raises NotFound."""
+    row = db.scalar(select(Dose).where(Dose.id == dose_id, Dose.removed_at.is_(None)))
     gone = NotFound(f"There is no dose {dose_id}, or you have no access to it.")
     if row is None:
         raise gone

@@ -60,9 +60,9 @@ def remove_dose(db: Session, dose: Dose, visit: Visit, reason: str, caller: Call
     if not reason.strip():
         raise Invalid("A reason is missing.", "Say why the dose is taken back; the audit trail keeps it.")
     set_reason(db, reason.strip())
-    visit.doses.remove(dose)
-    db.delete(dose)
+    dose.removed_at = now()
     db.flush()
+    db.refresh(visit, ["doses"])
 
 
 def _check_time(visit: Visit, taken_at: datetime) -> None:

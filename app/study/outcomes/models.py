@@ -5,10 +5,10 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, LargeBinary, String, UniqueConstraint, func
+from sqlalchemy import CheckConstraint, ForeignKey, Index, LargeBinary, String, func
 from sqlalchemy.orm import Mapped, mapped_column
 
-from app.platform.database import Base
+from app.platform.database import ONE_STANDING, Base
 from app.study.models import Hemisphere
 
 
@@ -16,12 +16,13 @@ class TremorSeries(Base):
     """Minutes of tremor from one uploaded file of a watch, in UTC.
 
     Little-endian arrays of `n` minutes in time order: `start_unix_s_f64` and `duration_s_f64` in seconds, `fractions_f32` [n, 6] in the
-    order of `ml.qoc.TREMOR_CLASSES`, `any_tremor_f32`; NaN where the export does not tell.
+    order of `ml.qoc.TREMOR_CLASSES`, `any_tremor_f32`; NaN where the export does not tell. Minutes that a newer reading of the file
+    replaced are marked as removed and count no more.
     """
 
     __tablename__ = "tremor_series"
     __table_args__ = (
-        UniqueConstraint("participant_id", "upload_file_id"),
+        Index("uq_tremor_series_participant_id_upload_file_id", "participant_id", "upload_file_id", **ONE_STANDING),
         CheckConstraint("n >= 1", name="minutes"),
         CheckConstraint("last_end_at > first_start_at", name="order"),
         CheckConstraint(
@@ -42,26 +43,37 @@ class TremorSeries(Base):
     fractions_f32: Mapped[bytes] = mapped_column(LargeBinary)
     any_tremor_f32: Mapped[bytes] = mapped_column(LargeBinary)
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    removed_at: Mapped[datetime | None]
 
 
 class GraspTest(Base):
     """One hand's grasp test near the end of a session: times of open fists, s (little-endian float64, `n` of them).
 
-    `implausible` lists which of the n - 1 intervals between them are too short or too long to be a grasp.
+    `implausible` lists which of the n - 1 intervals between them are too short or too long to be a grasp. A test that a newer reading
+    replaced, or that belongs to another session, is marked as removed and counts no more; it outlasts a proposal that was given up.
     """
 
     __tablename__ = "grasp_test"
     __table_args__ = (
-        UniqueConstraint("session_id", "upload_file_id", "hand", postgresql_nulls_not_distinct=True),
+        Index(
+            "uq_grasp_test_session_id_upload_file_id_hand",
+            "session_id",
+            "upload_file_id",
+            "hand",
+            postgresql_nulls_not_distinct=True,
+            **ONE_STANDING,
+        ),
+        CheckConstraint("session_id is not null or removed_at is not null", name="belongs"),
         CheckConstraint("hand in ('left', 'right')", name="hand"),
         CheckConstraint("n >= 1 and octet_length(open_fist_s_f64) = 8 * n", name="length"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
-    session_id: Mapped[int] = mapped_column(ForeignKey("session.id", ondelete="CASCADE"))
+    session_id: Mapped[int | None] = mapped_column(ForeignKey("session.id", ondelete="SET NULL"))
     upload_file_id: Mapped[int] = mapped_column(ForeignKey("upload_file.id"), index=True)
     hand: Mapped[Hemisphere | None] = mapped_column(String(5))
     n: Mapped[int]
     open_fist_s_f64: Mapped[bytes] = mapped_column(LargeBinary)
     implausible: Mapped[list[Any]]
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    removed_at: Mapped[datetime | None]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
-from app.platform.database import set_reason
+from app.platform.database import now, set_reason
 from app.platform.errors import Invalid
 from app.platform.web.charts import counted
 from app.study import repository
@@ -56,7 +56,8 @@ def store_tremor(
 ) -> list[str]:
     """Keep all minutes of tremor of a file, and derive the tremor of every confirmed session that they overlap.
 
-    The same file again replaces its own minutes, so that decoding anew changes nothing but what the decoder reads otherwise.
+    The same file again replaces its own minutes, so that decoding anew changes nothing but what the decoder reads otherwise. What was
+    replaced stays as a removed row.
 
     Args:
         db: the caller commits.
@@ -76,13 +77,15 @@ def store_tremor(
     spans = [(before.first_start_at, before.last_end_at)] if before else []
     if minutes.start_unix_s.size == 0:
         if before is not None:
-            db.delete(before)
+            before.removed_at = now()
             db.flush()
         return ["The file holds no minute of tremor.", *(_derive_overlapping(db, participant_id, spans) if spans else [])]
-    row = before or TremorSeries(participant_id=participant_id, upload_file_id=upload_file_id)
+    row = TremorSeries(participant_id=participant_id, upload_file_id=upload_file_id)
     tremor.pack(row, minutes)
-    db.add(row)
-    db.flush()
+    if before is not None and tremor.same_values(before, row):
+        row = before
+    else:
+        _replace(db, before, row)
     spans.append((row.first_start_at, row.last_end_at))
     said = [f"Kept: {counted(row.n, 'minute')} of tremor from {_when(row.first_start_at)} to {_when(row.last_end_at)} UTC."]
     others = of_files.tremor_series(db, participant_id, row.first_start_at, row.last_end_at, but_file_id=upload_file_id)
@@ -108,7 +111,7 @@ def store_grasp(
     Args:
         db: the caller commits.
         session: whose test it was. upload_file_id: the file; the same file and hand again replace what it gave before, and a file that
-            belonged to another session no longer counts there.
+            belonged to another session no longer counts there. What was replaced stays as a removed row.
         hand: `left`, `right`, or None where the file does not say.
         open_fist_s: times of open fists, s, strictly increasing, shape [n].
         implausible: intervals too short or too long for a grasp, shape [n - 1]; they are kept and marked.
@@ -128,10 +131,11 @@ def store_grasp(
     said = _take_from_other_sessions(db, session, upload_file_id)
     side = Hemisphere(hand) if hand else None
     known = (t for t in of_files.grasp_tests(db, session.id) if t.upload_file_id == upload_file_id and t.hand == side)
-    row = next(known, None) or GraspTest(session_id=session.id, upload_file_id=upload_file_id, hand=side)
-    row.n, row.open_fist_s_f64, row.implausible = times.size, times.astype("<f8").tobytes(), marks.tolist()
-    db.add(row)
-    db.flush()
+    before, packed = next(known, None), (times.astype("<f8").tobytes(), marks.tolist())
+    if before is None or (before.open_fist_s_f64, before.implausible) != packed:
+        row = GraspTest(session_id=session.id, upload_file_id=upload_file_id, hand=side, n=times.size)
+        row.open_fist_s_f64, row.implausible = packed
+        _replace(db, before, row)
     whose = f"{hand} hand" if hand else "hand not stated"
     return [*said, f"Session {session.id}: grasp test, {whose}, {times.size} open fists are kept.", *derive_for_session(db, session)]
 
@@ -165,6 +169,13 @@ def derive_for_session(db: Session, session: StudySession) -> list[str]:
             f"the files give {clash.derived.sentence}. Compare them on the session's page."
         )
     return said
+
+
+def give_up(db: Session, session: StudySession) -> None:
+    """The grasp tests of a proposal that is about to be deleted stay as removed rows."""
+    for row in of_files.grasp_tests(db, session.id):
+        row.removed_at = now()
+    db.flush()
 
 
 def disagreements(session: StudySession, found: Sequence[Derived]) -> list[Disagreement]:
@@ -247,12 +258,21 @@ def _take_from_other_sessions(db: Session, session: StudySession, upload_file_id
     said = []
     elsewhere = [t for t in of_files.grasp_tests_of_file(db, upload_file_id) if t.session_id != session.id]
     for row in elsewhere:
-        db.delete(row)
+        row.removed_at = now()
     db.flush()
-    for session_id in sorted({t.session_id for t in elsewhere}):
+    for session_id in sorted({t.session_id for t in elsewhere if t.session_id is not None}):
         said += [f"The grasp tests of this file no longer belong to session {session_id}."]
         said += derive_for_session(db, db.get_one(StudySession, session_id))
     return said
+
+
+def _replace(db: Session, before: TremorSeries | GraspTest | None, row: TremorSeries | GraspTest) -> None:
+    """Put a row in the place of another one, which stays as a removed row: of two that count the database would take one alone."""
+    if before is not None:
+        before.removed_at = now()
+        db.flush()
+    db.add(row)
+    db.flush()
 
 
 def _derive_overlapping(db: Session, participant_id: int, spans: Sequence[tuple[datetime, datetime]]) -> list[str]:

@@ -74,6 +74,12 @@ def pack(row: TremorSeries, minutes: Minutes) -> None:
     row.last_end_at = datetime.fromtimestamp(float(minutes.stop_unix_s.max()), UTC)
 
 
+def same_values(one: TremorSeries, other: TremorSeries) -> bool:
+    """Whether two rows hold the same minutes, to the last bit."""
+    arrays = ("n", "start_unix_s_f64", "duration_s_f64", "fractions_f32", "any_tremor_f32")
+    return all(getattr(one, name) == getattr(other, name) for name in arrays)
+
+
 def unpack(row: TremorSeries) -> Minutes:
     """The minutes of a row."""
     return Minutes(

@@ -95,8 +95,8 @@ def test_rows_of_a_visit_that_was_removed_stay_in_the_trail_of_its_study(client:
         found = seen(db, Caller("x", 1, (Grant(study, site, Role.MONITOR),)))
         return [e.action for e in found if e.entity == "cdbs_amplitude" and (e.after or e.before or {})["visit_id"] == visit]
 
-    assert amplitudes(north.id, None) == ["delete", "insert"]
-    assert amplitudes(north.id, sites["n1"]) == ["delete", "insert"]
+    assert amplitudes(north.id, None) == ["update", "insert"]
+    assert amplitudes(north.id, sites["n1"]) == ["update", "insert"]
     assert amplitudes(north.id, sites["n2"]) == amplitudes(main, None) == []
 
 
