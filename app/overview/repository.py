@@ -190,6 +190,12 @@ def participant_id_of_code(db: Session, caller: Caller, code: str) -> int | None
     return db.scalar(query)
 
 
+def withdrawn_codes(db: Session, caller: Caller) -> frozenset[str]:
+    """Codes of the participants who have withdrawn."""
+    query = select(Participant.code).join(Participant.site).where(in_scope(caller), Participant.status == "withdrawn")
+    return frozenset(db.scalars(query))
+
+
 def find_participants(db: Session, caller: Caller, words: str, most: int) -> Sequence[Participant]:
     """Participants whose code holds the words, by code."""
     query = select(Participant).join(Participant.site).options(joinedload(Participant.site))

@@ -16,6 +16,7 @@ from app.analysis.pooled.service import readable
 from app.platform.database import Db
 from app.platform.web.templates import render
 from app.study.models import Controller, Participant
+from app.study.service import withdrawn_codes
 
 router = APIRouter()
 
@@ -60,5 +61,7 @@ def overall(saved: Sequence[Saved]) -> Saved | None:
 @router.get("/energy-saved")
 def energy_saved_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Energy saved so far; the home page takes its numbers from here once it stands."""
-    saved = energy_saved(db, readable(db, caller), caller)
-    return HTMLResponse(render(request, "overview/energy_saved.html", saved=saved, overall=overall(saved)))
+    participants = readable(db, caller)
+    saved = energy_saved(db, participants, caller)
+    page = render(request, "overview/energy_saved.html", saved=saved, overall=overall(saved), withdrawn=withdrawn_codes(participants))
+    return HTMLResponse(page)

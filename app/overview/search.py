@@ -45,20 +45,26 @@ def search(db: Session, caller: Caller, words: str) -> dict[str, list[Hit]]:
     number = re.fullmatch(r"(?:session )?#?(\d{1,9})", wanted, re.IGNORECASE)
     titles = {k.name: k.title for k in registry.kinds().values()}
     kinds = [name for name, title in titles.items() if wanted.lower() in title.lower() or wanted.lower() == name]
+    gone = repository.withdrawn_codes(db, caller)
+
+    def of(code: str) -> str:
+        return f"{code} (withdrawn)" if code in gone else code
+
     found = {
         "Participants": [
-            Hit(p.code, p.site.name, f"/participants/{p.code}") for p in repository.find_participants(db, caller, whole, MOST)
+            Hit(p.code, f"{p.site.name}, withdrawn" if p.code in gone else p.site.name, f"/participants/{p.code}")
+            for p in repository.find_participants(db, caller, whole, MOST)
         ],
         "Sessions": [
-            Hit(f"Session {i}", f"{code}, visit {visit}, {when(day)}", f"/sessions/{i}")
+            Hit(f"Session {i}", f"{of(code)}, visit {visit}, {when(day)}", f"/sessions/{i}")
             for i, code, visit, day in (repository.find_session(db, caller, int(number[1]), owner) if number else ())
         ],
         "Policies": [
-            Hit(name, f"{code}, {kind}", f"/participants/{code}/policies/{i}")
+            Hit(name, f"{of(code)}, {kind}", f"/participants/{code}/policies/{i}")
             for i, name, kind, code in repository.find_policies(db, caller, wanted, owner, MOST)
         ],
         "Jobs": [
-            Hit(titles.get(kind, kind), f"{code}, {status}, {when(made)}", f"/jobs/{i}")
+            Hit(titles.get(kind, kind), f"{of(code)}, {status}, {when(made)}", f"/jobs/{i}")
             for i, kind, status, made, code in repository.find_jobs(db, caller, wanted, kinds, owner, MOST)
         ],
     }

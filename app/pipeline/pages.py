@@ -29,7 +29,7 @@ from app.platform.web.templates import render
 from app.study import repository as study
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
-from app.study.service import may
+from app.study.service import may, withdrawn_codes
 from ml.ope import registry as estimators
 
 router = APIRouter()
@@ -97,6 +97,7 @@ def all_jobs_page(request: Request, db: Db, caller: CurrentCaller, paging: Pagin
         request,
         "pipeline/all_jobs.html",
         codes=codes,
+        withdrawn=withdrawn_codes(participants),
         stoppable={p.id for p in participants if may(caller, can.RUN_JOBS, p)},
         startable=[p.code for p in participants if may(caller, can.RUN_JOBS, p)][:MOST_NAMED],
         live=live,

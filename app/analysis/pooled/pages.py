@@ -18,6 +18,7 @@ from app.platform.kept import kept
 from app.platform.web.charts import Chart
 from app.platform.web.charts import figure as empty
 from app.platform.web.templates import render
+from app.study.service import withdrawn_codes
 
 router = APIRouter()
 
@@ -33,6 +34,7 @@ def pooled_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse
         found=found,
         charts=_charts(found),
         trial=found.trial,
+        withdrawn=withdrawn_codes(participants),
         times=service.computation_times(db, participants),
         wording=wording,
     )
@@ -69,4 +71,5 @@ def results_figure(db: Db, caller: CurrentCaller) -> Response:
 def trial_time_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Minutes of every controller in every participant that the caller may read."""
     participants = service.readable(db, caller)
-    return HTMLResponse(render(request, "analysis/trial_time.html", trial=trial_time(db, participants, caller)))
+    trial = trial_time(db, participants, caller)
+    return HTMLResponse(render(request, "analysis/trial_time.html", trial=trial, withdrawn=withdrawn_codes(participants)))

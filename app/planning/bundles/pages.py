@@ -101,6 +101,7 @@ def session_bundles(request: Request, visit: CurrentVisit, db: Db, caller: Curre
     page = render(
         request,
         "planning/session_bundles.html",
+        participant=visit.participant,
         visit=visit,
         view=view,
         limits_ma=wording.limits_ma,

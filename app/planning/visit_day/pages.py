@@ -179,6 +179,7 @@ def _page(
     return render(
         request,
         "planning/visit_day/day.html",
+        participant=visit.participant,
         visit=visit,
         day=shown,
         current=current,
