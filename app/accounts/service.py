@@ -17,13 +17,14 @@ from app.accounts.addresses import LONGEST_ADDRESS, normal_address
 from app.accounts.models import ApiToken, Membership, Role, Scope, SignIn, SignInAttempt, Study, User
 from app.accounts.passwords import MIN_PASSWORD, FewAtOnce, place, weakness
 from app.accounts.permissions import MANAGE_ACCOUNTS, READ_AUDIT, Caller, Grant
-from app.platform.audit import record
-from app.platform.database import new_session, now
+from app.platform.audit import record, record_once
+from app.platform.database import new_session, now, set_actor
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 from app.settings import get_settings
 
 FAILURES_ALLOWED = 5
 FAILURE_WINDOW = timedelta(minutes=15)
+LOCKED_OUT = {"why": "too many failed tries"}
 TOKEN_DAYS, MOST_TOKEN_DAYS = 90, 730
 _SEEN_RESOLUTION = timedelta(minutes=1)
 _TOKEN_PREFIX = "blp_"  # noqa: S105 - no secret
@@ -101,11 +102,17 @@ def confirm_password(user_id: int, password: str, code: str = "") -> None:
     """
     with place(), new_session() as db:
         user = db.get_one(User, user_id)
-        attempt = _count_attempt(db, user.email)
+        set_actor(db, user.email, user_id)
+        attempt = _count_attempt(db, user.email, known=True)
+        wrong = None
         if not (_hasher.verify(password, user.password_hash) and user.active):
-            raise Forbidden("The password is wrong.", "Nothing was changed; try again.")
-        if not second_factor.accepts(db, user.id, code):
-            raise Forbidden("The code of the second factor is wrong or missing.", "Nothing was changed; give the one of now.")
+            wrong = "The password is wrong.", "Nothing was changed; try again."
+        elif not second_factor.accepts(db, user.id, code):
+            wrong = "The code of the second factor is wrong or missing.", "Nothing was changed; give the one of now."
+        if wrong is not None:
+            record(db, "refuse", "confirmation", user.email, {"why": wrong[0]})
+            db.commit()
+            raise Forbidden(*wrong)
         repository.forget_failures(db, attempt)
         db.commit()
 
@@ -149,7 +156,7 @@ def sign_in(db: Session, email: str, password: str, code: str = "") -> str:
     """
     address = normal_address(email)
     user = repository.user_by_email(db, email)
-    attempt = _count_attempt(db, user.email if user else address) if address else None
+    attempt = _count_attempt(db, user.email if user else address, known=user is not None) if address else None
     # an unknown address costs the same time as a wrong password, so that addresses cannot be guessed by the clock: somebody's hash
     # stands in, for an address always the same, because hashes of earlier versions cost more
     stand_in = repository.some_password_hash(db, address or "") or _decoy()
@@ -173,11 +180,16 @@ def open_session(db: Session, user: User, issuer: str | None = None) -> str:
     return token
 
 
-def _count_attempt(db: Session, address: str) -> SignInAttempt:
-    """Count a try of an address, and commit. Raises TooMany where it has used up its tries; such a try is not counted."""
+def _count_attempt(db: Session, address: str, known: bool) -> SignInAttempt:
+    """Count a try of an address, and commit. Raises TooMany where it has used up its tries; such a try is not counted.
+
+    A lock-out is one row of the trail, however often it is tried meanwhile: whoever guesses must not be able to fill it.
+    """
     repository.lock_address(db, address)
     repository.prune_failures(db, FAILURE_WINDOW)
     if repository.recent_failures(db, address, FAILURE_WINDOW) >= FAILURES_ALLOWED:
+        # what was typed as an unknown address may be a password
+        record_once(db, "refuse", "sign_in", address if known else "unknown address", LOCKED_OUT, FAILURE_WINDOW)
         db.commit()
         raise TooMany(
             f"Too many failed sign-ins for {address}.",

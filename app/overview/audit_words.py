@@ -71,6 +71,7 @@ def _recorded(event: AuditEvent, names: Names) -> str:
         ("export", "session"): f"exported the samples of {names.session(number)}",
         ("download", "plan"): f"printed plan {number}" + (f" for {names.visit(plan)}" if plan is not None else ""),
         ("refuse", "sign_in"): f"refused a sign-in of {event.entity_id}",
+        ("refuse", "confirmation"): f"refused {event.entity_id} a signature or a new password",
     }
     return said.get((event.action, event.entity), f"{event.action}: {event.entity.replace('_', ' ')} {event.entity_id}")
 
@@ -169,7 +170,8 @@ def _version(of: str) -> Callable[[Row, Row, Names], str]:
 
 def _dose(before: Row, after: Row, names: Names) -> str:
     row = after or before
-    return f"{'took back' if not after else 'wrote down'} a dose of {str(row['drug']).replace('_', ' ')} at {names.visit(row['visit_id'])}"
+    did = "took back" if not after or after.get("removed_at") else "wrote down"
+    return f"{did} a dose of {str(row['drug']).replace('_', ' ')} at {names.visit(row['visit_id'])}"
 
 
 def _of_session(first: str, later: str) -> Callable[[Row, Row, Names], str]:

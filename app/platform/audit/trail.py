@@ -109,6 +109,16 @@ def record(db: Session, action: str, entity: str, entity_id: str | int, details:
     db.execute(note, {"action": action, "entity": entity, "entity_id": str(entity_id), "details": said})
 
 
+def record_once(db: Session, action: str, entity: str, entity_id: str, details: dict[str, Any], every: timedelta) -> bool:
+    """The same as `record`, but not where it stands there with these details and is younger than `every`; whether a row was written."""
+    same = (AuditEvent.entity == entity) & (AuditEvent.entity_id == entity_id) & (AuditEvent.action == action)
+    young = (AuditEvent.after == details) & (AuditEvent.at > now() - every)
+    if db.scalar(select(AuditEvent.id).where(same, young).limit(1)) is not None:
+        return False
+    record(db, action, entity, entity_id, details)
+    return True
+
+
 def record_view(db: Session, what: str) -> bool:
     """Record that the acting user looked at `what`, once in VIEW_EVERY; whether a row was written. The caller commits."""
     user_id = db.info.get("actor", {}).get("user_id")
