@@ -5,6 +5,7 @@ from __future__ import annotations
 from tests.promised.faults import FAULTS
 from tests.promised.promise import Promise
 from tests.promised.promise import of as _of
+from tests.promised.records import RECORDS
 
 CHAIN = "tests/app/platform/test_audit_chain.py"
 ROLE = "tests/app/platform/test_service_role.py"
@@ -46,7 +47,6 @@ PROMISES = [
          f"{CHAIN}::test_what_the_owner_changes_is_found"),
         ("a forged seal is found", "if not hmac.compare_digest(mac, _mac(position, digest)):", "if False:",
          f"{CHAIN}::test_what_the_owner_changes_is_found"),
-        ("a trigger that is off is found", "t.tgenabled in ('O', 'A') and ", "", f"{CHAIN}::test_a_trigger_that_is_off_is_named"),
         ("seals stand outside the database too", "*_seals_of_file()]", "]",
          f"{CHAIN}::test_a_seal_that_was_deleted_from_the_database_still_stands_in_its_file"),
     ),
@@ -375,4 +375,5 @@ PROMISES = [
          f"{PAGES}::test_every_form_against_every_role"),
     ),
     *FAULTS,
+    *RECORDS,
 ]  # fmt: skip

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from enum import StrEnum
+from itertools import islice
 from pathlib import Path
 
 import structlog
@@ -25,16 +25,16 @@ from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from app.platform.audit.trail import AUDITED
+from app.platform.audit.breaks import MOST_BREAKS, Break, BreakKind
+from app.platform.audit.guards import what_writes
+from app.platform.audit.rows import past_the_trail
 from app.platform.database import Base, transaction
+from app.platform.signatures.service import changed_records
 from app.settings import get_settings, private_folder
 
 GENESIS = hashlib.sha256(b"betaloop audit trail").digest()
 SECRET = "audit-seals"  # noqa: S105 - the name of a key
 SEAL_EVERY_S = 60.0
-MOST_BREAKS = 100
-"""After so many the rest is not looked for: the trail is broken, and one wants to know where it begins."""
-NEVER_CHANGED = ("audit_event", "audit_link", "audit_seal")
 
 
 class AuditLink(Base):
@@ -59,29 +59,6 @@ class AuditSeal(Base):
     digest: Mapped[bytes] = mapped_column(LargeBinary)
     mac: Mapped[bytes] = mapped_column(LargeBinary)
     made_at: Mapped[datetime] = mapped_column(server_default=func.clock_timestamp())
-
-
-class BreakKind(StrEnum):
-    """What is wrong at a place of the chain."""
-
-    EDITED = "edited"
-    REMOVED = "removed"
-    ADDED = "added"
-    GAP = "gap"
-    REWRITTEN = "rewritten"
-    FORGED_SEAL = "forged_seal"
-    CUT_OFF = "cut_off"
-    TRIGGER_OFF = "trigger_off"
-
-
-@dataclass(frozen=True)
-class Break:
-    """One break: its place in the chain, the number of the row of the trail, and the table whose trigger is off, as far as they apply."""
-
-    kind: BreakKind
-    position: int | None = None
-    event_id: int | None = None
-    table: str | None = None
 
 
 @dataclass(frozen=True)
@@ -143,7 +120,7 @@ def keep_sealing(stop: threading.Event) -> None:
 
 
 def verify(db: Session) -> Verified:
-    """Compute the whole chain again and hold every seal against it."""
+    """Compute the whole chain again, hold every seal against it, and look at what writes it and at the rows that it tells of."""
     digests: dict[int, bytes] = {}
     wanted = [*_seals_of_database(db), *_seals_of_file()]
     places = {place for place, _, _ in wanted}
@@ -165,7 +142,9 @@ def verify(db: Session) -> Verified:
     if len(breaks) < MOST_BREAKS:
         breaks += [Break(BreakKind.ADDED, event_id=i) for i in _unlinked(db)]
         breaks += _against_seals(wanted, digests, links)
-        breaks += [Break(BreakKind.TRIGGER_OFF, table=name) for name in _without_trigger(db)]
+        breaks += what_writes(db)
+        breaks += [Break(BreakKind.SIGNATURE_CHANGED, table="signature", row=str(i)) for i in changed_records(db)]
+        breaks += islice(past_the_trail(db), MOST_BREAKS)
     return Verified(links, len(places), max(places, default=0), tuple(breaks[:MOST_BREAKS]))
 
 
@@ -200,17 +179,6 @@ def _unlinked(db: Session) -> list[int]:
         "select e.id from audit_event e left join audit_link l on l.event_id = e.id where l.event_id is null order by e.id limit :most"
     )
     return list(db.scalars(text(statement), {"most": MOST_BREAKS}))
-
-
-def _without_trigger(db: Session) -> list[str]:
-    """Tables whose changes would not reach the trail, or not the chain, or that could be changed."""
-    wanted = {(table, "audit") for table in AUDITED} | {(table, "never_changed") for table in NEVER_CHANGED} | {("audit_event", "chained")}
-    statement = (
-        "select c.relname, t.tgname from pg_trigger t join pg_class c on c.oid = t.tgrelid"
-        " where t.tgenabled in ('O', 'A') and not t.tgisinternal and c.relnamespace = 'public'::regnamespace"
-    )
-    there = {(table, name) for table, name in db.execute(text(statement))}
-    return sorted({table for table, name in wanted - there})
 
 
 def _seals_of_database(db: Session) -> list[tuple[int, bytes, bytes]]:

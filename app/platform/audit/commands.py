@@ -6,7 +6,8 @@ from dataclasses import asdict
 
 import typer
 
-from app.platform.audit.chain import Break, BreakKind, Verified, seal, verify
+from app.platform.audit.breaks import sentence
+from app.platform.audit.chain import Verified, seal, verify
 from app.platform.database import new_session, transaction
 from app.platform.terminal import ACTOR, AsJson, print_line, show
 
@@ -36,17 +37,4 @@ def sentences(found: Verified) -> list[str]:
     if found.whole:
         sealed = f"sealed up to link {found.sealed_to}" if found.sealed_to else "not sealed yet"
         return [f"The audit trail is whole: {found.links} links, {sealed}."]
-    return [f"The audit trail is broken at {len(found.breaks)} places:", *(f"  {_sentence(b)}" for b in found.breaks)]
-
-
-def _sentence(b: Break) -> str:
-    return {
-        BreakKind.EDITED: f"link {b.position}: row {b.event_id} is not what was written",
-        BreakKind.REMOVED: f"link {b.position}: row {b.event_id} was taken out",
-        BreakKind.ADDED: f"row {b.event_id} was put in past the chain",
-        BreakKind.GAP: f"link {b.position} is missing",
-        BreakKind.REWRITTEN: f"link {b.position} is not the one that was sealed: the chain was computed anew",
-        BreakKind.FORGED_SEAL: f"the seal of link {b.position} was not made with this installation's key",
-        BreakKind.CUT_OFF: f"link {b.position} was sealed and is gone: the end of the trail was cut off",
-        BreakKind.TRIGGER_OFF: f"table {b.table}: a trigger of the trail is missing or switched off",
-    }[b.kind]
+    return [f"The audit trail is broken at {len(found.breaks)} places:", *(f"  {sentence(b)}" for b in found.breaks)]

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import sqlalchemy as sa
 from sqlalchemy import CheckConstraint, ForeignKey, Index, String, func
-from sqlalchemy.orm import Mapped, mapped_column
+from sqlalchemy.dialects.postgresql import JSONB
+from sqlalchemy.orm import Mapped, column_property, mapped_column
 
+from app.platform.audit import AuditEvent
 from app.platform.database import Base
 
 
@@ -31,3 +35,24 @@ class Signature(Base):
     signer: Mapped[str] = mapped_column(String(254))
     """The signer's address when it was signed."""
     signed_at: Mapped[datetime] = mapped_column(server_default=func.clock_timestamp())
+    if TYPE_CHECKING:  # mapped below, where the table that it asks for is there
+        recorded: Mapped[dict[str, Any] | None]
+        """The signature as the audit trail took it down, without its content; None where its entry is gone or does not fit the chain."""
+
+
+_ENTRY = AuditEvent.__table__.alias("signed_entry")
+_LINK, _BEFORE = (sa.table("audit_link", *(sa.column(n) for n in ("position", "event_id", "digest"))).alias(a) for a in ("own", "before"))
+_FITS = _LINK.c.digest == func.audit_digest(
+    func.coalesce(_BEFORE.c.digest, hashlib.sha256(b"betaloop audit trail").digest()), sa.literal_column("signed_entry")
+)
+# links are made at the commit: the entry of a signature that this transaction gives has none yet
+_OWN = sa.literal_column("signed_entry.xmin = pg_current_xact_id_if_assigned()::xid", sa.Boolean)
+Signature.recorded = column_property(
+    sa.select(sa.cast(sa.case((sa.or_(_FITS, _LINK.c.position.is_(None) & _OWN), _ENTRY.c.after)), JSONB))
+    .select_from(_ENTRY.outerjoin(_LINK, _LINK.c.event_id == _ENTRY.c.id).outerjoin(_BEFORE, _BEFORE.c.position == _LINK.c.position - 1))
+    .where(_ENTRY.c.entity == "signature", _ENTRY.c.action == "insert", _ENTRY.c.entity_id == sa.cast(Signature.id, String))
+    .order_by(_ENTRY.c.id)
+    .limit(1)
+    .correlate(Signature.__table__)
+    .scalar_subquery()
+)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -22,3 +23,10 @@ def newest_of_each(db: Session, kind: str, subject_ids: Collection[int]) -> dict
         return {}
     mine = (Signature.subject_kind == kind) & Signature.subject_id.in_(subject_ids)
     return {row.subject_id: row for row in db.scalars(select(Signature).where(mine).order_by(Signature.id))}
+
+
+def contents(db: Session) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    """Of every signature its number, hash and content."""
+    rows = db.execute(select(Signature.id, Signature.sha256, Signature.content).order_by(Signature.id).execution_options(yield_per=100))
+    for row in rows:
+        yield row[0], row[1], row[2]

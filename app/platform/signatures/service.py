@@ -6,14 +6,17 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
 from sqlalchemy.orm import Session
 
+from app.platform.signatures import repository
 from app.platform.signatures.models import Signature
 
 _EXACT = 2**53
+_RECORDED = ("id", "subject_kind", "subject_id", "meaning", "sha256", "signed_by", "signer")
 
 
 class SignatureState(StrEnum):
@@ -64,8 +67,22 @@ def record(db: Session, signer: Signer, *, kind: str, subject_id: int, meaning: 
 
 
 def covers(signature: Signature, content: Mapping[str, Any]) -> bool:
-    """Whether a signature was given for exactly this content, and its own record is whole."""
-    return signature.sha256 == content_hash(content) == content_hash(signature.content)
+    """Whether a signature was given for exactly this content, and its own record is whole and as the audit trail took it down."""
+    return signature.sha256 == content_hash(content) == content_hash(signature.content) and _as_recorded(signature)
+
+
+def changed_records(db: Session) -> list[int]:
+    """Numbers of the signatures whose content is not what was signed. Their other columns are for the audit trail to tell."""
+    return [number for number, sha256, content in repository.contents(db) if content_hash(content) != sha256]
+
+
+def _as_recorded(signature: Signature) -> bool:
+    """Whether the entry of the trail, in its place of the chain, tells of the same signature: hash, meaning, subject, who and when."""
+    said = signature.recorded
+    if said is None:
+        return False
+    same = all(said.get(name) == getattr(signature, name) for name in _RECORDED)
+    return same and datetime.fromisoformat(said["signed_at"]) == signature.signed_at
 
 
 def state_of(signature: Signature | None, content: Mapping[str, Any]) -> SignatureState:

@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 
 from app.learning.policies.baselines import constant_onnx
 from app.platform.audit import AUDITED
+from app.platform.audit.chain import verify
 from app.platform.database import Base
 from app.platform.tables import load_tables
 
@@ -101,3 +102,32 @@ def test_a_token_without_an_end_is_given_one_and_others_keep_theirs(owner_db: Se
     assert [tuple(row) for row in ends] == [("endless", True), ("short", False)]
     assert owner_db.scalar(text("select expires_at = '2026-12-01T00:00:00Z' from api_token where name = 'short'"))
     owner_db.rollback()
+
+
+def test_what_earlier_migrations_wrote_past_the_trail_has_its_entries(client: TestClient, enrolled: str, owner_db: Session) -> None:
+    visit = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 3}).json()["id"]
+    command.downgrade(config(owner_db.connection()), "0032")
+    lock = "insert into visit_lock (visit_id, locked, reason, created_by) values (:visit, true, 'complete', 'ada@clinic.example')"
+    owner_db.execute(text(lock), {"visit": visit})
+    command.upgrade(config(owner_db.connection()), "head")
+    owner_db.commit()
+    assert owner_db.scalar(text("select settings_version_id from visit_lock")) is not None
+    entry = (
+        "select actor, action, before ? 'settings_version_id', after ? 'settings_version_id' from audit_event where entity = 'visit_lock'"
+    )
+    assert [tuple(row) for row in owner_db.execute(text(f"{entry} order by id"))][1:] == [("migration 0035", "update", False, True)]
+    assert verify(owner_db).whole
+
+
+def test_doses_taken_back_since_go_with_the_way_back(client: TestClient, enrolled: str, owner_db: Session) -> None:
+    visit = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 3, "date": "2026-03-02"}).json()["id"]
+    dose = {"drug": "levodopa", "mg": 100, "taken_at": "2026-03-02T07:00:00Z"}
+    for mg in (100, 50):
+        number = client.post(f"/api/v1/visits/{visit}/doses", json=dose | {"mg": mg}).json()["id"]
+        if mg == 100:
+            client.post(f"/api/v1/doses/{number}/removal", json={"reason": "it was 50 mg"})
+    command.downgrade(config(owner_db.connection()), "0033")
+    assert owner_db.scalars(text("select mg from dose")).all() == [50]
+    command.upgrade(config(owner_db.connection()), "head")
+    owner_db.commit()
+    assert verify(owner_db).whole

@@ -7,7 +7,11 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
+from app.platform.audit.chain import verify
+from app.platform.database import new_session
 from app.platform.signatures.models import Signature
+from app.platform.signatures.repository import newest_of_each
+from app.platform.signatures.service import content_hash, covers
 from tests.conftest import PASSWORD
 
 LOCKS = "/api/v1/participants/P1/margins/locks"
@@ -73,3 +77,38 @@ def test_locks_of_earlier_versions_say_that_they_have_none(client: TestClient, e
     owner_db.commit()
     assert [lock["signature_state"] for lock in client.get(LOCKS).json()] == ["not_kept"]
     assert "without signature" in client.get("/participants/P1/margins", headers=PAGE).text
+
+
+@pytest.mark.parametrize("side", ["signature", "trail", "both"])
+def test_a_signature_that_was_rewritten_with_its_values_does_not_stand(
+    client: TestClient, enrolled: str, owner_db: Session, side: str
+) -> None:
+    """Whoever owns the tables changes the margins and what was signed; the entry of the audit trail tells of another signature."""
+    assert client.post(LOCKS, json={"version": 1, "reason": "protocol", "password": PASSWORD}).status_code == 201
+    content = owner_db.scalars(select(Signature)).one().content | {"tremor_points": 50}
+    for table in ("margins_version", "signature", "audit_event"):
+        owner_db.execute(text(f"alter table {table} disable trigger user"))
+    if side != "trail":
+        owner_db.execute(text("update margins_version set tremor_points = 50"))
+        signed = text("update signature set sha256 = :new, content = jsonb_set(content, '{tremor_points}', '50')")
+        owner_db.execute(signed, {"new": content_hash(content)})
+    if side != "signature":
+        told = text("update audit_event set after = jsonb_set(after, '{sha256}', to_jsonb(cast(:new as text))) where entity = 'signature'")
+        owner_db.execute(told, {"new": content_hash(content)})
+    for table in ("margins_version", "signature", "audit_event"):
+        owner_db.execute(text(f"alter table {table} enable trigger user"))
+    owner_db.commit()
+    assert [lock["signature_state"] for lock in client.get(LOCKS).json()] == ["broken"]
+    assert BROKEN in client.get("/participants/P1/margins", headers=PAGE).text
+    with new_session() as db:
+        assert not verify(db).whole
+
+
+def test_signatures_and_their_entries_are_read_in_one_query(client: TestClient, enrolled: str, db: Session, statements: list[str]) -> None:
+    for number in (1, 2, 3):
+        client.post(LOCKS, json={"version": number, "reason": "protocol", "password": PASSWORD})
+        client.put("/api/v1/participants/P1/margins", json={"margins": {"tremor_points": number}, "reason": "amended"})
+    statements.clear()
+    found = newest_of_each(db, "margins_lock", [1, 2, 3])
+    assert [covers(s, s.content) for s in found.values()] == [True] * 3
+    assert len([s for s in statements if "signature" in s]) == len([s for s in statements if "audit_event" in s]) == 1

@@ -1,0 +1,106 @@
+"""Whether what writes the trail is what betaloop made: the functions by their source, the triggers by all that they do, and no others.
+
+The owner of the tables could put a function that writes nothing in the place of one that does, or a trigger before it that lets nothing
+through. Migrations define both; what they define stands here, and a test holds the two against each other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+
+from app.platform.audit.breaks import Break, BreakKind
+from app.platform.audit.trail import AUDITED
+
+_AS_OWNER = ("search_path=pg_catalog, public, pg_temp",)
+FUNCTIONS: dict[str, tuple[str, tuple[str, ...] | None]] = {
+    "audit_row()": ("3be7f5ea05740bef04bf16c907db91f46874b53ea394538af5689bcbc10e7c21", _AS_OWNER),
+    "audit_chain()": ("310aa78f4ccefa3f2bff46c1e7f9dd9ea7b1056735a6adc4a212d960c3ea15c6", _AS_OWNER),
+    "audit_digest(bytea,audit_event)": ("2cb7199a5193e7d7854e3c7c75808f9765fd36b3c637c12d0162727e4a485b45", None),
+    "audit_field(text)": ("2d5a3e0a662df07283731d2de9968e470861aabc939ce9ee87c08d2e96ec016a", None),
+    "audit_note(text,text,text,jsonb)": ("ec4263b5a33410d9f815c47eee1d734788d26f93ca2c0b1dc8f39b8a8b7dcab5", _AS_OWNER),
+    "refuse_change()": ("da93516501980e79942450e1be880906bbc4364c29d70d72b2961d3d3f533966", None),
+}
+"""What the trail rests on: SHA-256 of the source as the newest migration left it, and its settings; those with settings run as owner."""
+
+NEVER_CHANGED = ("audit_event", "audit_link", "audit_seal")
+
+_EACH_WRITE, _EACH_INSERT, _BEFORE_CHANGE, _BEFORE_DELETION, _BEFORE_TRUNCATE = 29, 5, 27, 11, 34  # pg_trigger.tgtype
+KNOWN = {
+    ("audit", "audit_row", _EACH_WRITE),
+    ("chained", "audit_chain", _EACH_INSERT),
+    ("never_changed", "refuse_change", _BEFORE_CHANGE),
+    ("never_emptied", "refuse_change", _BEFORE_TRUNCATE),
+    ("never_deleted", "refuse_change", _BEFORE_DELETION),
+    ("count_time", "count_time_of_recording", 17),
+    ("count_time", "count_time_of_session", 17),
+    ("count_time", "count_time_of_segment", _EACH_WRITE),
+}
+"""Every trigger that migrations give to an audited table or to the trail: name, function, and when it runs."""
+WHEN = {"never_deleted": "(((old.status)::text = 'confirmed'::text))"}
+"""On what a trigger depends; the others on nothing."""
+
+_FUNCTIONS = """
+select p.oid::regprocedure::text, p.prosrc, p.prosecdef, p.proconfig from pg_proc p where p.pronamespace = 'public'::regnamespace
+"""
+_TRIGGERS = """
+select c.relname, t.tgname, p.proname, t.tgtype::int, p.pronamespace = 'public'::regnamespace, t.tgenabled::text,
+    coalesce(substring(pg_get_triggerdef(t.oid) from ' WHEN (.*) EXECUTE '), ''), t.tgattr::text, encode(t.tgargs, 'escape')
+from pg_trigger t join pg_class c on c.oid = t.tgrelid join pg_proc p on p.oid = t.tgfoid
+where not t.tgisinternal and c.relnamespace = 'public'::regnamespace
+union all
+select c.relname, r.rulename, '', 0, false, '', '', '', '' from pg_rewrite r join pg_class c on c.oid = r.ev_class
+where c.relnamespace = 'public'::regnamespace and c.relkind = 'r'
+"""
+_KEYS = """
+select c.relname, string_agg(a.attname, ',' order by k.place)
+from pg_index i join pg_class c on c.oid = i.indrelid cross join lateral unnest(i.indkey::int2[]) with ordinality k(number, place)
+join pg_attribute a on a.attrelid = c.oid and a.attnum = k.number
+where i.indisprimary and c.relnamespace = 'public'::regnamespace group by 1
+"""
+
+
+def keys(db: Session) -> dict[str, tuple[str, ...]]:
+    """The columns of each table's primary key, in order."""
+    return {table: tuple(columns.split(",")) for table, columns in db.execute(text(_KEYS))}
+
+
+def what_writes(db: Session) -> list[Break]:
+    """Functions, triggers and rules that are missing, off, changed or not betaloop's."""
+    return [*_functions(db), *_triggers(db)]
+
+
+def _functions(db: Session) -> Iterator[Break]:
+    there = {name: (source, as_owner, settings) for name, source, as_owner, settings in db.execute(text(_FUNCTIONS))}
+    for name, (sha256, wanted) in FUNCTIONS.items():
+        source, as_owner, settings = there.get(name, ("", False, None))
+        same = hashlib.sha256(source.encode()).hexdigest() == sha256
+        if not same or as_owner != (wanted is not None) or settings != (list(wanted) if wanted else None):
+            yield Break(BreakKind.FUNCTION_CHANGED, name=name)
+
+
+def _triggers(db: Session) -> Iterator[Break]:
+    """Triggers whose changes would not reach the trail, or not the chain, or that would let it be changed, and those of others."""
+    arguments = {
+        table: "".join(f"{part}\\000" for part in (",".join(AUDITED[table]), ",".join(key)))
+        for table, key in keys(db).items()
+        if table in AUDITED
+    }
+    wanted = {(table, "audit") for table in AUDITED}
+    wanted |= {(table, name) for table in NEVER_CHANGED for name in ("never_changed", "never_emptied")}
+    wanted |= {("audit_event", "chained"), ("session", "never_deleted")}
+    good = set()
+    for table, name, function, moment, own, enabled, condition, columns, given in db.execute(text(_TRIGGERS)):
+        if table not in AUDITED and table not in NEVER_CHANGED:
+            continue
+        if not (own and (name, function, moment) in KNOWN):
+            yield Break(BreakKind.TRIGGER_UNKNOWN, table=table, name=name)
+            continue
+        as_made = (columns, condition) == ("", WHEN.get(name, "")) and (name != "audit" or given == arguments.get(table))
+        if as_made and enabled in ("O", "A"):
+            good.add((table, name))
+    for table, name in sorted(wanted - good):
+        yield Break(BreakKind.TRIGGER_OFF, table=table, name=name)

@@ -1,0 +1,172 @@
+"""Rows that the tables' owner wrote past the trail, and what keeps later writes from it: `betaloop audit verify` names each."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+from typer.testing import CliRunner
+
+from app import cli
+from app.platform.audit.breaks import BreakKind
+from app.platform.audit.chain import verify
+from app.platform.database import new_session
+from app.platform.signatures.service import content_hash
+from tests.app.every_route import World
+from tests.conftest import PASSWORD
+
+LOCK = "/api/v1/participants/P1/margins/locks"
+
+
+def found() -> set[tuple[str, str | None, str | None, tuple[str, ...], str | None]]:
+    with new_session() as db:
+        return {(b.kind.value, b.table, b.row, b.columns, b.name) for b in verify(db).breaks}
+
+
+def past_the_triggers(owner_db: Session, table: str, statement: str) -> None:
+    """A statement of the owner, whose traces are swept away: the triggers stand again as they did."""
+    owner_db.execute(text(f"alter table {table} disable trigger user"))
+    owner_db.execute(text(statement))
+    owner_db.execute(text(f"alter table {table} enable trigger user"))
+    owner_db.commit()
+
+
+@pytest.fixture
+def visit(client: TestClient, enrolled: str) -> int:
+    body = {"number": 7, "note": "seen", "cdbs_amplitudes": [{"hemisphere": "left", "amplitude_ma": 2.5}]}
+    made = int(client.post(f"/api/v1/participants/{enrolled}/visits", json=body).json()["id"])
+    assert found() == set()
+    return made
+
+
+@pytest.mark.parametrize(
+    ("table", "statement", "kind", "columns"),
+    [
+        ("cdbs_amplitude", "update cdbs_amplitude set amplitude_ma = 3.5", "row_altered", ("amplitude_ma",)),
+        ("visit", "update visit set note = 'not seen', date = '2020-01-01' where number = 7", "row_altered", ("date", "note")),
+        ("cdbs_amplitude", "update cdbs_amplitude set removed_at = now()", "row_altered", ("removed_at",)),
+        ("cdbs_amplitude", "delete from cdbs_amplitude", "row_removed", ()),
+        ("cdbs_amplitude", "truncate cdbs_amplitude", "row_removed", ()),
+    ],
+)
+def test_what_was_written_past_the_trail_is_named(
+    visit: int, owner_db: Session, table: str, statement: str, kind: str, columns: tuple[str, ...]
+) -> None:
+    past_the_triggers(owner_db, table, statement)
+    ((said, of, _, differing, _),) = found()
+    assert (said, of, tuple(sorted(differing))) == (kind, table, columns)
+
+
+def test_a_row_that_was_put_in_is_named_and_told_in_words(visit: int, owner_db: Session) -> None:
+    past_the_triggers(owner_db, "qoc", "select 1")
+    past_the_triggers(
+        owner_db, "visit", "insert into visit (id, participant_id, number) select 999, participant_id, 99 from visit where number = 7"
+    )
+    assert found() == {("row_added", "visit", "999", (), None)}
+    said = CliRunner().invoke(cli.app, ["audit", "verify"])
+    assert said.exit_code == 1
+    assert "table visit, row 999 was put in past the trail" in said.output
+
+
+def test_a_column_that_an_entry_from_before_it_lacks_must_be_as_that_version_left_it(visit: int, owner_db: Session) -> None:
+    owner_db.execute(text("alter table visit add column place varchar(9) not null default 'clinic', add column remark text"))
+    owner_db.commit()
+    assert found() == set()
+    past_the_triggers(owner_db, "visit", "update visit set place = 'home' where number = 7")
+    assert {columns for _, _, _, columns, _ in found()} == {("place",)}
+    past_the_triggers(owner_db, "visit", "update visit set place = 'clinic', remark = 'x' where number = 7")
+    assert {columns for _, _, _, columns, _ in found()} == {("remark",)}
+
+
+def test_a_zone_of_the_database_changes_no_moment(visit: int, owner_db: Session) -> None:
+    owner_db.execute(text("do $$ begin execute format('alter database %I set timezone = ''Asia/Tokyo''', current_database()); end $$"))
+    owner_db.commit()
+    owner_db.connection().invalidate()
+    with new_session() as db:
+        db.connection().invalidate()
+    with new_session() as db:
+        assert db.scalar(text("show timezone")) == "Asia/Tokyo"
+        assert verify(db).whole
+
+
+NOTHING = (
+    "create or replace function audit_row() returns trigger language plpgsql security definer"
+    " set search_path = pg_catalog, public, pg_temp as $$ begin return null; end $$"
+)
+HOLDS_BACK = "create function hold_back() returns trigger language plpgsql as $$ begin return null; end $$"
+
+
+@pytest.mark.parametrize(
+    ("statements", "named"),
+    [
+        ([NOTHING], ("function_changed", None, "audit_row()")),
+        (["alter function audit_row() security invoker"], ("function_changed", None, "audit_row()")),
+        (["alter function audit_chain() set search_path = pg_temp, public"], ("function_changed", None, "audit_chain()")),
+        (["alter table qoc disable trigger audit"], ("trigger_off", "qoc", "audit")),
+        (["alter table session disable trigger never_deleted"], ("trigger_off", "session", "never_deleted")),
+        (["drop trigger audit on qoc", HOLDS_BACK,
+          "create trigger audit after insert or update or delete on qoc for each row execute function hold_back()"],
+         ("trigger_unknown", "qoc", "audit")),
+        (["drop trigger audit on qoc",
+          "create trigger audit after insert or update or delete on qoc for each row execute function audit_row('rating', 'id')"],
+         ("trigger_off", "qoc", "audit")),
+        (["drop trigger audit on qoc",
+          "create trigger audit after insert on qoc for each row execute function audit_row('', 'id')"],
+         ("trigger_unknown", "qoc", "audit")),
+        (["drop trigger audit on qoc", "create trigger audit after insert or update or delete on qoc for each row"
+          " when (pg_trigger_depth() > 5) execute function audit_row('', 'id')"], ("trigger_off", "qoc", "audit")),
+        ([HOLDS_BACK, "create trigger first before insert on audit_event for each row execute function hold_back()"],
+         ("trigger_unknown", "audit_event", "first")),
+        (["create rule lost as on insert to audit_event do instead nothing"], ("trigger_unknown", "audit_event", "lost")),
+    ],
+)  # fmt: skip
+def test_what_would_keep_later_writes_from_the_trail_is_named(
+    fresh_database: str, owner_db: Session, statements: list[str], named: tuple[str, str | None, str]
+) -> None:
+    for statement in statements:
+        owner_db.execute(text(statement))
+    owner_db.commit()
+    assert named in {(kind, table, name) for kind, table, _, _, name in found()}
+
+
+def test_what_a_function_that_writes_nothing_let_through_stays_named_when_it_is_put_back(
+    client: TestClient, enrolled: str, owner_db: Session
+) -> None:
+    ours = owner_db.scalar(text("select pg_get_functiondef('audit_row()'::regprocedure)"))
+    owner_db.execute(text(NOTHING))
+    owner_db.commit()
+    number = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 7}).json()["id"]
+    owner_db.connection().exec_driver_sql(str(ours))
+    owner_db.commit()
+    assert found() == {("row_added", "visit", str(number), (), None)}
+
+
+@pytest.mark.parametrize(
+    ("statement", "kinds"),
+    [
+        ("update signature set content = jsonb_set(content, '{tremor_points}', '50'), sha256 = '{new}'", {"row_altered"}),
+        ("update signature set content = jsonb_set(content, '{tremor_points}', '50')", {"signature_changed"}),
+        ("update signature set signer = 'somebody.else@clinic.example'", {"row_altered"}),
+    ],
+)
+def test_a_signature_that_was_rewritten_is_named(
+    client: TestClient, enrolled: str, owner_db: Session, statement: str, kinds: set[str]
+) -> None:
+    assert client.post(LOCK, json={"version": 1, "reason": "protocol", "password": PASSWORD}).status_code == 201
+    content = owner_db.scalar(text("select content from signature"))
+    new = content_hash(dict(content or {}) | {"tremor_points": 50})
+    past_the_triggers(owner_db, "signature", statement.replace("{new}", new))
+    assert {kind for kind, *_ in found()} == kinds
+
+
+def test_the_filled_study_is_whole_and_looked_at_within_seconds(world: World) -> None:
+    begun = time.process_time()
+    with new_session() as db:
+        checked = verify(db)
+    assert checked.breaks == ()
+    assert checked.links > 2000
+    assert time.process_time() - begun < 10
+    assert {kind.value for kind in BreakKind} >= {"row_altered", "row_removed", "row_added"}

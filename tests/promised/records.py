@@ -1,0 +1,61 @@
+"""Promises about records: the trail, what writes it, the rows that it tells of, and that nothing is deleted."""
+
+from __future__ import annotations
+
+from tests.promised.promise import of as _of
+
+CHAIN, PAST = "tests/app/platform/test_audit_chain.py", "tests/app/platform/audit/test_past_the_trail.py"
+MARGINS, KEPT = "tests/app/study/test_margin_signatures.py", "tests/app/study/test_nothing_is_deleted.py"
+REFUSALS, MARKS = "tests/app/accounts/test_refusals_in_the_trail.py", "tests/app/study/participation/test_withdrawn_marks.py"
+
+
+RECORDS = [
+    *_of(
+        "platform/audit/guards",
+        ("a trigger that is off is found", ' and enabled in ("O", "A"):', ":", f"{CHAIN}::test_a_trigger_that_is_off_is_named"),
+        ("a function that writes nothing is found", "same = hashlib.sha256(source.encode()).hexdigest() == sha256", "same = True",
+         f"{PAST}::test_what_would_keep_later_writes_from_the_trail_is_named"),
+        ("a trigger that leaves a column out is found", ' and (name != "audit" or given == arguments.get(table))', "",
+         f"{PAST}::test_what_would_keep_later_writes_from_the_trail_is_named"),
+        ("a trigger of others is found", "if not (own and (name, function, moment) in KNOWN):", "if False:",
+         f"{PAST}::test_what_would_keep_later_writes_from_the_trail_is_named"),
+    ),
+    *_of(
+        "study/doses/service",
+        ("doses are not deleted", "    dose.removed_at = now()\n", "    db.delete(dose)\n",
+         f"{KEPT}::test_a_dose_that_was_taken_back_stays_and_may_be_entered_anew"),
+    ),
+    *_of(
+        "study/service",
+        ("cDBS amplitudes are not deleted", "                row.removed_at = now()\n", "                db.delete(row)\n",
+         f"{KEPT}::test_an_amplitude_that_is_stated_no_more_stays_and_outlasts_its_visit"),
+        ("lists mark who has withdrawn", "if p.status == WITHDRAWN)", "if False)", f"{MARKS}::test_lists_mark_who_has_withdrawn"),
+    ),
+    *_of(
+        "study/outcomes/service",
+        ("replaced minutes stay as they were", "if before is not None and tremor.same_values(before, row):", "if before is not None:",
+         f"{KEPT}::test_minutes_that_a_newer_reading_replaced_stay_as_they_were"),
+        ("grasp tests outlast a proposal", "    for row in of_files.grasp_tests(db, session.id):\n        row.removed_at = now()\n", "",
+         f"{KEPT}::test_grasp_tests_outlast_a_proposal_that_was_given_up"),
+    ),
+    *_of(
+        "platform/audit/chain",
+        ("rows are held against the trail", "breaks += islice(past_the_trail(db), MOST_BREAKS)", "pass",
+         f"{PAST}::test_what_was_written_past_the_trail_is_named"),
+        ("a signature whose content was rewritten is named", "for i in changed_records(db)]", "for i in ()]",
+         f"{PAST}::test_a_signature_that_was_rewritten_is_named"),
+    ),
+    *_of(
+        "accounts/service",
+        ("lock-outs are in the trail",
+         '        record_once(db, "refuse", "sign_in", address if known else "unknown address", LOCKED_OUT, FAILURE_WINDOW)\n', "",
+         f"{REFUSALS}::test_a_lock_out_is_one_row_however_often_it_is_tried"),
+        ("wrong passwords at signatures are in the trail", 'record(db, "refuse", "confirmation", user.email, {"why": wrong[0]})', "pass",
+         f"{REFUSALS}::test_a_wrong_password_at_a_signature_is_in_the_trail"),
+    ),
+    *_of(
+        "platform/signatures/service",
+        ("signatures are bound to the trail", " and _as_recorded(signature)", "",
+         f"{MARGINS}::test_a_signature_that_was_rewritten_with_its_values_does_not_stand"),
+    ),
+]  # fmt: skip
