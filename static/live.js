@@ -1,6 +1,7 @@
 // Follows the server-sent events of a job: <section data-live="/api/v1/jobs/ID/events">. In the section, KEY is a step's key or "job":
 //   [data-step="KEY"]     a bar (the `progress` macro with that key)
 //   [data-status="KEY"]   an element whose text is the status
+//   [data-time-left]      the time that is left of the whole job, in the words of its events
 //   [data-log]            log lines are added to it (anywhere in the page); what stands there is replaced, for the log comes whole
 //   figure[data-curve="KEY"]  points are added to the traces named like their values (or with them as `meta`)
 // A step that the page does not know yet, and the job's end, load the page again.
@@ -17,7 +18,7 @@ function follow(section) {
   for (const kind of ["status", "step", "progress"]) on(kind, (event) => {
     if (event.step && !byKey(section, "status", event.step).length && !byKey(section, "step", event.step).length) reload(section);
     show(section, event.step ?? "job", event.data);
-    if (event.step && typeof event.data.job_progress === "number") show(section, "job", { progress: event.data.job_progress });
+    if (event.step && typeof event.data.job_progress === "number") show(section, "job", { progress: event.data.job_progress, time_left: event.data.time_left });
   });
   on("log", (event) => addLog(event.step, event.data.text));
   on("points", (event) => { for (const point of event.data.points) addPoint(section, event.step ?? "job", point); });
@@ -34,7 +35,7 @@ function follow(section) {
 const byKey = (section, attribute, key) => section.querySelectorAll(`[data-${attribute}="${CSS.escape(key)}"]`);
 const TONES = { succeeded: "good", failed: "bad", running: "info", cancelled: "warn" };
 
-function show(section, key, { status, progress, message }) {
+function show(section, key, { status, progress, message, time_left }) {
   for (const bar of byKey(section, "step", key)) {
     if (typeof progress === "number") {
       bar.querySelector("progress").value = progress;
@@ -42,6 +43,7 @@ function show(section, key, { status, progress, message }) {
     }
     if (typeof message === "string") bar.querySelector("[data-progress-message]").textContent = message;
   }
+  if (typeof time_left === "string") for (const place of section.querySelectorAll("[data-time-left]")) place.textContent = time_left;
   if (status) for (const place of byKey(section, "status", key)) {
     const badge = document.createElement("span");
     badge.className = `badge ${TONES[status] ?? ""}`;

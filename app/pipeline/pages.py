@@ -23,6 +23,7 @@ from app.platform.jobs import registry
 from app.platform.jobs import repository as jobs
 from app.platform.jobs import service as job_service
 from app.platform.jobs.models import JobStatus
+from app.platform.jobs.titles import numbered
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
@@ -122,6 +123,7 @@ def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller)
         job=found.job,
         title=_titles().get(found.job.kind, found.job.kind),
         live=not JobStatus(found.job.status).ended,
+        steps=list(zip(found.job.steps, numbered([s.title for s in found.job.steps]), strict=True)),
         curves=charts.job_curves(found.job, [e for e in events if e.kind == "points"]),
         log=[e for e in events if e.kind == "log"][-LOG_LINES:],
         params=_in_words(found.job.params),

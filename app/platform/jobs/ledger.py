@@ -181,7 +181,8 @@ class Ledger:
         job.progress = max(job.progress, min(MOST_UNFINISHED, db.scalar(mean) or 0.0))
         job.updated_at = now()
         job.message = f"{step.title}: {step.message}" if step.message else step.title
-        data = {"progress": step.progress, "job_progress": job.progress, "message": step.message}
+        left = job.seconds_left(job.updated_at)
+        data = {"progress": step.progress, "job_progress": job.progress, "seconds_left": left, "message": step.message}
         repository.add_event(db, job.id, "progress", data, step.key)
 
 

@@ -10,6 +10,7 @@ from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, Index, String, T
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
+from app.platform.jobs.titles import plain_words
 
 
 class JobStatus(StrEnum):
@@ -65,6 +66,11 @@ class Job(Base):
             return None
         return (present - self.started_at).total_seconds() * (1 - self.progress) / self.progress
 
+    @property
+    def doing(self) -> str:
+        """What it does now, in words without methods."""
+        return plain_words(self.message)
+
 
 class JobStep(Base):
     """One compute step of a job, run in a child process of its own; `key` is stable over restarts (`train/2`)."""
@@ -91,6 +97,11 @@ class JobStep(Base):
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
     job: Mapped[Job] = relationship(back_populates="steps")
+
+    @property
+    def doing(self) -> str:
+        """What it does now, in words without methods."""
+        return plain_words(self.message)
 
 
 class JobEvent(Base):

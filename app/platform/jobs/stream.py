@@ -11,10 +11,12 @@ from typing import Any
 from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.orm import Session
 
-from app.platform.database import new_session
+from app.platform.database import new_session, now
 from app.platform.jobs import repository
-from app.platform.jobs.models import Job, JobStatus
+from app.platform.jobs.models import Job, JobEvent, JobStatus
 from app.platform.jobs.service import describe_event
+from app.platform.jobs.titles import plain_words
+from app.platform.web.templates import time_left
 
 POLL_S = 0.5
 KEEP_ALIVE_S = 15.0
@@ -69,11 +71,12 @@ def describe(job: Job) -> dict[str, Any]:
         "kind": job.kind,
         "status": str(job.status),
         "progress": job.progress,
-        "message": job.message,
+        "time_left": time_left(job.seconds_left(now())),
+        "message": job.doing,
         "error": job.error,
         "result": job.result,
         "steps": [
-            {"key": s.key, "title": s.title, "status": str(s.status), "progress": s.progress, "message": s.message, "weight": s.weight}
+            {"key": s.key, "title": s.title, "status": str(s.status), "progress": s.progress, "message": s.doing, "weight": s.weight}
             for s in job.steps
         ],
     }
@@ -89,7 +92,18 @@ def _read(job_id: str, last_id: int | None) -> tuple[dict[str, Any], list[dict[s
         # the state before the events: once it says that the job has ended, the events that follow are the last
         state = describe(repository.get(db, job_id))
         events = [] if last_id is None else repository.events_after(db, job_id, last_id, _BATCH)
-        return state, [describe_event(event) for event in events]
+        return state, [shown(event) for event in events]
+
+
+def shown(event: JobEvent) -> dict[str, Any]:
+    """An event as pages show it: what a step does without names of methods, and the time that is left in words."""
+    described = describe_event(event)
+    data = dict(described["data"])
+    if "message" in data:
+        data["message"] = plain_words(data["message"])
+    if "seconds_left" in data:
+        data["time_left"] = time_left(data["seconds_left"])
+    return described | {"data": data}
 
 
 def _message(kind: str, data: dict[str, Any], event_id: int | None = None) -> str:

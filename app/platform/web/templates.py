@@ -102,6 +102,11 @@ def minutes_left(seconds: float) -> str:
     return f"about {math.ceil(seconds / 60)} min left" if seconds <= 7200 else f"about {seconds / 3600:.0f} h left"
 
 
+def time_left(seconds: float | None) -> str:
+    """The remaining time of a job in words, also where it cannot be told yet: on pages, in events and in the terminal."""
+    return "time left not known yet" if seconds is None else minutes_left(seconds)
+
+
 def size(value: int) -> str:
     """Bytes for people."""
     if value < 1024:
@@ -127,6 +132,6 @@ def sign_on_name() -> str:
 
 
 _environment.filters.update(
-    written=written, counted=counted, number=number, fixed=fixed, p=p_text, minutes=minutes, minutes_left=minutes_left, size=size, when=when
+    written=written, counted=counted, number=number, fixed=fixed, p=p_text, minutes=minutes, time_left=time_left, size=size, when=when
 )
 _environment.globals.update(static_url=static_url, plotly_url=plotly_url, now=now, sign_on_name=sign_on_name)

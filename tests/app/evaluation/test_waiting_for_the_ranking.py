@@ -14,7 +14,7 @@ from rich.console import Console
 
 from app.platform.database import now, transaction
 from app.platform.jobs.models import Job, JobStatus
-from app.platform.web.templates import minutes_left
+from app.platform.web.templates import minutes_left, time_left
 from app.simulation import demo
 
 PAGES = ("/", "/participants/P1", "/participants/P1/ranking")
@@ -88,6 +88,7 @@ def test_remaining_times_are_words() -> None:
         "about 120 min left",
         "about 6 h left",
     ]
+    assert (time_left(None), time_left(61.0)) == ("time left not known yet", "about 2 min left")
 
 
 def job(status: str, progress: float, left: float | None) -> dict[str, object]:
