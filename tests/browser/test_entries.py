@@ -183,3 +183,19 @@ def test_a_refused_form_is_kept_and_no_secret_ever_is(tab: Watched) -> None:
     assert "a first password" not in json.dumps(kept)
     page.reload()
     assert (page.input_value("main [name=email]"), page.input_value("#f-password")) == ("new@clinic.example", "")
+
+
+def test_what_stood_beside_something_too_large_stands_in_the_form_again(tab: Watched) -> None:
+    page = tab.page
+    tab.open("/participants/P1/visits/new")
+    page.fill("[name=number]", "7")
+    page.fill("[name=cdbs_left]", "2.5")
+    page.eval_on_selector("[name=note]", "note => { note.removeAttribute('maxlength'); note.value = 'x'.repeat(2 << 20); }")
+    page.click("main form[method=post] button.primary")
+    page.wait_for_selector("h1:text('Too large to take')")
+    assert "The other entries stand in the form that you came from" in page.inner_text("main")
+    page.go_back()
+    page.wait_for_selector("[name=number]")
+    assert (page.input_value("[name=number]"), page.input_value("[name=cdbs_left]")) == ("7", "2.5")
+    tab.open("/participants/P1/visits/new")  # also where the form is opened anew
+    assert (page.input_value("[name=number]"), page.input_value("[name=cdbs_left]")) == ("7", "2.5")

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 
 import pytest
 from fastapi.testclient import TestClient
 from playwright.sync_api import expect
+from sqlalchemy.orm import Session
+
+from app.platform.jobs.models import Job, JobEvent, JobStatus, JobStep
+from app.study.models import Participant
 
 pytestmark = pytest.mark.browser
 
@@ -29,6 +34,46 @@ def test_from_sign_in_to_a_participants_charts(window: Callable, studied: list[i
     assert watched.charts_drawn() == 6
     assert watched.errors == []
     assert watched.foreign == []
+
+
+def test_a_slash_leads_to_the_search_unless_somebody_types(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+    watched = window()
+    watched.sign_in()
+    watched.open("/participants/P1/visits/new")
+    watched.page.focus("[name=note]")
+    watched.page.keyboard.press("/")
+    assert (watched.page.input_value("[name=note]"), watched.page.input_value("#find")) == ("/", "")
+    watched.page.evaluate("() => document.activeElement.blur()")
+    watched.page.keyboard.press("/")
+    watched.page.keyboard.type("p1")
+    expect(watched.page.locator("#find")).to_have_value("p1")
+    watched.page.keyboard.press("Enter")
+    watched.page.wait_for_url("**/participants/P1")
+    assert watched.errors == []
+
+
+def test_the_time_left_of_a_job_moves_with_its_bar(window: Callable, enrolled: str, db: Session) -> None:  # type: ignore[type-arg]
+    begun = datetime.now(UTC) - timedelta(seconds=590)
+    owner = db.query(Participant).filter_by(code=enrolled).one().id
+    step = JobStep(key="train/0", title="Train policy 1 (DDPG)", position=0, status=JobStatus.RUNNING, progress=0.5, started_at=begun)
+    job = Job(
+        id="4f00aaaa-0000-4000-8000-000000000000", participant_id=owner, kind="train", status=JobStatus.RUNNING, progress=0.5, params={},
+        message="Train policy 1 (DDPG): update 2 of 4", code_version="1", created_by="test", started_at=begun, steps=[step],
+    )  # fmt: skip
+    db.add(job)
+    db.commit()
+    watched = window()
+    watched.sign_in()
+    watched.open(f"/jobs/{job.id}")
+    left, bar = watched.page.locator("[data-time-left]"), watched.page.locator("[data-step=job]")
+    expect(left).to_have_text("about 10 min left")
+    expect(bar).to_contain_text("Train policy 1: update 2 of 4")
+    told = {"progress": 0.8, "job_progress": 0.8, "seconds_left": 150.0, "message": "update 3 of 4"}
+    db.add(JobEvent(job_id=job.id, step_key=step.key, kind="progress", data=told))
+    db.commit()
+    expect(bar).to_contain_text("80 %")
+    expect(left).to_have_text("about 3 min left")
+    assert watched.errors == []
 
 
 def test_no_chart_offers_to_send_data_elsewhere(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from html import unescape
 from typing import Any
@@ -41,6 +42,12 @@ def test_a_whole_visit_is_confirmed_in_one_go_and_what_is_open_stays(browser: Te
     off, on, half = propose(("a.csv", steady(0)), ("b.csv", steady(1)), ("c.csv", steady(0.5)), visit="1")
     page = unescape(browser.get(URL).text)
     assert "the amplitude is 0 in all 20 steps where it is known" in page
+    pictures = re.findall(r'<div class="thumbnail">(<svg.*?</svg>)</div>', page, re.S)
+    assert len(pictures) == 3, "each proposal is seen at a glance"
+    for picture in pictures:
+        assert "Beta (µV)" in picture
+        assert "Amplitude (% of cDBS)" in picture or "Amplitude (mA)" in picture
+        assert picture.count("<path") >= 2
     answer = press(browser, "confirm:all")
     assert answer.status_code == 303
     assert answer.headers["location"].endswith(f"confirmed={off},{on}")

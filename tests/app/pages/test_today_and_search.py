@@ -11,6 +11,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.learning.policies.baselines import constant_onnx
 from app.overview.saved import Saved, overall
 from app.overview.state import states
 from app.overview.tasks import Actor, Task
@@ -44,13 +45,19 @@ def test_the_next_visit_waits_for_what_others_wait_for_and_says_who_acts(
         ("session {session}", "/sessions/{session}"),
         ("P1 {session}", "/sessions/{session}"),
         ("4f00", "/jobs/{job}"),
+        ("constant half", "/participants/P1/policies/{policy}"),
+        ("P1 HALF", "/participants/P1/policies/{policy}"),
     ],
 )
-def test_a_search_with_one_hit_opens_it(browser: TestClient, session_id: int, db: Session, words: str, leads_to: str) -> None:
+def test_a_search_with_one_hit_opens_it(
+    browser: TestClient, client: TestClient, session_id: int, db: Session, words: str, leads_to: str
+) -> None:
     job = _job(db, JobStatus.SUCCEEDED)
+    made = client.post("/api/v1/participants/P1/policies", data={"name": "constant half"}, files={"file": ("a.onnx", constant_onnx(0.5, 10))})
+    assert made.status_code == 201, made.text
     found = browser.get("/search", params={"q": words.format(session=session_id)})
     assert found.status_code == 303
-    assert found.headers["location"] == leads_to.format(session=session_id, job=job.id)
+    assert found.headers["location"] == leads_to.format(session=session_id, job=job.id, policy=made.json()["id"])
 
 
 def test_a_search_finds_nothing_beyond_the_callers_sites(sign_in: Callable[[str], TestClient], session_id: int, db: Session) -> None:
