@@ -78,6 +78,31 @@ def fixed(value: float | None, decimals: int = 1) -> str:
     return "—" if value is None or math.isnan(value) else f"{value:z.{decimals}f}".replace("-", "\u2212")
 
 
+def stated(value: float | None) -> str:
+    """A number that somebody stated or a device has, in as few digits as it needs, six at most: 2.5 mA stays 2.5, 20 min stay 20."""
+    return "\u2014" if value is None or math.isnan(value) else f"{value:z.6g}".replace("-", "\u2212")
+
+
+def whole(value: float) -> int:
+    """The nearest whole number, to count with."""
+    return round(value)
+
+
+def rate(value: float) -> str:
+    """A learning rate as people write it: 3e-4."""
+    return f"{value:.0e}".replace("e-0", "e-")
+
+
+def place(value: float) -> str:
+    """A coordinate of a drawing; nobody reads it."""
+    return f"{value:.2f}"
+
+
+def typed(value: float | None) -> str:
+    """A number as it stands in a field, for a form to send back: four significant digits, nothing where there is none."""
+    return "" if value is None else f"{value:.4g}"
+
+
 def p_text(p: float | None) -> str:
     """A p-value for people, without the zero that every p has before its point; one that rounds to nothing is said to be below .001."""
     if p is None or math.isnan(p):
@@ -132,6 +157,6 @@ def sign_on_name() -> str:
 
 
 _environment.filters.update(
-    written=written, counted=counted, number=number, fixed=fixed, p=p_text, minutes=minutes, time_left=time_left, size=size, when=when
+    written=written, counted=counted, number=number, fixed=fixed, stated=stated, whole=whole, rate=rate, place=place, typed=typed, p=p_text, minutes=minutes, time_left=time_left, size=size, when=when
 )
 _environment.globals.update(static_url=static_url, plotly_url=plotly_url, now=now, sign_on_name=sign_on_name)

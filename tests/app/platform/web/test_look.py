@@ -8,13 +8,37 @@ from pathlib import Path
 from app.analysis.biomarker.charts import SCALE
 from app.analysis.figures import COLOURS
 from app.platform.web.charts import figure, written
-from app.platform.web.templates import fixed
+from app.platform.web.templates import fixed, number, place, rate, stated, typed, whole
 
-STATIC = Path(__file__).parents[4] / "static"
+ROOT = Path(__file__).parents[4]
+STATIC = ROOT / "static"
+OWN_FORMAT = re.compile(r"(?<!\{)%[-+0]*\d*(?:\.\d+)?[gfeGE]\b|\|\s*round\b")
+"""A number that a template formats by itself: `"%.3g"|format(x)`, `x|round`."""
 
 
 def test_what_rounds_to_nothing_has_no_sign() -> None:
     assert [fixed(v, 1) for v in (-0.02, 0.0, -0.06)] == ["0.0", "0.0", "\u22120.1"]
+
+
+def test_numbers_are_formatted_in_one_place() -> None:
+    found = {
+        f"{path.relative_to(ROOT)}:{n}": hit
+        for path in (ROOT / "app/templates").rglob("*.html")
+        for n, line in enumerate(path.read_text().splitlines(), 1)
+        if (hit := OWN_FORMAT.findall(line))
+    }
+    assert found == {}, "use the filters number, fixed, stated, whole, typed or place"
+    assert OWN_FORMAT.findall('{{ "%g"|format(x) }} {{ "%.3g mA"|format(x) }} {{ x|round|int }} {% for %} {{ "%d"|format(3) }} 4 %') == [
+        "%g", "%.3g", "|round",
+    ]  # fmt: skip
+
+
+def test_a_stated_number_has_the_digits_that_it_needs() -> None:
+    assert [stated(v) for v in (2.5, 20.0, 0.125, 4 / 3, -1.5, -0.0, None, float("nan"))] == [
+        "2.5", "20", "0.125", "1.33333", "\u22121.5", "0", "\u2014", "\u2014",
+    ]  # fmt: skip
+    assert [typed(v) for v in (2.5, 1.23456, -1.0, None)] == ["2.5", "1.235", "-1", ""], "a field takes what a keyboard types"
+    assert (whole(19.6), place(1 / 3), rate(3e-4), number(2.5)) == (20, "0.33", "3e-4", "2.50")
 
 
 def test_figures_for_papers_have_the_colours_of_the_pages() -> None:
