@@ -6,6 +6,8 @@ from typing import Any
 
 from fastapi.routing import iter_route_contexts
 
+from app.platform.database import transaction
+from app.platform.jobs.models import Job, JobEvent
 from tests.app.every_route import World
 
 ELSEWHERE = {
@@ -45,3 +47,36 @@ def addresses(world: World) -> dict[str, str]:
     }
     paths = [p for p in routes(world.app) if p not in ELSEWHERE]
     return {p: p.format(**(world.ids | own.get(p, {}))) + QUERIES.get(p, "") for p in paths}
+
+
+PARTS = {"train": ("plan", "train/", "baselines", "store-policies"), "evaluate": ("plan", "fit/", "store-models", "choose", "estimate/", "rank")}
+"""Steps of a pipeline, by their keys' beginnings, of which a job of one kind consists."""
+
+
+def ended_jobs(world: World) -> dict[str, str]:
+    """By kind: the page of a succeeded job with steps, learning curves and a log: a pipeline that a release ran, and what it is made of."""
+    found = next(j for j in world.read("/participants/P1/jobs")["items"] if j["kind"] == "pipeline" and j["status"] == "succeeded")
+    pages = {"pipeline": f"/jobs/{found['id']}"}
+    with transaction("test") as db:
+        whole = db.get_one(Job, found["id"])
+        events = db.query(JobEvent).filter_by(job_id=whole.id).order_by(JobEvent.id).all()
+        assert {"points"} <= {e.kind for e in events}
+        for number, (kind, keys) in enumerate(PARTS.items()):
+            steps = [s for s in whole.steps if s.key.startswith(keys)]
+            assert len(steps) >= 4, kind
+            job = Job(id=f"4f00aaaa-0000-4000-8000-00000000000{number}", kind=kind, steps=[_copy(s, ("id", "job_id")) for s in steps])
+            for name in ("participant_id", "status", "progress", "message", "code_version", "created_by", "started_at", "finished_at"):
+                setattr(job, name, getattr(whole, name))
+            job.params, job.result = {}, {"snapshot_id": 1}
+            db.add(job)
+            db.flush()
+            of_it = [e for e in events if e.step_key and e.step_key.startswith(keys)]
+            db.add_all([_copy(e, ("id", "job_id"), job_id=job.id) for e in of_it])
+            db.add(JobEvent(job_id=job.id, step_key=steps[1].key, kind="log", data={"text": "member 1 of the DLSM ran to its last update"}))
+            pages[kind] = f"/jobs/{job.id}"
+    return pages
+
+
+def _copy(row: Any, but: tuple[str, ...], **more: Any) -> Any:
+    """A row of the same table with the same values."""
+    return type(row)(**{c.key: getattr(row, c.key) for c in type(row).__table__.columns if c.key not in but} | more)

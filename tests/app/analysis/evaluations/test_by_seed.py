@@ -14,6 +14,7 @@ from app.learning.models import BufferSnapshot
 from app.learning.snapshots.service import take_snapshot
 from app.study.repository import participant_by_code
 from tests.app.evaluations import estimate, policies  # noqa: F401 (a fixture)
+from tests.app.words import above_fold, drawn_above_fold, methods_named
 
 PATH = "/api/v1/participants/P1/analyses/evaluations"
 Upload = Callable[..., int]
@@ -65,4 +66,7 @@ def test_seeds_of_one_horizon_stand_together(
     assert longer["rows"][0]["mae"] != pytest.approx(found["rows"][0]["mae"])
     shown = client.get("/participants/P1/analyses/evaluations").text
     assert all(f'href="/sessions/{session}"' in shown for session in later), "the sessions behind the numbers are a click away"
+    assert shown.count("data-chart") >= 1
+    assert methods_named(f"{above_fold(shown)} | {drawn_above_fold(shown, str)}") == [], "methods stand in a fold"
+    assert "1 way to predict what a policy would do, each with 3 seeds of its random numbers, on 2 policies" in above_fold(shown)
     assert len(client.get("/participants/P1/analyses/evaluations.csv").text.splitlines()) == 4
