@@ -149,33 +149,37 @@ function report({ item, head, words }, status, answer) {
     if (!answer.files || states.has(one.name) || !groups.length) groups.push({ one, inner: [] });
     else groups.at(-1).inner.push(one);
   }
+  const lines = element("ul", { className: "files" });
   for (const { one, inner } of groups) {
     const file = states.get(one.name);
-    const line = element("div", { className: "row" }, element("h3", { textContent: one.name }));
-    if (file) line.append(file.duplicate ? badge("known already", "info") : badge(...(STATES[file.status] ?? (file.waits_for_mapping ? UNKNOWN_COLUMNS : ["not usable, kept", "bad"]))));
-    if (file?.waits_for_mapping) line.append(mappingLink(file.id));
-    item.append(line, ...said(one, good || one.name !== answer.file)); // the note above has that file's problem
+    const marks = file ? [file.duplicate ? badge("known already", "info") : badge(...(STATES[file.status] ?? (file.waits_for_mapping ? UNKNOWN_COLUMNS : ["not usable, kept", "bad"])))] : [];
+    const link = file?.waits_for_mapping ? [mappingLink(file.id)] : [];
     const told = inner.filter((r) => r.problem || Object.keys(LABELS).some((key) => r[key]?.length));
-    if (!told.length) continue;
-    const odd = told.filter((r) => r.flagged?.length).length;
-    item.append(element("details", { open: told.some((r) => r.problem) },
-      element("summary", { textContent: `${inner.length} files in it${odd ? `, ${odd} with something to look at` : ""}` }),
-      ...told.flatMap((r) => [element("h3", { textContent: r.name }), ...said(r, good)])));
+    const own = said(one, good || one.name !== answer.file); // the note above has that file's problem
+    const inside = told.length ? [element("ul", { className: "files" }, ...told.map((r) => element("li", {}, folded(r, [r], [], said(r, good)))))] : [];
+    lines.append(element("li", {}, folded(one, [one, ...told], marks, [...own, ...inside], inner.length), ...link));
   }
+  if (lines.children.length) item.append(lines);
 }
 
-// what a report says: what was understood and is to be looked at stands open, the rest is folded
+// a file is one line, open only where there is a problem; what was understood, and how much is to be looked at, stands in it
+function folded(one, reports, marks, content, inside = 0) {
+  const problems = reports.filter((r) => r.problem).length;
+  const odd = reports.reduce((sum, r) => sum + (r.flagged?.length ?? 0), 0);
+  const first = reports.map((r) => ["understood", "flagged", "repaired", "ignored", "removed"].flatMap((key) => r[key] ?? [])[0]).find(Boolean);
+  const line = [inside ? `${inside} ${inside > 1 ? "files" : "file"} in it` : "", first ?? ""].filter(Boolean).join(" · ");
+  const made = [element("b", { textContent: one.name }), ...marks];
+  if (problems) made.push(badge(`${problems} ${problems > 1 ? "problems" : "problem"}`, "bad"));
+  if (odd) made.push(badge(`${odd} to look at`, "warn"));
+  return element("details", { className: "file", open: problems > 0 }, element("summary", {}, ...made, element("span", { className: "line", textContent: line })), ...content);
+}
+
+// what a report says, label by label
 function said(one, good) {
   const found = [];
   if (one.problem && good) found.push(element("div", { className: "note bad" }, ...["what", "where", "hint"].map((part) => element("div", { textContent: one.problem[part] }))));
-  const listed = (keys) => {
-    const pairs = element("dl", { className: "pairs" });
-    for (const key of keys.filter((k) => one[k]?.length)) pairs.append(element("dt", {}, key === "flagged" ? badge("look at this", "warn") : LABELS[key]), element("dd", {}, ...one[key].map((text) => element("div", { textContent: text }))));
-    return pairs;
-  };
-  const main = listed(["understood", "flagged"]);
-  if (main.children.length) found.push(main);
-  const rest = ["repaired", "ignored", "removed"].filter((key) => one[key]?.length);
-  if (rest.length) found.push(element("details", { open: !main.children.length }, element("summary", { textContent: rest.map((key, i) => `${i ? LABELS[key].toLowerCase() : LABELS[key]} ${one[key].length}`).join(", ") }), listed(rest)));
+  const pairs = element("dl", { className: "pairs" });
+  for (const key of Object.keys(LABELS).filter((k) => one[k]?.length)) pairs.append(element("dt", {}, key === "flagged" ? badge("look at this", "warn") : LABELS[key]), element("dd", {}, ...one[key].map((text) => element("div", { textContent: text }))));
+  if (pairs.children.length) found.push(pairs);
   return found;
 }

@@ -174,8 +174,14 @@ def test_files_dropped_on_the_upload_page_become_sessions(window: Callable, enro
         files,
     )
     watched.page.dispatch_event("[data-drop]", "drop", {"dataTransfer": transfer})
-    outcomes = ["received", "read", "look at this", "columns not known", "known already"]
-    expect(watched.page.locator("[data-upload-list] .badge")).to_have_text(outcomes, timeout=60_000)
+    outcomes = ["received", "read", "1 to look at", "columns not known", "1 problem", "known already"]
+    told = watched.page.locator("[data-upload-list] .badge:not(dt .badge)")
+    expect(told).to_have_text(outcomes, timeout=60_000)
+    folds = watched.page.locator("[data-upload-list] details.file")
+    assert [fold.get_attribute("open") is not None for fold in folds.all()] == [False, True, False], "open where there is a problem"
+    expect(folds.first.locator("summary")).to_contain_text("good.csv")
+    expect(folds.first.locator("summary .line")).to_contain_text("steps")
+    assert not watched.page.is_visible("[data-upload-list] dt:has-text('Understood')")
     expect(watched.page.locator("[data-upload-list] li").first).to_contain_text("bad <b>.csv")
     assert client.get("/api/v1/visits/1/sessions").json()["total"] == 1
     assert watched.page.locator("[data-upload-list] a", has_text="Say what its columns are").count() == 1
@@ -205,7 +211,7 @@ def test_tables_of_unknown_columns_alone_lead_to_their_mappings_and_each_says_wh
     watched.page.dispatch_event("[data-drop]", "drop", {"dataTransfer": transfer})
     item = watched.page.locator("[data-upload-list] li")
     expect(item.locator(".badge").first).to_have_text("columns not known", timeout=60_000)
-    expect(item.locator("h3")).to_have_text(["one.csv", "two.csv"])
+    expect(item.locator("summary b")).to_have_text(["one.csv", "two.csv"])
     expect(item.locator(".note.bad")).to_have_count(2)
     expect(item.locator("summary", has_text="files in it")).to_have_count(0)
     expect(item.locator("a.button")).to_have_text(["Say what its columns are (1 of 2)", "Say what its columns are (2 of 2)"])
