@@ -24,7 +24,7 @@ from app.platform.jobs import repository as jobs
 from app.platform.jobs import service as job_service
 from app.platform.jobs.models import JobStatus
 from app.platform.jobs.titles import numbered
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
 from app.study import repository as study
@@ -49,6 +49,8 @@ PARAM_NAMES = {
     "sweep": "Sweep", "tuned": "Fine-tuned from each", "updates": "Gradient steps of each policy",
 }  # fmt: skip
 """What a job was asked for, in the words of its form."""
+FORM_LABELS = PARAM_NAMES | {"sweep": "Name of the sweep", "updates": "Gradient steps of each"}
+"""Fields of the form, as they are called there, for its errors."""
 VALUE_NAMES = {
     "aim": {"steps": "step rewards, as in the paper", "return": "step rewards and each step's share of the end-of-session reward",
             "both": "by turns step rewards alone, and with the end-of-session reward"},
@@ -77,13 +79,13 @@ def start_job(request: Request, participant: CurrentParticipant, db: Db, caller:
         kinds = registry.kinds()
         kind = kinds.get(given.get("kind", ""))
         if kind is None:
-            raise Invalid("The form names no kind of job.", f"Choose one of {', '.join(kinds)}.")
-        asked = parse(kind.params, {name: v for name, v in given.items() if name != "again"}).model_dump(mode="json")
+            raise Invalid("The form names no kind of job.", f"Choose one of {', '.join(kinds)}.", field="kind")
+        asked = parse(kind.params, {name: v for name, v in given.items() if name != "again"}, FORM_LABELS).model_dump(mode="json")
         started = service.start_job(db, participant, kind.name, asked, caller, again="again" in given)
         db.commit()
     except BetaloopError as error:
         db.rollback()
-        return _jobs(request, participant, db, caller, 50, 0, error.problem(request.url.path), given, error.status)
+        return _jobs(request, participant, db, caller, 50, 0, error, given)
     return RedirectResponse(f"/jobs/{started.job.id}?done={'started' if started.new else 'same'}", 303)
 
 
@@ -157,12 +159,12 @@ def _jobs(
     caller: Caller,
     limit: int,
     offset: int,
-    problem: dict[str, Any] | None = None,
+    error: BetaloopError | None = None,
     given: dict[str, Any] | None = None,
-    status: int = 200,
 ) -> HTMLResponse:
     rows, total = jobs.find(db, participant.id, limit=limit, offset=offset)
-    blocked = not_ready(db, participant)
+    # what keeps every job from starting is said before anybody tries
+    said = error or not_ready(db, participant)
     page = render(
         request,
         "pipeline/jobs.html",
@@ -178,7 +180,8 @@ def _jobs(
         chosen=bool((given or {}).keys() - {"kind", "preset"}),
         live=any(not JobStatus(j.status).ended for j in rows),
         refresh_s=REFRESH_S,
-        problem=problem or (blocked.problem(request.url.path) if blocked else None),
+        remarks=field_notes(error, given or {}),
+        problem=said.problem(request.url.path) if said else None,
         given=given or {},
         default_sweep=DEFAULT_SWEEP,
         algorithms=TRAINABLE,
@@ -189,7 +192,7 @@ def _jobs(
         trained=[p for p in learning.candidates(db, participant.id) if p.kind == "trained"],
         may_run=may(caller, can.RUN_JOBS, participant),
     )
-    return HTMLResponse(page, status)
+    return HTMLResponse(page, error.status if error else 200)
 
 
 def _titles() -> dict[str, str]:

@@ -68,13 +68,15 @@ def draft_of(values: FormData) -> PlanIn:
     ids = [str(v) for v in values.getlist("policy_ids")]
     wrong = [i for i in ids if not (i.isdecimal() and 0 < int(i) < 2**31)]
     if wrong:
-        raise Invalid(f"'{wrong[0]}' is no policy.", "Choose policies of the list.")
+        raise Invalid(f"'{wrong[0]}' is no policy.", "Choose policies of the list.", field="policy_ids")
     if len(ids) > 20:
-        raise Invalid(f"{len(ids)} policies are chosen; a visit takes 20 at most.", "Tick fewer.")
+        raise Invalid(f"{len(ids)} policies are chosen; a visit takes 20 at most.", "Tick fewer.", field="policy_ids")
     options = parse(PlanOptions, values, LABELS)
     reasons, lowest = ({i: str(values.get(f"{name}_{i}", "")).strip() for i in ids} for name in ("override", "limit"))
     overrides = [{"policy_id": int(i), "reason": text} for i, text in reasons.items() if text]
-    limits = [parse(LimitIn, {"policy_id": i, "min_fraction": text}, LABELS) for i, text in lowest.items() if text]
+    limits = [
+        parse(LimitIn, {"policy_id": i, "min_fraction": text}, LABELS, {"min_fraction": f"limit_{i}"}) for i, text in lowest.items() if text
+    ]
     return PlanIn.model_validate(
         {"policy_ids": [int(i) for i in ids], "overrides": overrides, "limits": limits, "held": held_of(values)}
         | options.model_dump(exclude_unset=True)
@@ -181,7 +183,11 @@ def held_of(values: FormData) -> list[HeldIn]:
     if not len(units) == len(amplitudes) == len(sessions) <= MOST_ROWS or any(unit not in UNITS for unit in units):
         raise Invalid("The held sessions are not those of the form.", "Load the page again.")
     rows = zip(units, amplitudes, sessions, strict=True)
-    return [parse(HeldIn, {unit: amplitude, "sessions": number}, LABELS) for unit, amplitude, number in rows if number not in ("", "0")]
+    return [
+        parse(HeldIn, {unit: amplitude, "sessions": number}, LABELS, {unit: f"held_amplitude-{k}", "sessions": f"held_sessions-{k}"})
+        for k, (unit, amplitude, number) in enumerate(rows)
+        if number not in ("", "0")
+    ]
 
 
 def held_rows(values: FormData | None, holds: Sequence[Held], lower_bound: float, cdbs_ma: float | None) -> list[HeldRow]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from sqlalchemy.exc import DBAPIError, OperationalError
@@ -20,7 +22,7 @@ class BetaloopError(Exception):
     Args:
         detail: what is wrong, and where.
         hint: what to do about it.
-        extra: further members of the problem document.
+        extra: further members of the problem document; `field` is the one that all of it is about, so that a form says it there.
     """
 
     status = 400
@@ -163,3 +165,13 @@ def no_room() -> StorageFull:
     return StorageFull(
         "There is no room left on the disk.", "Ask your administrator to make room; what was stored before is safe. Then try again."
     )
+
+
+@contextmanager
+def about(field: str) -> Iterator[None]:
+    """What is wrong inside is wrong with one field, where it names none itself."""
+    try:
+        yield
+    except BetaloopError as error:
+        error.extra.setdefault("field", field)
+        raise

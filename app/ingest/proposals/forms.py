@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -16,7 +16,7 @@ from app.ingest.models import SessionProposal
 from app.ingest.proposals.visit_of_recording import VisitToAdd
 from app.ingest.schemas import PartIn, ProposalChange
 from app.platform.errors import Invalid
-from app.platform.web.forms import parse
+from app.platform.web.forms import FieldNote, parse
 from app.study import blinding
 from app.study import repository as study
 from app.study.models import Controller, SessionSegment, StudySession
@@ -26,6 +26,8 @@ LABELS = {
     "visit": "Visit", "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "from": "From", "to": "To",
     "control": "Control channel", "program": "Program", "started_at": "Start", "start_s": "From", "stop_s": "To",
 }  # fmt: skip
+FIELDS = {"start_s": "from", "stop_s": "to", "control_stream": "control", "control_channel": "control", "control_program": "program"}
+"""What the form calls the fields of a correction, where it calls them otherwise."""
 HIDDEN = "hidden"
 """Stands for a controller that is stated and may not be told; sent back, it changes nothing."""
 PARTS = 6
@@ -45,7 +47,7 @@ class ProposalForm:
         usable: usable steps by channel, the control channel first.
         programs: that the control recording has an amplitude of.
         thumbnail: beta and amplitude at a glance, None where neither is known or they may not be told.
-        problem: why the form was refused.
+        problem: why the form was refused. remarks: what of it stands at which field; `part-2` is a row of the form that cuts, `parts` all.
         to_add: the visit that can be made of the recording.
     """
 
@@ -63,6 +65,7 @@ class ProposalForm:
     thumbnail: Markup | None = None
     reason: str = ""
     problem: dict[str, Any] | None = None
+    remarks: Mapping[str, FieldNote] = field(default_factory=dict)
     to_add: VisitToAdd | None = None
 
     @property
@@ -137,10 +140,10 @@ def as_change(session: StudySession, version: str, stored: Mapping[str, str], ty
             try:
                 fields[target] = f"{_seconds(session, own[name]):.3f}"
             except ValueError as error:
-                errors.append({"where": LABELS[name], "what": str(error)})
+                errors.append({"where": LABELS[name], "what": str(error), "name": name})
     if errors:
         raise Invalid("Some times cannot be used.", "Correct them and send the form again.", errors=errors)
-    return parse(ProposalChange, {"version": version, **fields}, LABELS)
+    return parse(ProposalChange, {"version": version, **fields}, LABELS, FIELDS)
 
 
 def as_parts(session: StudySession, rows: list[dict[str, str]]) -> list[PartIn]:
@@ -153,7 +156,7 @@ def as_parts(session: StudySession, rows: list[dict[str, str]]) -> list[PartIn]:
             start, stop = _seconds(session, row["from"]), _seconds(session, row["to"])
             parts.append(PartIn(start_s=start, stop_s=stop, controller=Controller(row["controller"]) if row["controller"] else None))
         except ValueError as error:
-            errors.append({"where": f"row {i}", "what": str(error).splitlines()[0]})
+            errors.append({"where": f"row {i}", "what": str(error).splitlines()[0], "name": f"part-{i}"})
     if errors:
         raise Invalid("Some parts cannot be used.", "Correct them and send the form again.", errors=errors)
     if not parts:

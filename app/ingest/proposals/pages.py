@@ -16,13 +16,13 @@ from app.ingest import repository, wording
 from app.ingest.deps import CurrentProposal
 from app.ingest.models import SessionProposal
 from app.ingest.proposals import service as proposals
-from app.ingest.proposals.forms import HIDDEN, ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
+from app.ingest.proposals.forms import FIELDS, HIDDEN, ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
 from app.ingest.proposals.thumbnail import thumbnail
 from app.ingest.proposals.visit_of_recording import add_visit_of_recording, visit_to_add
 from app.ingest.uploads import service
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.web.forms import FormValues
+from app.platform.web.forms import FormValues, field_notes, renamed
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.study import repository as study
@@ -124,10 +124,10 @@ def _decide_one(
     if mine and verb == "discard":
         why = values.get(f"reason-{session.id}", "").strip()
         if not why:
-            raise Invalid("A proposal is dropped with a reason.", "Say why this is no session.")
+            raise Invalid("A proposal is dropped with a reason.", "Say why this is no session.", field="reason")
         proposals.discard(db, session, _version(version), why[:1000], caller)
     elif mine and verb == "split":
-        proposals.split(db, session, _version(version), as_parts(session, typed_parts(values, session.id)), caller)
+        _cut(db, session, _version(version), typed_parts(values, session.id), caller)
     elif mine and verb == "visit":
         if own:
             version = str(proposals.change(db, session, as_change(session, version, stored, typed), caller).version)
@@ -139,6 +139,16 @@ def _decide_one(
         # what another tab changed meanwhile stays as it is there; an own correction beside it is refused by its version, not lost
         proposals.change(db, session, as_change(session, version, stored, typed), caller)
     return False
+
+
+def _cut(db: Session, session: StudySession, version: int, rows: list[dict[str, str]], caller: Caller) -> None:
+    """Cut a recording; what is wrong with a part is said of the parts, for the fields of a correction are others."""
+    try:
+        proposals.split(db, session, version, as_parts(session, rows), caller)
+    except Invalid as error:
+        if "errors" not in error.extra:
+            error.extra["field"] = "parts"
+        raise
 
 
 def _version(text: str) -> int:
@@ -203,6 +213,7 @@ def _form(
     data = _steps(db, session)
     told = may_know(session.visit, caller)
     found = designs.of_session(db, session, data.table, caller) if data and told else None
+    remarks = field_notes(renamed(error, FIELDS) if error else None, stored)
     return ProposalForm(
         session,
         proposal,
@@ -218,6 +229,7 @@ def _form(
         thumbnail(data) if data and told else None,
         sent.get(f"reason-{session.id}", "") if error else "",
         error.problem(request.url.path) if error else None,
+        remarks,
         visit_to_add(session, proposal, visits),
     )
 

@@ -53,11 +53,17 @@ def on_grid(session: StudySession, start_s: float, stop_s: float) -> tuple[float
     length = next(s for s in session.segments if s.is_control).recording.duration_s
     start, stop = round(start_s / period) * period, round(stop_s / period) * period
     if not 0 <= start < length or stop_s > length + period:
-        raise Invalid(f"The recording is {length:.0f} s long; {start_s:.0f} to {stop_s:.0f} s is not within it.", "Choose a part of it.")
+        raise Invalid(
+            f"The recording is {length:.0f} s long; {start_s:.0f} to {stop_s:.0f} s is not within it.",
+            "Choose a part of it.",
+            field="stop_s" if start_s < length else "start_s",
+        )
     # its end is the last row, whole or not: forms show it in whole seconds
     stop = length if stop_s > length - 1.0 and length - stop > 0.1 else min(stop, length)
     if stop - start < period:
-        raise Invalid(f"The part from {start_s:.0f} to {stop_s:.0f} s holds no step of {period:g} s.", "Let it end after it begins.")
+        raise Invalid(
+            f"The part from {start_s:.0f} to {stop_s:.0f} s holds no step of {period:g} s.", "Let it end after it begins.", field="stop_s"
+        )
     return start, stop
 
 

@@ -122,7 +122,9 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
     if missing:
         known = wording.reasons(proposal.evidence, session.visit.sealed)
         why = "; ".join(f"{name}: {known.get(name, 'nobody stated it')}" for name in missing)
-        raise Invalid(f"Session {session.id} cannot be confirmed yet: its {' and '.join(missing)} is open ({why}).", "State it.")
+        raise Invalid(
+            f"Session {session.id} cannot be confirmed yet: its {' and '.join(missing)} is open ({why}).", "State it.", field=missing[0]
+        )
     require_unlocked(session.visit)
     sessions.refuse_overlap(db, session)
     sessions.count(db, session)
@@ -206,13 +208,14 @@ def _move_to_visit(db: Session, session: StudySession, proposal: SessionProposal
     participant = session.visit.participant
     visit = study.visit_by_number(db, participant.id, number)
     if visit is None:
-        raise Invalid(f"Participant {participant.code} has no visit {number}.", "Add the visit first.")
+        raise Invalid(f"Participant {participant.code} has no visit {number}.", "Add the visit first.", field="visit")
     slot = logged.slot_of_recording(db, control_recording(session))
     if slot is not None and slot.planned is not None and slot.planned.sealed and visit.id not in (session.visit_id, slot.planned.visit_id):
         raise Conflict(
             f"Session {session.id} stays at its visit: its log is of a session of visit {slot.visit_number}, whose plan's key is sealed, "
             f"and visit {number} would show what ran.",
             "A clinician opens the key on the page of the plan; then it can be moved.",
+            field="visit",
         )
     if visit.id != session.visit_id:
         session.ordinal = study.next_ordinal(db, visit.id)
@@ -235,7 +238,9 @@ def _name_controller(db: Session, session: StudySession, given: dict[str, object
     else:
         policy_id = study.policy_id(db, participant.id, name) if name else None
         if name and policy_id is None:
-            raise Invalid(f"Participant {participant.code} has no policy '{name}'.", "Give the name or number of one of its policies.")
+            hint = "Give the name or number of one of its policies."
+            raise Invalid(f"Participant {participant.code} has no policy '{name}'.", hint, field="policy")
     if policy_id is not None and controller not in POLICY_CONTROLLERS:
-        raise Invalid(f"A {controller or ''} session has no policy.".replace("  ", " "), "Leave the policy empty, or name the controller.")
+        what = f"A {controller or ''} session has no policy.".replace("  ", " ")
+        raise Invalid(what, "Leave the policy empty, or name the controller.", field="policy")
     blinding.assign(session, controller, policy_id)

@@ -20,7 +20,7 @@ from app.ingest.uploads.in_progress import coming, told
 from app.ingest.uploads.service import BetaStated, Incoming, UploadOutcome
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, passing
-from app.platform.web.forms import parse
+from app.platform.web.forms import field_notes, parse
 from app.platform.web.schemas import Int, RowId, Text
 from app.platform.web.templates import render
 from app.settings import get_settings
@@ -62,7 +62,7 @@ def upload(
     participant: CurrentParticipant,
     db: Db,
     caller: CurrentCaller,
-    file: Annotated[list[UploadFile], File()],
+    file: Annotated[list[UploadFile] | None, File()] = None,
     visit: Annotated[str, Form()] = "",
     controller: Annotated[str, Form()] = "",
     policy: Annotated[str, Form()] = "",
@@ -83,9 +83,9 @@ def upload(
         stated = service.state_session(
             db, participant, form.visit, form.controller, form.policy or None, form.started_at, form.hemisphere, counts, form.session
         )
-        chosen = [Incoming(f.filename or "file", f.file) for f in file if f.filename]
+        chosen = [Incoming(f.filename or "file", f.file) for f in file or () if f.filename]
         if not chosen:
-            raise Invalid("No file was chosen.", "Choose at least one file.")
+            raise Invalid("No file was chosen.", "Choose at least one file.", field="file")
         beta = BetaStated(form.beta_unit, form.beta_source, form.lfp_unit)
         outcome = service.receive(db, participant, stated, chosen, caller, beta)
     except BetaloopError as error:
@@ -159,6 +159,7 @@ def _page(
         held=sum(f.quarantine_sha256 is not None for f in repository.quarantined_files(db, participant.id)),
         uploads=[(u, _state(u, coming_in)) for u in uploads],
         limit_mb=get_settings().upload_limit_mb,
+        remarks=field_notes(error, known),
         problem=error.problem(request.url.path) if error else None,
     )
     unusable = outcome is not None and not outcome.usable

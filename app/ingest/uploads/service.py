@@ -107,27 +107,33 @@ def state_session(
     try:
         started_at = sensible_time(started_at) if started_at else None
     except ValueError as error:
-        raise Invalid(f"The stated start {started_at} is out of range: {error}.", "Give the start of the session.") from error
+        raise Invalid(
+            f"The stated start {started_at} is out of range: {error}.", "Give the start of the session.", field="started_at"
+        ) from error
     known = ", ".join(str(v.number) for v in study.visits(db, participant.id, 500, 0)[0])
     visit = study.visit_by_number(db, participant.id, visit_number) if visit_number is not None else None
     if visit is None and visit_number is not None:
         listed = f"visits: {known or 'none yet'}"
-        raise Invalid(f"Participant {participant.code} has no visit {visit_number} ({listed}).", "Add the visit first.")
+        raise Invalid(f"Participant {participant.code} has no visit {visit_number} ({listed}).", "Add the visit first.", field="visit")
     if not known:
-        raise Invalid(f"Participant {participant.code} has no visit yet.", "Add the visit first.")
+        raise Invalid(f"Participant {participant.code} has no visit yet.", "Add the visit first.", field="visit")
     if controller is not None and visit is not None and confirm:
         require_unlocked(visit)
     if controller is not None and visit is None and confirm:
-        raise Invalid("A controller is stated, but no visit.", "Name the visit, or send confirm=false and let it be proposed by its date.")
+        hint = "Name the visit, or send confirm=false and let it be proposed by its date."
+        raise Invalid("A controller is stated, but no visit.", hint, field="visit")
     policy_id = study.policy_id(db, participant.id, policy) if policy else None
     if policy and policy_id is None:
-        raise Invalid(f"Participant {participant.code} has no policy '{policy}'.", "Give the name or number of one of its policies.")
+        hint = "Give the name or number of one of its policies."
+        raise Invalid(f"Participant {participant.code} has no policy '{policy}'.", hint, field="policy")
     session = None
     if session_id is not None:
         mine = study.sessions_of_participant(db, participant.id, with_proposals=True)
         session = next((s for s in mine if s.id == session_id), None)
         if session is None:
-            raise Invalid(f"Participant {participant.code} has no session {session_id}.", "Name one of this participant's sessions.")
+            raise Invalid(
+                f"Participant {participant.code} has no session {session_id}.", "Name one of this participant's sessions.", field="session"
+            )
     return StatedSession(visit, controller, policy_id, started_at, hemisphere, confirm, session)
 
 
@@ -164,7 +170,7 @@ def receive(
     """
     study_service.require(caller, can.UPLOAD, participant)
     if not incoming:
-        raise Invalid("The upload holds no file.", "Choose at least one file.")
+        raise Invalid("The upload holds no file.", "Choose at least one file.", field="file")
     beta = beta or BetaStated()
     said = _said(stated, beta)
     upload = Upload(participant_id=participant.id, created_by=caller.label, stated=said)

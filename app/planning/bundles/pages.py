@@ -25,7 +25,7 @@ from app.planning.plans.view import read_plan
 from app.planning.releases import service as releases
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.settings import get_settings
 from app.study.deps import CurrentParticipant, CurrentVisit
@@ -85,7 +85,7 @@ def release_policy(
         db.commit()
     except BetaloopError as error:
         db.rollback()
-        return _page(request, participant, policy, db, caller, error, typed)
+        return _page(request, participant, policy, db, caller, error, typed, releasing=True)
     return RedirectResponse(f"/participants/{participant.code}/policies/{policy.id}/bundle?done=released#release", 303)
 
 
@@ -128,6 +128,8 @@ def _page(
     caller: Caller,
     error: BetaloopError | None = None,
     typed: Mapping[str, str] | None = None,
+    *,
+    releasing: bool = False,
 ) -> HTMLResponse:
     sides = sorted({Hemisphere(a.hemisphere) for visit in participant.visits for a in visit.cdbs_amplitudes})
     facts: dict[str, Any] = {"manifest": None, "warnings": [], "energy": None, "unmade": None}
@@ -159,6 +161,8 @@ def _page(
         release_required=get_settings().require_released_policies,
         may_release=may(caller, can.APPROVE_PLAN, participant),
         key=bundles.public_key(),
+        remarks=field_notes(error, typed or {}),
+        releasing=releasing,
         problem=error.problem(request.url.path) if error else None,
         **facts,
     )

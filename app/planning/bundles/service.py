@@ -233,8 +233,17 @@ def manifest_of(
             approvals=approvals(db, participant.id, policy.id),
         )
     except BundleError as error:
-        raise _unmade(policy, error) from error
+        raise _unmade(policy, error, _at_fault(limits, device, cdbs)) from error
     return manifest, probe_windows(usable, version)
+
+
+def _at_fault(limits: Limits, device: DeviceLimits | None, cdbs_ma: float) -> dict[str, str]:
+    """The stated limit that leaves out the cDBS amplitude or leaves the stimulator's own, as a problem's `field`; empty where none does."""
+    if limits.min_ma is not None and (limits.min_ma > cdbs_ma or (device and limits.min_ma < device.min_ma)):
+        return {"field": "min_ma"}
+    if limits.max_ma is not None and (limits.max_ma < cdbs_ma or (device and limits.max_ma > device.max_ma)):
+        return {"field": "max_ma"}
+    return {}
 
 
 def beta_limits(snapshot: BufferSnapshot | None) -> dict[str, Any]:
@@ -257,9 +266,10 @@ def _lowest(db: Session, participant: Participant, policy: Policy, limits: Limit
         raise Invalid(
             f"A lower limit of {limits.min_ma:g} mA is below the {least:g} mA with which policy '{policy.name}' was approved to be tested.",
             "Raise the lower limit, or leave it out.",
+            field="min_ma",
         )
     return limits.min_ma
 
 
-def _unmade(policy: Policy, error: Exception) -> Invalid:
-    return Invalid(f"The bundle of policy '{policy.name}' cannot be made: {error}.", "Correct what is named.")
+def _unmade(policy: Policy, error: Exception, fault: dict[str, str] | None = None) -> Invalid:
+    return Invalid(f"The bundle of policy '{policy.name}' cannot be made: {error}.", "Correct what is named.", **(fault or {}))

@@ -119,11 +119,13 @@ def slot_limits(
         raise Invalid(
             f"Limits of {low:g} to {high:g} mA leave out the cDBS amplitude of {cdbs_ma:g} mA, to which every fault leads back.",
             "State limits that hold it.",
+            field="min_ma" if low > cdbs_ma else "max_ma",
         )
     if device and (low < device.min_ma - _TOLERANCE_MA or high > device.max_ma + _TOLERANCE_MA):
         raise Invalid(
             f"Limits of {low:g} to {high:g} mA leave those of the stimulator, {device.min_ma:g} to {device.max_ma:g} mA.",
             "State limits within the stimulator's own.",
+            field="min_ma" if low < device.min_ma - _TOLERANCE_MA else "max_ma",
         )
     return SlotLimits(cdbs_ma, low, high, ramp)
 

@@ -24,7 +24,7 @@ from app.planning.plans.view import PlanView, read_plan, shown
 from app.planning.plans.visits import remove_visit, today, visit_for_draft
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, NotFound
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.schemas import Int, Model, PagingQuery
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant, CurrentVisit
@@ -210,6 +210,7 @@ def _page(
         session_name=wording.session_name,
         warnings=[text for _, text in wording.plain_warnings(view.warnings)] if view else [],
         method_notes=wording.method_notes(view.warnings) if view else [],
+        remarks=field_notes(error, dict.fromkeys(values, "")) if values is not None else {},
         problem=error.problem(request.url.path) if error else None,
         may_override=may_approve,
         drafting=drafting,

@@ -157,7 +157,8 @@ def testable_policies(db: Session, participant: Participant, ids: Sequence[int])
     found = learning.policies_named(db, participant.id, ids)
     for policy in found:
         if policy.retired_reason:
-            raise Invalid(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", "Leave it out, or take it back first.")
+            hint = "Leave it out, or take it back first."
+            raise Invalid(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", hint, field="policy_ids")
     return found
 
 
@@ -247,6 +248,7 @@ def _supersede(db: Session, visit: Visit, reason: str | None, caller: Caller) ->
             raise Invalid(
                 f"Plan {earlier.id} of visit {visit.number} is approved; no reason is given why it is replaced.",
                 "Say why the approved plan is replaced (`reason`), or leave it as it is.",
+                field="reason",
             )
         set_reason(db, f"approved plan {earlier.id} superseded by a new draft: {why}")
     earlier.status = "superseded"

@@ -36,18 +36,19 @@ FormValues = Annotated[FormData, Depends(_form)]
 """The fields of a posted form (no files), e.g. `values.get("name", "")` and, for repeated ones, `values.getlist("policy")`."""
 
 
-def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] | None = None) -> M:
+def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] | None = None, names: Mapping[str, str] | None = None) -> M:
     """Read a model from form text. An empty field is null; a field that the form does not have is left out.
 
     Args:
         model: the API type; only its fields are read.
         values: field name to text, or to a list of texts where the field is repeated.
         labels: names as the page shows them, for the errors.
+        names: what the form calls the model's fields, where it calls them otherwise, for the errors.
 
     Raises:
         Invalid: names each field that is wrong and why; the document's `errors` holds them too, `name` being that of the field.
     """
-    labels = labels or {}
+    labels, names = labels or {}, names or {}
     errors: list[dict[str, str]] = []
     data: dict[str, Any] = {}
     for name, info in model.model_fields.items():
@@ -58,14 +59,15 @@ def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] |
             try:
                 data[name] = _value(str(values[name]), info.annotation, info.is_required())
             except ValueError as error:
-                errors.append({"where": labels.get(name, name), "what": str(error), "name": name})
+                errors.append({"where": labels.get(name, name), "what": str(error), "name": names.get(name, name)})
     if not errors:
         try:
             return model.model_validate(data)
         except ValidationError as error:
             for e in error.errors():
-                name = ".".join(map(str, e["loc"]))
-                errors.append({"where": labels.get(name, name), "what": _said(e), "name": name})
+                # a check of the model as a whole names its field by the error's type
+                name = ".".join(map(str, e["loc"])) or (e["type"] if e["type"] in model.model_fields else "")
+                errors.append({"where": labels.get(name, name), "what": _said(e), "name": names.get(name, name)})
     raise Invalid("Some fields cannot be used.", "Correct them and send the form again.", errors=errors)
 
 
@@ -73,7 +75,7 @@ def _said(error: Mapping[str, Any]) -> str:
     """What is wrong with a field; a pattern is no sentence, and the field's name or help says what it takes."""
     if error["type"] == "string_pattern_mismatch":
         return f"'{error['input']}' is not written as this field takes it"
-    return str(error["msg"])
+    return str(error["msg"]).removeprefix("Value error, ")
 
 
 @dataclass(frozen=True)
@@ -94,19 +96,39 @@ class FieldNote:
 def field_notes(
     error: BetaloopError | None, typed: Mapping[str, str], name_of: Callable[[Mapping[str, Any]], str] | None = None
 ) -> dict[str, FieldNote]:
-    """By field of a form, what its refusal says of it: the problem's `errors` with a `name`, and its `questions` with a `field`.
+    """By field of a form, what its refusal says of it.
+
+    That are the problem's `errors` with a `name`, its `questions` with a `field`, and the whole of it where it names its own `field`.
+    What is wrong with one value of a list (`methods.1`) stands at the list.
 
     Args:
         error: why the form was refused. typed: what its fields held.
         name_of: the form's field that a question is about, where it is not called like the question's.
     """
     extra = error.extra if error else {}
-    notes = {str(e["name"]): FieldNote(str(e["what"])) for e in extra.get("errors", ()) if "name" in e}
+    notes: dict[str, FieldNote] = {}
+    for e in extra.get("errors", ()):
+        if name := str(e.get("name", "")):
+            notes.setdefault(name if name in typed else name.partition(".")[0], FieldNote(str(e["what"])))
+    if error is not None and (named := str(extra.get("field", ""))):
+        notes.setdefault(named, FieldNote(f"{error.detail} {error.hint}".strip()))
     for asked in extra.get("questions", ()):
         name = name_of(asked) if name_of else str(asked.get("field", ""))
         if name in typed:
             notes[name] = FieldNote(str(asked["text"]), _answer(name, typed[name]), bool(asked["confirmed"]))
     return notes
+
+
+def renamed(error: BetaloopError, names: Mapping[str, str]) -> BetaloopError:
+    """The same error with fields called as the form calls them; `names` maps the rule's name of a field to the form's."""
+    if named := error.extra.get("field"):
+        error.extra["field"] = names.get(named, named)
+    error.extra |= (
+        {"errors": [dict(e) | {"name": names.get(e["name"], e["name"])} if "name" in e else e for e in error.extra["errors"]]}
+        if "errors" in error.extra
+        else {}
+    )
+    return error
 
 
 def confirmed(values: FormData, typed: Mapping[str, str]) -> list[str]:

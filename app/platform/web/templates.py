@@ -157,6 +157,19 @@ def sign_on_name() -> str:
 
 
 _environment.filters.update(
-    written=written, counted=counted, number=number, fixed=fixed, stated=stated, whole=whole, rate=rate, place=place, typed=typed, p=p_text, minutes=minutes, time_left=time_left, size=size, when=when
+    written=written,
+    counted=counted,
+    number=number,
+    fixed=fixed,
+    stated=stated,
+    whole=whole,
+    rate=rate,
+    place=place,
+    typed=typed,
+    p=p_text,
+    minutes=minutes,
+    time_left=time_left,
+    size=size,
+    when=when,
 )
 _environment.globals.update(static_url=static_url, plotly_url=plotly_url, now=now, sign_on_name=sign_on_name)

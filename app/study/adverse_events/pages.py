@@ -13,7 +13,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.study import repository as study_repository
 from app.study.adverse_events import repository, service
@@ -64,7 +64,7 @@ def change_adverse_event(request: Request, event: CurrentEvent, db: Db, caller: 
         service.change_adverse_event(db, event, change, caller)
     except BetaloopError as error:
         db.rollback()
-        return _page(request, event.participant, db, caller, {}, error)
+        return _page(request, event.participant, db, caller, typed, error, f"correct-{event.id}")
     db.commit()
     return RedirectResponse(f"/participants/{event.participant.code}/adverse-events?done=corrected", 303)
 
@@ -78,14 +78,21 @@ def clear_adverse_event(request: Request, event: CurrentEvent, db: Db, caller: C
         service.clear_adverse_event(db, event, given.revision, given.reason, caller)
     except BetaloopError as error:
         db.rollback()
-        return _page(request, event.participant, db, caller, {}, error)
+        return _page(request, event.participant, db, caller, typed, error, f"clear-{event.id}")
     db.commit()
     return RedirectResponse(f"/participants/{event.participant.code}/adverse-events?done=cleared", 303)
 
 
 def _page(
-    request: Request, participant: Participant, db: Session, caller: Caller, typed: dict[str, Any], error: BetaloopError | None = None
+    request: Request,
+    participant: Participant,
+    db: Session,
+    caller: Caller,
+    typed: dict[str, Any],
+    error: BetaloopError | None = None,
+    form: str = "event",
 ) -> HTMLResponse:
+    """The page; `form` is the one that was sent: `event` for a new one, `correct-3`, `clear-3`, as the ids of its fields begin."""
     found = repository.events_of_participant(db, participant.id)
     visits, _ = study_repository.visits(db, participant.id, 500, 0)
     page = render(
@@ -98,6 +105,8 @@ def _page(
         kinds=EVENT_KINDS,
         severities=EVENT_SEVERITIES,
         typed=typed,
+        sent=form,
+        remarks=field_notes(error, typed),
         may_add=may(caller, can.WRITE_QOC, participant),
         may_write=may(caller, can.WRITE_STUDY, participant),
         may_clear=may(caller, can.APPROVE_PLAN, participant),

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.database import set_reason
-from app.platform.errors import Conflict, Invalid
+from app.platform.errors import Conflict, Invalid, about
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
@@ -108,14 +108,22 @@ def blocked_policies(events: Iterable[AdverseEvent], caller: Caller) -> frozense
 def _checked_visit(db: Session, participant: Participant, draft: AdverseEventIn, caller: Caller) -> int | None:
     if draft.session_id is None:
         if draft.visit_id is not None:
-            study.require_own(participant, study_repository.visit(db, draft.visit_id, caller), f"visit {draft.visit_id}")
+            with about("visit_id"):
+                study.require_own(participant, study_repository.visit(db, draft.visit_id, caller), f"visit {draft.visit_id}")
         return draft.visit_id
-    session = study_repository.session(db, draft.session_id, caller)
-    study.require_own(participant, session.visit, f"session {draft.session_id}")
+    with about("session_id"):
+        session = study_repository.session(db, draft.session_id, caller)
+        study.require_own(participant, session.visit, f"session {draft.session_id}")
     if session.status == "proposed":
-        raise Conflict(f"Session {session.id} is a proposal that nobody has confirmed yet.", "Confirm it first, or name the visit alone.")
+        raise Conflict(
+            f"Session {session.id} is a proposal that nobody has confirmed yet.",
+            "Confirm it first, or name the visit alone.",
+            field="session_id",
+        )
     if draft.visit_id not in (None, session.visit_id):
-        raise Invalid(f"Session {session.id} is not of visit {draft.visit_id}.", "Leave the visit out, or correct one of them.")
+        raise Invalid(
+            f"Session {session.id} is not of visit {draft.visit_id}.", "Leave the visit out, or correct one of them.", field="visit_id"
+        )
     if draft.policy_id is not None:
         raise Invalid("A session tells itself what ran.", "Leave the policy out; correct the session if it names the wrong one.")
     return session.visit_id
@@ -145,7 +153,7 @@ def _follow(
     cleared: str | None,
 ) -> AdverseEvent:
     if not reason.strip():
-        raise Invalid("A reason is missing.", "Say why; it is kept with the event.")
+        raise Invalid("A reason is missing.", "Say why; it is kept with the event.", field="reason")
     repository.lock_event(db, event)
     if event.now.revision != revision:
         raise Conflict(

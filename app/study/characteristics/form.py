@@ -42,10 +42,12 @@ def characteristics(typed: Mapping[str, str]) -> CharacteristicsFields:
     Raises:
         Invalid: names the row and the field that cannot be read.
     """
-    leads = [parse(Lead, row, _numbered("Lead", i, LEAD_LABELS)) for i, row in _rows(typed, "lead", LEAD_LABELS, MOST_LEADS)]
-    doses = [parse(PlannedDose, row, _numbered("Dose", i, DOSE_LABELS)) for i, row in _rows(typed, "dose", DOSE_LABELS, MOST_DOSES)]
-    if len({(d.drug, d.at) for d in doses}) < len(doses):
-        raise Invalid("The same drug stands twice at one time in the schedule.", "Give both together in one row.")
+    leads = [parse(Lead, row, *_numbered("Lead", i, LEAD_LABELS)) for i, row in _rows(typed, "lead", LEAD_LABELS, MOST_LEADS)]
+    planned = _rows(typed, "dose", DOSE_LABELS, MOST_DOSES)
+    doses = [parse(PlannedDose, row, *_numbered("Dose", i, DOSE_LABELS)) for i, row in planned]
+    for k, (i, _) in enumerate(planned):
+        if (doses[k].drug, doses[k].at) in [(d.drug, d.at) for d in doses[:k]]:
+            raise Invalid("The same drug stands twice at one time in the schedule.", "Give both together in one row.", field=f"dose{i}_at")
     symptoms = [s for s in Symptom if typed[f"symptom_{s}"]]
     hand = parse(CharacteristicsFields, {"hand": typed["hand"]}, {"hand": "Hand of the grasp test"}).hand
     return CharacteristicsFields(leads=leads, symptoms=symptoms, hand=hand, medication=doses)
@@ -56,5 +58,7 @@ def _rows(typed: Mapping[str, str], name: str, labels: Mapping[str, str], most: 
     return [(i, row) for i, row in rows if any(row.values())]
 
 
-def _numbered(what: str, number: int, labels: Mapping[str, str]) -> dict[str, str]:
-    return {field: f"{what} {number}, {label.lower()}" for field, label in labels.items()}
+def _numbered(what: str, number: int, labels: Mapping[str, str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Labels and names of the fields of a row."""
+    names = {field: f"{what.lower()}{number}_{field}" for field in labels}
+    return {field: f"{what} {number}, {label.lower()}" for field, label in labels.items()}, names

@@ -11,7 +11,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.web.forms import FormValues
+from app.platform.web.forms import FormValues, field_notes
 from app.platform.web.templates import render
 from app.study.characteristics import form, service
 from app.study.characteristics.schemas import MOST_DOSES, MOST_LEADS
@@ -79,6 +79,7 @@ def _page(
         same_side=bool(current and current.hand and suggested and current.hand != suggested),
         history=history_of([(row, characteristics_words(service.fields_of(row))) for row in participant.characteristics], first_tells=True),
         may_write=may(caller, can.WRITE_STUDY, participant),
+        remarks=field_notes(error, values),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

@@ -45,7 +45,7 @@ def change_characteristics(
             raise Invalid("Nothing was stated.", "Give a lead, a symptom, the hand or a dose.")
         return current
     if not reason.strip():
-        raise Invalid("A reason is missing.", "Say why in a sentence; it is kept with the version.")
+        raise Invalid("A reason is missing.", "Say why in a sentence; it is kept with the version.", field="reason")
     set_reason(db, reason.strip())
     row = CharacteristicsVersion(
         participant_id=participant.id, version=seen + 1, created_by=caller.label, reason=reason.strip(), **wanted.model_dump(mode="json")

@@ -11,7 +11,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
-from app.platform.web.forms import FormValues, field_notes, parse
+from app.platform.web.forms import FormValues, field_notes, parse, renamed
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
 from app.study.form_changes import Shown, own_changes, reason_of
@@ -81,12 +81,13 @@ def lock_margins(request: Request, participant: CurrentParticipant, db: Db, call
     """Lock the present margins, signed."""
     typed = {name: str(values.get(field, "")) for name, field in _LOCK_FIELDS.items()}
     try:
-        wanted = parse(MarginsLockFields, typed, {"reason": "Reason"})
+        wanted = parse(MarginsLockFields, typed, {"reason": "What the margins rest on"})
         password, code = str(values.get("password", "")), str(values.get("code", ""))
         service.lock_margins(db, participant, wanted.version, wanted.reason, caller, password, code)
     except BetaloopError as error:
         db.rollback()
-        return _page(request, db, participant, caller, texts(participant.current_margins, LABELS), error, lock_reason=typed["reason"])
+        shown = texts(participant.current_margins, LABELS)
+        return _page(request, db, participant, caller, shown, renamed(error, _LOCK_FIELDS), lock_reason=typed["reason"])
     db.commit()
     return RedirectResponse(f"/participants/{participant.code}/margins?done=locked", 303)
 
@@ -114,7 +115,7 @@ def _page(
         lock_meaning=sign_off.MEANING,
         lock_signatures=sign_off.signatures_of_locks(db, participant),
         may_write=may(caller, can.APPROVE_PLAN, participant),
-        remarks=field_notes(error, values),
+        remarks=field_notes(error, values | {"lock_reason": lock_reason}),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

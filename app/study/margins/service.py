@@ -34,7 +34,7 @@ def change_margins(db: Session, participant: Participant, change: MarginsIn, rea
     if all(getattr(current, name) == value for name, value in values.items()):
         return current
     if not reason.strip():
-        raise Invalid("New margins need the reason why they are changed.", "Say why in a sentence.")
+        raise Invalid("New margins need the reason why they are changed.", "Say why in a sentence.", field="reason")
     row = MarginsVersion(
         participant_id=participant.id, version=current.version + 1, created_by=caller.label, reason=reason.strip(), **values
     )
@@ -68,7 +68,7 @@ def lock_margins(
     if participant.margins_lock and participant.margins_lock.margins_version_id == current.id:
         raise Conflict(f"Version {version} is locked already.", "A new lock would only take away evidence.")
     if not reason.strip():
-        raise Invalid("A lock needs a reason.", "Say what the margins rest on, in a sentence.")
+        raise Invalid("A lock needs a reason.", "Say what the margins rest on, in a sentence.", field="reason")
     row = MarginsLock(participant_id=participant.id, margins_version_id=current.id, reason=reason.strip(), created_by=caller.label)
     set_reason(db, row.reason)
     participant.margins_locks.append(row)

@@ -49,7 +49,10 @@ def addresses(world: World) -> dict[str, str]:
     return {p: p.format(**(world.ids | own.get(p, {}))) + QUERIES.get(p, "") for p in paths}
 
 
-PARTS = {"train": ("plan", "train/", "baselines", "store-policies"), "evaluate": ("plan", "fit/", "store-models", "choose", "estimate/", "rank")}
+PARTS = {
+    "train": ("plan", "train/", "baselines", "store-policies"),
+    "evaluate": ("plan", "fit/", "store-models", "choose", "estimate/", "rank"),
+}
 """Steps of a pipeline, by their keys' beginnings, of which a job of one kind consists."""
 
 

@@ -53,7 +53,9 @@ def test_a_search_with_one_hit_opens_it(
     browser: TestClient, client: TestClient, session_id: int, db: Session, words: str, leads_to: str
 ) -> None:
     job = _job(db, JobStatus.SUCCEEDED)
-    made = client.post("/api/v1/participants/P1/policies", data={"name": "constant half"}, files={"file": ("a.onnx", constant_onnx(0.5, 10))})
+    made = client.post(
+        "/api/v1/participants/P1/policies", data={"name": "constant half"}, files={"file": ("a.onnx", constant_onnx(0.5, 10))}
+    )
     assert made.status_code == 201, made.text
     found = browser.get("/search", params={"q": words.format(session=session_id)})
     assert found.status_code == 303
