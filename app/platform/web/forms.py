@@ -64,7 +64,7 @@ def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] |
         try:
             return model.model_validate(data)
         except ValidationError as error:
-            for e in error.errors():
+            for e in (e for e in error.errors() if e["type"] != "default_factory_not_called"):  # follows from another field's error
                 # a check of the model as a whole names its field by the error's type
                 name = ".".join(map(str, e["loc"])) or (e["type"] if e["type"] in model.model_fields else "")
                 errors.append({"where": labels.get(name, name), "what": _said(e), "name": names.get(name, name)})

@@ -64,8 +64,10 @@ def held_against(page: str, sent: Sent) -> list[str]:
     missing = []
     if not tag:
         missing.append("no such field")
-    elif not tag.startswith(("<fieldset", "<tr", "<div")) and 'aria-invalid="true"' not in tag:
-        missing.append(f"not marked: {tag}")
+    elif not tag.startswith(("<fieldset", "<tr", "<div")):
+        described = re.findall(r' aria-describedby="([^"]*)"', tag)
+        if 'aria-invalid="true"' not in tag or len(described) != 1 or f"n-{name}" not in described[0].split():
+            missing.append(f"not marked: {tag}")
     if note is None or sent.says not in unescape(note[1]):
         missing.append(f"says {note[1] if note else 'nothing'}")
     if f'<a href="#{sent.field}">' not in page:
@@ -177,6 +179,10 @@ def test_forms_of_jobs_plans_and_bundles_say_errors_at_their_fields(browser: Tes
     assert refused(browser, forms) == {}
     page = browser.post(f"{home}/policies/{policy}/release", data=limits | {"min_ma": "low"}).text
     assert page.count('class="field-note"') == 1, "the form that was not sent has no error"
+    assert page.count('value="low"') == 1, "and none of what was typed into the other"
+    few = browser.post(jobs, data={"kind": "pipeline", "count": "99"}).text
+    assert "default factory" not in few
+    assert few.count('class="field-note"') == 1
 
 
 def test_the_box_leads_to_the_fields_of_the_older_forms_too(
