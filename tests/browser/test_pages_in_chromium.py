@@ -174,13 +174,13 @@ def test_files_dropped_on_the_upload_page_become_sessions(window: Callable, enro
         files,
     )
     watched.page.dispatch_event("[data-drop]", "drop", {"dataTransfer": transfer})
-    outcomes = ["received", "read", "1 to look at", "columns not known", "1 problem", "known already"]
+    outcomes = ["received", "read", "2 to look at", "columns not known", "1 problem", "known already"]
     told = watched.page.locator("[data-upload-list] .badge:not(dt .badge)")
     expect(told).to_have_text(outcomes, timeout=60_000)
     folds = watched.page.locator("[data-upload-list] details.file")
     assert [fold.get_attribute("open") is not None for fold in folds.all()] == [False, True, False], "open where there is a problem"
     expect(folds.first.locator("summary")).to_contain_text("good.csv")
-    expect(folds.first.locator("summary .line")).to_contain_text("steps")
+    expect(folds.first.locator("summary .line")).to_contain_text("rows of 2 s")
     assert not watched.page.is_visible("[data-upload-list] dt:has-text('Understood')")
     expect(watched.page.locator("[data-upload-list] li").first).to_contain_text("bad <b>.csv")
     assert client.get("/api/v1/visits/1/sessions").json()["total"] == 1
