@@ -25,7 +25,7 @@ def test_every_file_is_a_line_and_only_a_problem_stands_open(browser: TestClient
     told = lines(page)
     assert {name: opened for name, (opened, _) in told.items()} == {"good.csv": False, "bad.csv": True, "noise.bin": True}
     assert re.fullmatch(r"read 4 to look at table, \d+ B · 1 session · 50 rows of 2 s: .*", told["good.csv"][1]), told["good.csv"]
-    assert told["bad.csv"][1].startswith("columns not known 1 problem table, 8 B")
+    assert told["bad.csv"][1].startswith("columns not known 1 problem unreadable, 8 B")
     assert "1 problem" in told["noise.bin"][1]
     seen = above_fold(page)
     assert "Removed" not in seen
