@@ -34,6 +34,8 @@ from app.study import repository as study
 router = APIRouter()
 
 REFRESH_S = 5
+SOON = 12
+"""Next visits that stand open; later ones are a fold away."""
 _ARM_COLUMNS = ("controller", "policy_id")
 _HIDDEN = "hidden from you"
 _KEPT = {
@@ -60,13 +62,15 @@ def overview(
     """Today: the next visits with what each waits for, then all participants as cards, those that need attention marked."""
     rows, total = study.participants(db, caller, paging.limit, paging.offset, withdrawn=withdrawn == "yes")
     today = datetime.now(UTC).date()
-    states = state.states(db, rows, today)
-    dated = [(p, states[p.id]) for p in rows if states[p.id].next_visit is not None]
+    # of the whole study: whoever is seen tomorrow may stand on another page of participants
+    coming = study.next_visits(db, caller, today, withdrawn=withdrawn == "yes")
+    states = state.states(db, list(dict.fromkeys([*rows, *coming])), today)
     page = render(
         request,
         "overview/overview.html",
         participants=[(p, states[p.id]) for p in rows],
-        coming=sorted(dated, key=lambda row: (row[1].next_visit, row[0].code)),
+        coming=[(p, states[p.id]) for p in coming],
+        soon=SOON,
         today=today,
         what=wording.what,
         actors=wording.ACTORS,

@@ -88,4 +88,5 @@ def _answer(db: Session, participant: Participant, caller: Caller) -> _Answer | 
 def _story(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsVersion]) -> Chart | None:
     """The months on one axis, kept while none of what they are made of has changed."""
     key = ("story", held.key, tuple((v.id, v.date) for v in visits), tuple((v.version, v.created_at) for v in versions))
-    return kept(key, lambda: story_chart(held, visits, versions))
+    today = datetime.now(UTC).date()
+    return kept((*key, today), lambda: story_chart(held, visits, versions, today))

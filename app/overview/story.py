@@ -1,15 +1,16 @@
-"""A participant's months on one axis: what every session brought, the visits, and when settings changed."""
+"""A participant's months on one axis: what every session brought, every dated visit, the next one, and when settings changed."""
 
 from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 from app.analysis.evidence.facts import Facts
 from app.analysis.evidence.service import Evidence
-from app.platform.web.charts import GRID, MUTED, SYMBOLS, WARN, Cell, Chart, colour, counted, figure, marker
+from app.platform.web.charts import ACCENT, GRID, MUTED, SYMBOLS, TEXT, WARN, Cell, Chart, Link, colour, counted, figure, marker
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import SettingsVersion, Visit
 
@@ -18,15 +19,19 @@ _SHARE = 0.7
 """Of the shortest time between two visits that the sessions of a visit may take on the axis."""
 _TICKS = 8
 """Days that find room below the axis, on a tablet too."""
+_AIR = 0.03
+"""Of what the axis shows, left and right of it."""
 _APART = dt.timedelta(minutes=20)
 """Between sessions of a visit whose times nobody stated, so that they stand beside each other in their order."""
 
 
-def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsVersion]) -> Chart | None:
-    """Every session that counts and that the reader may know of, as a dot in a panel per quantity; None without any on a known day.
+def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsVersion], today: dt.date) -> Chart | None:
+    """Every session that counts and that the reader may know of, as a dot in a panel per quantity, and every dated visit, also one without
+    such a session; None without any session on a known day.
 
     Args:
         held: sessions as the caller may know them. visits: with their dates. versions: of the settings, by number.
+        today: the first visit from then on is marked as the next one.
     """
     days = {v.id: v.date for v in visits}
     dated = [(moment, s) for s in held.sessions if (moment := _moment(s, days)) is not None]
@@ -38,16 +43,20 @@ def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[Sett
     for controller in dict.fromkeys(s.controller for _, s in dated):
         shown = marker(controller.value, 8)
         data.append({"type": "scatter", "mode": "markers", "name": CONTROLLER_NAMES[controller], "x": [None], "y": [None], "marker": shown})
-    layout["shapes"], layout["annotations"] = _marks(dated, places, versions)
-    layout["xaxis"] |= _days(dated, places)
+    stands = _visits(dated, places, visits, today)
+    layout["shapes"], layout["annotations"] = _marks(stands, versions)
+    layout["xaxis"] |= _days(stands) | {"range": _range(places, stands, versions)}
     columns = ("Start", "Visit", "Session", "Controller", *(f"{name} ({unit})" for name, unit, _ in panels))
     rows: list[list[Cell]] = [
-        [f"{moment:%Y-%m-%d %H:%M}", s.visit, s.session_id, CONTROLLER_NAMES[s.controller], *(values[i] for _, _, values in panels)]
+        [f"{moment:%Y-%m-%d %H:%M}", s.visit, Link(s.session_id, f"/sessions/{s.session_id}"), CONTROLLER_NAMES[s.controller],
+         *(values[i] for _, _, values in panels)]
         for i, (moment, s) in enumerate(dated)
-    ]
+    ]  # fmt: skip
+    nothing: list[Cell] = [None] * (2 + len(panels))
+    rows += [[f"{v.day}{' (next visit)' if v.is_next else ''}", Link(v.number, f"/visits/{v.visit_id}"), *nothing] for v in stands if v.empty]
     visits_seen = len({s.visit_id for _, s in dated})
     n = f"{counted(len(dated), 'session')} in {counted(visits_seen, 'visit')}"
-    subtitle = f"n = {n}, those of a day side by side \u00b7 press a dot for its session"
+    subtitle = f"n = {n}, those of a day side by side \u00b7 press a dot for its session, or take it from the table"
     return Chart("story", "All months", subtitle, figure(data, **layout), columns, rows, height=82 + 82 * len(panels))
 
 
@@ -126,43 +135,83 @@ def _panels(
     return data, layout
 
 
-def _days(dated: Sequence[tuple[dt.datetime, Facts]], places: Sequence[dt.datetime]) -> dict[str, Any]:
-    """Ticks where visits stand, with their days: a calendar's would date sessions that stand beside their visit's day by another one."""
+@dataclass(frozen=True)
+class _Stand:
+    """A dated visit on the axis.
+
+    Attributes:
+        at: in the middle of its sessions, or on its day. line: left of its first session. day: of its first session, or its own.
+        empty: whether no session of it is shown. is_next: whether it is the first one from today on.
+    """
+
+    at: dt.datetime
+    line: dt.datetime
+    day: dt.date
+    visit_id: int
+    number: int
+    empty: bool
+    is_next: bool
+
+
+def _visits(
+    dated: Sequence[tuple[dt.datetime, Facts]], places: Sequence[dt.datetime], visits: Sequence[Visit], today: dt.date
+) -> list[_Stand]:
+    """Every visit that has a day, from its own row or from its sessions, in the order of the axis."""
     spans: dict[int, list[tuple[dt.datetime, dt.datetime]]] = {}
     for (moment, s), place in zip(dated, places, strict=True):
         spans.setdefault(s.visit_id, []).append((place, moment))
-    numbers = {s.visit_id: s.visit for _, s in dated}
-    ticks = sorted((min(at)[0] + (max(at)[0] - min(at)[0]) / 2, min(m for _, m in at), numbers[visit]) for visit, at in spans.items())
-    shown = ticks[:: -(-len(ticks) // _TICKS)]
-    words = [f"visit {number}<br>{day:%Y-%m-%d}" for _, day, number in shown]
-    return {"tickvals": [at.isoformat() for at, _, _ in shown], "ticktext": words}
+    coming = min((v for v in visits if v.date is not None and v.date >= today), key=lambda v: (v.date, v.number), default=None)
+    found = []
+    for visit in visits:
+        held = spans.get(visit.id)
+        if held:
+            first, last = min(held)[0], max(held)[0]
+            at, line, day = first + (last - first) / 2, first, min(m for _, m in held).date()
+        elif visit.date is not None:
+            at = line = dt.datetime.combine(visit.date, dt.time(12), dt.UTC)
+            day = visit.date
+        else:
+            continue
+        found.append(_Stand(at, line, day, visit.id, visit.number, not held, visit is coming))
+    return sorted(found, key=lambda v: (v.at, v.number))
+
+
+def _range(places: Sequence[dt.datetime], stands: Sequence[_Stand], versions: Sequence[SettingsVersion]) -> list[str]:
+    """What the axis shows: every dot and every line, which the library would not look at, with some air."""
+    moments = [*places, *(v.at for v in stands), *(v.created_at for v in versions if v.version > 1)]
+    air = max((max(moments) - min(moments)) * _AIR, dt.timedelta(hours=1))
+    return [(min(moments) - air).isoformat(), (max(moments) + air).isoformat()]
+
+
+def _days(stands: Sequence[_Stand]) -> dict[str, Any]:
+    """Ticks where visits stand, with their days: a calendar's would date sessions that stand beside their visit's day by another one."""
+    step = -(-len(stands) // _TICKS)
+    # counted from the last, so that the newest has its day, and the next one whatever its place
+    shown = [v for i, v in enumerate(reversed(stands)) if i % step == 0][::-1]
+    words = [f"visit {v.number}<br>{v.day:%Y-%m-%d}" for v in shown]
+    return {"tickvals": [v.at.isoformat() for v in shown], "ticktext": words}
 
 
 def _title(name: str, unit: str) -> dict[str, Any]:
     return {"text": f"{name}<br>{unit}", "font": {"size": 12}, "standoff": 10}
 
 
-def _marks(
-    dated: Sequence[tuple[dt.datetime, Facts]], places: Sequence[dt.datetime], versions: Sequence[SettingsVersion]
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """A line per visit, and a dashed one with its words where settings were changed."""
-    first: dict[int, dt.datetime] = {}
-    for place, (_, s) in zip(places, dated, strict=True):
-        first[s.visit] = min(place, first.get(s.visit, place))
+def _marks(stands: Sequence[_Stand], versions: Sequence[SettingsVersion]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """A line per visit, the next one's in colour with its words, and a dashed one with its words where settings were changed."""
     lines, labels = [], []
-    for text, at, ink, dash in (
-        *(("", moment, GRID, "solid") for _, moment in sorted(first.items())),
-        *((f"settings {v.version}", v.created_at, WARN, "dash") for v in versions if v.version > 1),
+    for text, at, ink, dash, width in (
+        *((f"next visit: {v.number}" if v.is_next else "", v.line, ACCENT if v.is_next else GRID, "solid", 1 + v.is_next) for v in stands),
+        *((f"settings {v.version}", v.created_at, WARN, "dash", 1) for v in versions if v.version > 1),
     ):
         where = {"xref": "x", "yref": "paper"}
-        line = {"color": ink, "width": 1, "dash": dash}
+        line = {"color": ink, "width": width, "dash": dash}
         lines.append(
             {"type": "line", **where, "x0": at.isoformat(), "x1": at.isoformat(), "y0": 0, "y1": 1, "line": line, "layer": "below"}
         )
         if not text:
             continue
         labels.append(
-            {"text": text, **where, "x": at.isoformat(), "y": 0, "yanchor": "bottom", "xanchor": "left", "showarrow": False,
-             "textangle": -90, "font": {"size": 11, "color": MUTED}}
+            {"text": text, **where, "x": at.isoformat(), "y": 0, "yanchor": "bottom", "xanchor": "right" if ink == ACCENT else "left",
+             "showarrow": False, "textangle": -90, "font": {"size": 11, "color": TEXT if ink == ACCENT else MUTED}}
         )  # fmt: skip
     return lines, labels

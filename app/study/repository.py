@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import date, datetime
 from typing import Any, NamedTuple
 
 from sqlalchemy import ARRAY, ColumnElement, Integer, Select, any_, cast, column, false, func, or_, select, table, true
@@ -29,6 +29,13 @@ from app.study.models import (
 
 CONFIRMED = StudySession.status == "confirmed"
 """Condition on `StudySession`: only what a person has confirmed counts in buffers, analyses, rankings and exports."""
+_WHOLE = (
+    joinedload(Participant.site),
+    selectinload(Participant.settings),
+    selectinload(Participant.margins),
+    selectinload(Participant.margins_locks),
+)
+"""What every page of a participant asks for."""
 
 
 def in_scope(caller: Caller) -> ColumnElement[bool]:
@@ -45,12 +52,7 @@ def participant_by_code(db: Session, code: str, caller: Caller) -> Participant:
         select(Participant)
         .join(Participant.site)
         .where(Participant.code == code, in_scope(caller))
-        .options(
-            joinedload(Participant.site),
-            selectinload(Participant.settings),
-            selectinload(Participant.margins),
-            selectinload(Participant.margins_locks),
-        )
+        .options(*_WHOLE)
     )
     if row is None:
         raise NotFound(f"There is no participant '{code}', or you have no access to it.")
@@ -64,21 +66,22 @@ def sites(db: Session, caller: Caller) -> Sequence[Site]:
 
 def participants(db: Session, caller: Caller, limit: int, offset: int, withdrawn: bool = True) -> tuple[Sequence[Participant], int]:
     """A page of participants by code, and how many there are; without those who have withdrawn where `withdrawn` is false."""
-    query = select(Participant).join(Participant.site).where(in_scope(caller))
-    if not withdrawn:
-        query = query.where(Participant.status != "withdrawn")
-    rows = db.scalars(
-        query.order_by(Participant.code)
-        .limit(limit)
-        .offset(offset)
-        .options(
-            joinedload(Participant.site),
-            selectinload(Participant.settings),
-            selectinload(Participant.margins),
-            selectinload(Participant.margins_locks),
-        )
-    ).all()
+    query = _participants(caller, withdrawn)
+    rows = db.scalars(query.order_by(Participant.code).limit(limit).offset(offset).options(*_WHOLE)).all()
     return rows, count(db, query)
+
+
+def next_visits(db: Session, caller: Caller, today: date, withdrawn: bool = True) -> Sequence[Participant]:
+    """Every participant with a visit dated today or later: whose first such visit is soonest, first, then by code."""
+    first = select(Visit.participant_id, func.min(Visit.date).label("day")).where(Visit.date >= today)
+    days = first.group_by(Visit.participant_id).subquery()
+    query = _participants(caller, withdrawn).join(days, days.c.participant_id == Participant.id)
+    return db.scalars(query.order_by(days.c.day, Participant.code).options(*_WHOLE)).all()
+
+
+def _participants(caller: Caller, withdrawn: bool) -> Select[Participant]:
+    query = select(Participant).join(Participant.site).where(in_scope(caller))
+    return query if withdrawn else query.where(Participant.status != "withdrawn")
 
 
 def visits(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[Visit], int]:

@@ -22,7 +22,20 @@ SYMBOLS = {"cdbs": "circle", "rl": "diamond", "distilled": "square", "no_dbs": "
 
 TEXT, MUTED, GRID, ACCENT, WARN, BAD = "token:text", "token:muted", "token:grid", "token:accent", "token:warn", "token:bad"
 
-Cell = str | float | int | None
+
+@dataclass(frozen=True)
+class Link:
+    """A cell that leads to a page of the service.
+
+    Attributes:
+        text: what it says, a number where it is one. url: a path of the service.
+    """
+
+    text: str | int
+    url: str
+
+
+Cell = str | float | int | Link | None
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,17 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.learning.policies.baselines import constant_onnx
+from app.overview.overview import SOON
 from app.overview.saved import Saved, overall
 from app.overview.state import states
 from app.overview.tasks import Actor, Task
 from app.platform.jobs import service as jobs
 from app.platform.jobs.models import Job, JobStatus
-from app.study.models import Participant
+from app.study.enrolment.schemas import ParticipantIn
+from app.study.enrolment.service import enrol
+from app.study.models import Participant, Visit
 from app.study.repository import participant_by_code
+from tests.app.analysis.conftest import adder
 
 
 def test_the_next_visit_waits_for_what_others_wait_for_and_says_who_acts(
@@ -36,6 +40,29 @@ def test_the_next_visit_waits_for_what_others_wait_for_and_says_who_acts(
     state = states(db, [participant_by_code(db, "P1", SYSTEM)], today)[1]
     assert state.blocked_by is not None
     assert (state.blocked_by.task, state.blocked_by.actor) == (Task.RANK, Actor.ENGINEER)
+
+
+def test_the_next_visits_are_those_of_the_whole_study_whatever_page_of_participants_is_shown(
+    browser: TestClient, enrolled: str, db: Session
+) -> None:
+    """Of 60 participants, 50 to a page: those of the second page are seen first."""
+    today = datetime.now(UTC).date()
+    for number in range(59):
+        other = enrol(db, ParticipantIn.model_validate({"code": f"Q{number:02d}"}), SYSTEM)
+        other.status = "withdrawn" if number == 58 else "active"
+        db.flush()
+        # the last by code comes first; each has another visit behind it
+        db.add_all([Visit(participant_id=other.id, number=n, date=today + timedelta(days=n * (60 - number))) for n in (1, 2)])
+    db.commit()
+    for page in ("/", "/?offset=50"):
+        text = browser.get(page).text
+        card = text.split("Next visits")[1].split("</section>")[0]
+        assert re.findall(r'<th scope="row"><a href="/participants/(\w+)">', card) == [f"Q{n:02d}" for n in range(57, -1, -1)], page
+        assert "n = 58" in card
+        assert "46 later" in card
+        assert card.index("<details") < card.index(f"Q{57 - SOON:02d}</a>")
+        assert card.index("<details") > card.index(f"Q{58 - SOON:02d}</a>")
+    assert ">Q58</a>" in browser.get("/?withdrawn=yes").text.split("Next visits")[1].split("</section>")[0]
 
 
 @pytest.mark.parametrize(
@@ -106,6 +133,25 @@ def test_a_job_is_stopped_from_the_list_by_those_who_may_and_says_so(
     page = browser.get("/jobs").text
     assert "cancelled</span>" in page
     assert f'Start one for <a href="/participants/{enrolled}/jobs">' in page
+
+
+def test_the_page_of_energy_saved_has_the_number_that_the_home_page_takes_and_each_participants(
+    browser: TestClient, db: Session, enrolled: str
+) -> None:
+    assert "No learned controller has run" in browser.get("/energy-saved").text
+    add = adder(db, enrolled)
+    add("rl", fraction=0.5, duration_s=600.0)
+    add("distilled", fraction=0.8, duration_s=300.0)
+    add("cdbs")
+    add("random", fraction=0.1)
+    add("rl", fraction=0.1, excluded="cable")
+    page = browser.get("/energy-saved").text
+    held = page.split('id="energy-saved"')[1]
+    # 1 - (0.25 * 10 min + 0.64 * 5 min) / 15 min
+    assert re.search(r"Saved by learned controllers</dt><dd><b>62</b>", held)
+    assert re.search(r"Over</dt><dd><b>15</b> <span class=\"unit\">min</span><small>n = 2 sessions, 1 participant</small>", held)
+    assert re.search(r'energy">P1</a></th><td class="num">62</td><td class="num">15</td><td class="num">2</td>', held)
+    assert 'id="energy-saved" data-late' in browser.get("/").text
 
 
 def test_energy_saved_is_weighted_by_minutes() -> None:
