@@ -29,10 +29,12 @@ from typing import Any
 import httpx2 as httpx
 import numpy as np
 import uvicorn
-from sqlalchemy import event, select, text
+from sqlalchemy import event, func, select, text
 from support.page_study import EMAIL, PASSWORD, Extent, add_account, add_participant
+from support.page_uploads import callers, complete
 
 from app.accounts.permissions import SYSTEM
+from app.learning.repository import candidates
 from app.main import create_app
 from app.pipeline.service import start_job
 from app.platform.database import get_engine, transaction
@@ -47,28 +49,49 @@ ROOT = Path(__file__).resolve().parents[1]
 KEPT = ROOT / "var" / "benchmarks" / "pages"
 
 PAGES = {
+    "sign-in": "/sign-in",
     "home": "/",
     "energy saved": "/energy-saved",
     "search": "/search?q=P0",
+    "new participant": "/participants/new",
     "participant": "/participants/{code}",
     "visits": "/participants/{code}/visits",
+    "new visit": "/participants/{code}/visits/new",
     "visit": "/visits/{visit}",
-    "day": "/visits/{visit}/plan",
+    "plan of a visit": "/visits/{visit}/plan",
+    "approved plan": "/visits/{planned}/plan",
+    "slots": "/visits/{planned}/slots",
+    "bundles": "/visits/{planned}/bundles",
+    "visit day": "/visit-day/{planned}",
     "session": "/sessions/{session}",
+    "signal": "/sessions/{signal}/signal",
+    "signal's chart": "/sessions/{signal}/signal.json",
     "upload": "/participants/{code}/upload",
+    "report": "/uploads/{upload}",
     "proposals": "/participants/{code}/proposals",
+    "proposal": "/proposals/{proposal}",
     "quarantine": "/participants/{code}/quarantine",
+    "mapping": "/uploaded-files/{file}/mapping",
+    "column mappings": "/studies/main/column-mappings",
+    "device history": "/participants/{code}/device-history",
     "settings": "/participants/{code}/settings",
+    "characteristics": "/participants/{code}/characteristics",
     "margins": "/participants/{code}/margins",
+    "adverse events": "/participants/{code}/adverse-events",
+    "data queries": "/participants/{code}/data-queries",
     "policies": "/participants/{code}/policies",
     "policy": "/participants/{code}/policies/{policy}",
     "bundle": "/participants/{code}/policies/{policy}/bundle",
     "buffer gate": "/participants/{code}/buffer-gate",
     "snapshot": "/snapshots/{snapshot}",
     "sweep": "/sweeps/{sweep}",
+    "next generation": "/participants/{code}/next-generation",
     "ranking": "/participants/{code}/ranking",
+    "compare": "/participants/{code}/compare?session={session}&policy={policy}&policy={other}",
     "calibration": "/participants/{code}/calibration",
     "analyses": "/participants/{code}/analyses",
+    "analysis by visit": "/participants/{code}/analyses/visits/rl",
+    "models": "/participants/{code}/analyses/models/rl",
     "paper": "/participants/{code}/analyses/paper",
     "energy": "/participants/{code}/analyses/energy",
     "beta": "/participants/{code}/analyses/beta",
@@ -82,7 +105,12 @@ PAGES = {
     "audit": "/audit",
     "account": "/account",
     "accounts": "/accounts",
+    "studies": "/studies",
+    "glossary": "/glossary",
+    "interface": "/api-reference",
+    "style guide": "/styleguide",
 }
+"""Every page of the service (`tests/benchmarks/test_pages.py`), by what it is called in the table."""
 
 
 @dataclass
@@ -105,6 +133,7 @@ class Measured:
 def prepare(folder: Path, extent: Extent) -> None:
     """The study in a data folder; what an interruption left is gone on with, participant by participant."""
     os.environ["BETALOOP_DATA_DIR"] = str(folder)
+    os.environ["BETALOOP_DEVELOPMENT"] = "true"  # the style guide is a page of developers
     get_settings.cache_clear()
     migrate()
     done = folder / "study.json"
@@ -118,22 +147,44 @@ def prepare(folder: Path, extent: Extent) -> None:
         made.append(number)
         done.write_text(json.dumps(made))
         print(f"made {number} of {extent.participants} in {time.monotonic() - started:.0f} s", flush=True)
+    _enter(folder, extent)
     with transaction("bench") as db:
         db.execute(text("analyze"))
 
 
-def addresses(extent: Extent) -> list[dict[str, Any]]:
-    """What stands in the paths, for each participant: its newest visit with sessions, one of its sessions, policies, jobs."""
+def _enter(folder: Path, extent: Extent) -> None:
+    """What is entered through the interface, for each participant once; `entered.json` holds what it is found by."""
+    done = folder / "entered.json"
+    entered: dict[str, dict[str, Any]] = json.loads(done.read_text()) if done.exists() else {}
+    codes = [f"P{number:02d}" for number in range(1, extent.participants + 1)]
+    if all(code in entered for code in codes):
+        return
+    signer, drafter = callers(create_app(), EMAIL)
+    for code in codes:
+        if code in entered:
+            continue
+        started = time.monotonic()
+        with transaction("bench") as db:
+            policies = [p.id for p in candidates(db, participant_by_code(db, code, SYSTEM).id)[:2]]
+        entered[code] = complete(signer, drafter, code, PASSWORD, extent.visits, policies)
+        done.write_text(json.dumps(entered))
+        print(f"entered what {code} brings in {time.monotonic() - started:.0f} s", flush=True)
+
+
+def addresses(folder: Path, extent: Extent) -> list[dict[str, Any]]:
+    """What stands in the paths, for each participant: its newest visit with sessions, one of its sessions, policies, jobs, uploads."""
     found = []
+    entered = json.loads((folder / "entered.json").read_text())
     with transaction("bench") as db:
         for number in range(1, extent.participants + 1):
             participant = participant_by_code(db, f"P{number:02d}", SYSTEM)
-            visit = participant.visits[-1]
+            visit = next(v for v in participant.visits if v.number == extent.visits)
             names = {"policy": "select max(id) from policy where kind = 'trained'", "job": "select min(id) from job where kind = 'train'"}
+            names |= {"other": "select min(id) from policy where kind = 'trained'"}
             names |= {"snapshot": "select max(id) from buffer_snapshot where true", "sweep": "select max(id) from sweep where true"}
             rows = {k: db.scalar(text(f"{q} and participant_id = {participant.id}")) for k, q in names.items()}
-            session = db.scalar(select(StudySession.id).join(Visit).where(Visit.id == visit.id).limit(1))
-            found.append({"code": participant.code, "visit": visit.id, "session": session, **rows})
+            session = db.scalar(select(func.min(StudySession.id)).join(Visit).where(Visit.id == visit.id))
+            found.append({"code": participant.code, "visit": visit.id, "session": session, **rows, **entered[participant.code]})
     return found
 
 
@@ -188,10 +239,14 @@ def service() -> Iterator[tuple[str, Counter]]:
         thread.join(30)
 
 
+def _browser(base: str) -> httpx.Client:
+    return httpx.Client(base_url=base, headers={"Accept": "text/html", "Sec-Fetch-Site": "same-origin"}, timeout=60)
+
+
 def measure(base: str, counter: Counter, places: list[dict[str, Any]], names: list[str], requests: int) -> dict[str, Measured]:
     """Every page `requests` times, participant after participant."""
     found = {name: Measured() for name in names}
-    with httpx.Client(base_url=base, headers={"Accept": "text/html", "Sec-Fetch-Site": "same-origin"}, timeout=60) as client:
+    with _browser(base) as client, _browser(base) as nobody:
         if client.post("/sign-in", data={"email": EMAIL, "password": PASSWORD}).status_code != 303:
             raise SystemExit("nobody could sign in")
         client.get("/")  # templates are compiled once in the life of a service
@@ -202,7 +257,8 @@ def measure(base: str, counter: Counter, places: list[dict[str, Any]], names: li
                 place = places[(1 + i) % len(places)]
                 counter.queries = 0
                 cpu, wall = time.process_time(), time.perf_counter()
-                with client.stream("GET", PAGES[name].format(**place)) as answer:
+                who = nobody if name == "sign-in" else client
+                with who.stream("GET", PAGES[name].format(**place)) as answer:
                     body = b"".join(answer.iter_raw())
                 found[name].wall_ms.append(1000 * (time.perf_counter() - wall))
                 found[name].cpu_ms.append(1000 * (time.process_time() - cpu))
@@ -238,7 +294,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="betaloop-pages-") as scratch:
         folder = Path(scratch) if options.quick else options.data
         prepare(folder / extent.name, extent)
-        places = addresses(extent)
+        places = addresses(folder / extent.name, extent)
         with service() as (base, counter):
             if options.idle:
                 found = measure(base, counter, places, names, options.requests or (5 if options.quick else 40))

@@ -15,7 +15,10 @@ from app.study.recordings.history import History, Spectrum, Trend
 SIDES = {"left": "token:cdbs", "right": "token:rl"}
 _COLOURS = ("token:cdbs", "token:rl", "token:random", "token:distilled", "token:other", "token:no_dbs")
 _DASHES = ("solid", "dash", "dot")
-GAP_S = 20 * 60.0
+AVERAGE_S = 10 * 60.0
+MOST_POINTS = 1500
+"""Of a line: about one for each pixel of its width. A device keeps 60 days, 8640 averages of each side."""
+GAP_S = 2 * AVERAGE_S
 """Two averages further apart than this are not joined: the device makes one every ten minutes."""
 MOST_SPECTRA = 12
 """Snapshots in one picture, the newest; the interface gives all."""
@@ -39,8 +42,10 @@ def _trend_charts(history: History, number: int) -> list[Chart]:
         return []
     every = [t for trend in history.trends for t in trend.unix_s]
     averages = ", ".join(f"{t.side} n = {len(t.unix_s)}" for t in history.trends)
-    span = f"{_day(min(every))} to {_day(max(every))}, averages over 10 min, {averages}"
-    power = [_line(t, t.power, "device units") for t in history.trends]
+    window_s = _window_s(history.trends)
+    shown = f", lowest and highest of every {window_s / 3600:.3g} h" if window_s else ""
+    span = f"{_day(min(every))} to {_day(max(every))}, averages over 10 min{shown}, {averages}"
+    power = [_line(t, t.power, "device units", window_s) for t in history.trends]
     top = max((v for t in history.trends for v in t.power if v is not None), default=1.0)
     marks = _event_marks(history, top, min(every), max(every))
     layout = {"xaxis": axis("Date (UTC)", "", type="date"), "showlegend": True}
@@ -53,30 +58,51 @@ def _trend_charts(history: History, number: int) -> list[Chart]:
         Chart(
             f"trend-amplitude-{number}", "Trend of the amplitude", f"mA · {span}",
             figure(
-                [_line(t, t.amplitude_ma, "mA") for t in history.trends], yaxis=axis("Amplitude", "mA", rangemode="tozero"), **layout
+                [_line(t, t.amplitude_ma, "mA", window_s) for t in history.trends], yaxis=axis("Amplitude", "mA", rangemode="tozero"), **layout
             ),
             ("Day", *(f"Mean amplitude, {t.side} (mA)" for t in history.trends)), _daily(history.trends, "amplitude_ma"), height=220,
         ),
     ]  # fmt: skip
 
 
-def _line(trend: Trend, values: Sequence[float | None], unit: str) -> dict[str, Any]:
+def _window_s(trends: Sequence[Trend]) -> float:
+    """Width of the windows of which a line shows the lowest and the highest average, s; 0 where it shows all."""
+    most = max(len(t.unix_s) for t in trends)
+    return 0.0 if most <= MOST_POINTS else 2 * AVERAGE_S * -(-most // MOST_POINTS)
+
+
+def _line(trend: Trend, values: Sequence[float | None], unit: str, window_s: float) -> dict[str, Any]:
     """One side; a gap stands where averages are missing."""
-    x: list[str | None] = []
-    y: list[float | None] = []
+    shown: list[tuple[float, float | None]] = []
+    held: list[tuple[float, float]] = []
     before = None
     for at, value in zip(trend.unix_s, values, strict=True):
-        if before is not None and at - before > GAP_S:
-            x.append(_iso(before + 1))
-            y.append(None)
-        x.append(_iso(at))
-        y.append(value)
+        gap = before is not None and at - before > GAP_S
+        if held and (gap or value is None or not window_s or held[0][0] // window_s != at // window_s):
+            shown += _extremes(held)
+            held = []
+        if before is not None and gap:
+            shown.append((before + 1, None))
+        if value is None:
+            shown.append((at, None))
+        else:
+            held.append((at, value))
         before = at
+    shown += _extremes(held)
     return {
-        "type": "scatter", "mode": "lines", "name": trend.side, "x": x, "y": y, "connectgaps": False,
+        "type": "scatter", "mode": "lines", "name": trend.side, "x": [_iso(at) for at, _ in shown], "y": [v for _, v in shown],
+        "connectgaps": False,
         "line": {"color": SIDES.get(trend.side, "token:other"), "width": 1, "dash": "solid" if trend.side == "left" else "dot"},
         "hovertemplate": f"%{{x}}<br>%{{y:.4g}} {unit}",
     }  # fmt: skip
+
+
+def _extremes(held: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The lowest and the highest of a window's averages in their order, one where all are equal: a spike is not averaged away."""
+    if not held:
+        return []
+    low, high = min(held, key=lambda p: p[1]), max(held, key=lambda p: p[1])
+    return [low] if low[1] == high[1] else sorted((low, high))
 
 
 def _event_marks(history: History, height: float, first_s: float, last_s: float) -> list[dict[str, Any]]:

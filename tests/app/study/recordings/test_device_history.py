@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import zlib
 from datetime import UTC, datetime, timedelta
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+
+from app.study.recordings.history_charts import MOST_POINTS
 
 BEGIN = datetime(2026, 2, 1, tzinfo=UTC)
 NAMES = ("Ada Lovelace", "NPA123456N")
@@ -93,6 +97,33 @@ def test_missing_averages_are_a_gap_and_the_table_has_a_row_per_day(client: Test
     table = page.split('id="trend-power-')[1].split("</figure>")[0]
     assert [day in table for day in ("2026-02-01", "2026-02-02", "2026-02-03", "2026-02-04")] == [True, True, True, False]
     assert "null" in table, "ten missing averages break the line"
+
+
+def test_sixty_days_of_both_sides_are_drawn_by_their_extremes_and_the_page_stays_small(client: TestClient, enrolled: str) -> None:
+    """What a device keeps at most. A spike of ten minutes stays, and so does the gap."""
+    rng = np.random.default_rng(3)
+    content = json.loads(report())
+    logs = {}
+    for side in ("Left", "Right"):
+        power = rng.integers(50, 400, 8640).tolist()
+        power[5001] = 900
+        averages = [{"DateTime": at(10 * k), "LFP": p, "AmplitudeInMilliAmps": 2.0 + 0.1 * (k > 6000)} for k, p in enumerate(power)]
+        logs[f"HemisphereLocationDef.{side}"] = {at(86400): averages[:7000] + averages[7010:]}
+    content["DiagnosticData"]["LFPTrendLogs"] = logs
+    sent = client.post("/api/v1/uploads", data={"participant": enrolled}, files={"file": ("r.json", json.dumps(content).encode())})
+    assert sent.status_code == 201, sent.text
+    page = client.get(f"/participants/{enrolled}/device-history", headers={"Accept": "text/html", "Accept-Encoding": "identity"}).text
+    assert len(zlib.compress(page.encode())) < 40_000
+    chart = page.split('id="trend-power-')[1].split("</figure>")[0]
+    assert "lowest and highest of every 2 h" in chart
+    lines = json.loads(chart.split('<script type="application/json">')[1].split("</script>")[0])["data"][:2]
+    for line in lines:
+        assert len(line["y"]) <= 1.05 * MOST_POINTS
+        assert max(v for v in line["y"] if v is not None) == 900
+        assert line["x"][line["y"].index(900)][:16] == at(50010)[:16]
+        assert line["y"].count(None) == 1
+    levels = page.split('id="trend-amplitude-')[1].split('<script type="application/json">')[1].split("</script>")[0]
+    assert set(json.loads(levels)["data"][0]["y"]) == {2.0, 2.1, None}, "no amplitude that was never set"
 
 
 def test_a_participant_without_a_report_is_told_what_is_needed(client: TestClient, enrolled: str) -> None:
