@@ -183,12 +183,20 @@ def plain(value: Any) -> Any:
     if isinstance(value, str):
         return written(value)
     if isinstance(value, np.ndarray):
-        return plain(value.tolist())
+        return _floats(value) if value.dtype.kind == "f" and value.ndim else plain(value.tolist())
     if isinstance(value, np.generic):
         return plain(value.item())
     if isinstance(value, Mapping):
         return {k: plain(v) for k, v in value.items()}
     return value
+
+
+def _floats(values: np.ndarray[Any, Any]) -> list[Any]:
+    """As `plain`, of an array of floats: a spectrogram has forty thousand."""
+    if values.ndim > 1:
+        return [_floats(row) for row in values]
+    known = math.isfinite
+    return [float(f"{v:.{_DIGITS}g}") if known(v) else None for v in values.tolist()]
 
 
 _MICRO = re.compile(r"\bu([VAs]2?)\b")

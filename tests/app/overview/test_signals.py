@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from app.overview.signals import service
+from app.overview.signals import compute, service
+from app.overview.signals.figures import chart_figure
+from app.overview.signals.pages import POINTS
 from app.platform.web.png import palette, picture
+from ml.formats.recording import SampleLog
 from tests.app.ingest.conftest import send, steady  # noqa: F401 (fixture)
 from tests.app.overview.test_samples import lfp_table, session  # noqa: F401 (fixture)
 
@@ -129,6 +134,29 @@ def test_the_page_draws_without_a_script_and_a_blinded_assessor_sees_nothing(cli
     blinded = client_as("blinded_assessor")
     for place in ("/api/v1/sessions/{}/signal", "/sessions/{}/signal", "/sessions/{}/signal.json"):
         assert blinded.get(place.format(session)).status_code == 403
+
+
+def test_a_stretch_of_a_million_samples_is_drawn_fluidly(tmp_path: Path) -> None:
+    """80 minutes at 250 Hz; processor time, which other work on the machine does not lengthen, by bounds ten times what it takes."""
+    rate, n = 250.0, 1_200_000
+    values = np.random.default_rng(4).standard_normal(n)
+    values[600_123] = 50.0
+    log = SampleLog.of("LFP", "uV", [(0.0, rate, values)])
+    begun = time.process_time()
+    header = compute._written(log, tmp_path, 0)
+    assert time.process_time() - begun < 2.0, "the pyramid and the spectrogram, once in a session's life"
+    channel = service.SignalChannel(0, 1, None, "LFP", "uV", (rate,), n, header["begin_s"], header["end_s"])
+    signals = service.Signals(tmp_path, (channel,), (json.loads(json.dumps(header)),))
+    spike_s = 600_123 / rate
+    for width in (4800.0, 600.0, 60.0, 8.0, 2.0):
+        begin = max(0.0, spike_s - width / 2)
+        begun = time.process_time()
+        window = signals.window(0, begin, begin + width, POINTS)
+        drawn = json.dumps(chart_figure(window, (begin, begin + width), 13.0, 30.0))
+        assert time.process_time() - begun < 0.3, f"a window of {width} s"
+        assert len(drawn) < 600_000
+        assert window.t_s.size <= 5 * POINTS
+        assert float(np.nanmax(window.high)) == 50.0, "no spike is lost at any width"
 
 
 def test_a_picture_has_its_size_its_colours_and_nothing_where_nothing_is_known() -> None:
