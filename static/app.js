@@ -99,8 +99,9 @@ for (const late of document.querySelectorAll("[data-late][id]")) {
     .then(async (answer) => {
       const fresh = answer.ok && new DOMParser().parseFromString(await answer.text(), "text/html").getElementById(late.id);
       if (fresh) { late.replaceChildren(...fresh.childNodes); announce(late); }
+      late.dataset.late = fresh ? "here" : "refused";
     })
-    .catch((error) => console.info("left as a link", error));
+    .catch((error) => { late.dataset.late = "refused"; console.info("left as a link", error); });
 }
 
 // --- parts of a page that fetch themselves again
