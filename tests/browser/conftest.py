@@ -21,6 +21,20 @@ PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 PASSWORD = "correct horse battery"
 PATIENCE_MS = 120_000
 """How long a page may take to come, or a part of it: on a machine that is busy with other work, half a minute was too short."""
+DRAWN_FOR_PAPER = """() => [...document.querySelectorAll("figure[data-chart]")].every((figure) => figure.dataset.drawn === "failed"
+  || (figure.dataset.drawn === "yes" && figure.querySelector(".plot").layout?.autosize === false))"""
+CLIPPED = """() => {
+  const past = (e, within) => Math.round(e.getBoundingClientRect().right - within.getBoundingClientRect().right);
+  const told = (e, within, what) => (e.getBoundingClientRect().width && past(e, within) > 0 ? [`${what} by ${past(e, within)} px`] : []);
+  const cards = [...document.querySelectorAll("main .card")].flatMap((card) =>
+    [...card.querySelectorAll("table, figure, svg.drawing, dl, pre")].flatMap((e) => told(e, card, `${e.tagName} past its card`)));
+  const charts = [...document.querySelectorAll("figure[data-chart]")].flatMap((figure) => {
+    if (figure.dataset.drawn === "failed") return [`${figure.id} was not drawn`];
+    return [...figure.querySelectorAll(".main-svg")].flatMap((e) => [".plot", "main"].flatMap((name) => told(e, e.closest(name), `${figure.id} past ${name}`)));
+  });
+  return [...cards, ...charts];
+}"""
+"""Tables and boxes past their card; charts past the place that would cut them off."""
 FLAGS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync",
@@ -62,6 +76,18 @@ class Watched:
             chart.scroll_into_view_if_needed()
             self.page.wait_for_selector(f"#{chart.get_attribute('id')}[data-drawn=yes] .main-svg", timeout=60_000)
         return len(charts)
+
+    def settled(self) -> None:
+        """Wait for all that comes after the page: charts, and parts that are fetched."""
+        self.charts_drawn()
+        self.page.wait_for_function("() => ![...document.querySelectorAll('[data-late]')].some((e) => e.dataset.late === '')")
+
+    def on_paper(self) -> list[str]:
+        """Have every chart drawn for paper, as before printing, which this browser must be told; what is wider than what it stands in."""
+        self.page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
+        self.page.wait_for_function(DRAWN_FOR_PAPER)
+        found: list[str] = self.page.evaluate(CLIPPED)
+        return found
 
 
 def program() -> str:

@@ -17,7 +17,8 @@ from tests.app.every_route import PASSWORD, TABLE, World, token_of
 from tests.app.pages.every_page import addresses
 from tests.browser import tour
 from tests.browser.conftest import Watched, serving, windows
-from tests.browser.test_accessibility import MOST_SHIFT, RULES, SHIFTS, WINDOWS
+from tests.browser.test_accessibility import MOST_SHIFT, RULES, SHEET, SHIFTS, WINDOWS
+from tests.browser.test_pages_in_chromium import BUTTONS_OVER
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -89,14 +90,33 @@ def test_every_page_keeps_to_every_rule_and_to_its_place(window: Callable, world
         if not html or name in DRAWN:
             continue
         watched.open(path)
+        watched.settled()
         if (moved := watched.page.evaluate(SHIFTS)) > MOST_SHIFT:
-            found.append(f"{name}: moves by {moved:.2f}")
+            found.append(f"{name}: moves by {moved:.3f}")
         found += broken(axe, watched, name)
+        # on a tablet the buttons are large, and keep off the title too
+        found += [f"{name}: buttons over {c}" for c in watched.page.evaluate(BUTTONS_OVER) if width == 768 or c.endswith("data")]
         seen += 1
     assert "\n".join(found) == ""
     assert seen >= 50
     assert watched.errors == []
     assert watched.foreign == []
+
+
+def test_on_paper_no_page_has_anything_cut_off(window: Callable[..., Watched], world: World) -> None:
+    """Every page, every fold that is open, every chart as it is drawn before printing."""
+    watched = window(SHEET, 900, "light")
+    watched.sign_in(password=PASSWORD)
+    watched.page.emulate_media(media="print")
+    found, charts = [], 0
+    for name in [*tour.PAGES]:
+        watched.open(addresses(world)[name])
+        found += [f"{name}: {what}" for what in watched.on_paper()]
+        found += [f"{name}: {wider} px wider than the sheet"] if (wider := watched.page.evaluate(TOO_WIDE)) > 0 else []
+        charts += len(watched.page.query_selector_all("figure[data-drawn=yes]"))
+    assert "\n".join(found) == ""
+    assert charts >= 20
+    assert watched.errors == []
 
 
 @WINDOWS
