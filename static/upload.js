@@ -10,8 +10,6 @@ const FIELDS = ["visit", "controller", "policy", "started_at", "hemisphere", "be
 const UNKNOWN_COLUMNS = ["columns not known", "warn"];
 const STATES = { decoded: ["read", "good"], received: ["being read", "info"], released: ["released unread", "warn"], discarded: ["discarded", "warn"] };
 
-form.querySelector("[data-drop-hint]").prepend("Drop files or whole folders here, or choose them. ");
-
 for (const kind of ["dragenter", "dragover"]) drop.addEventListener(kind, (event) => { event.preventDefault(); drop.classList.add("over"); });
 drop.addEventListener("dragleave", (event) => { if (!drop.contains(event.relatedTarget)) drop.classList.remove("over"); });
 drop.addEventListener("drop", async (event) => {

@@ -74,6 +74,14 @@ def test_the_tour_shows_every_page(window: Callable, world: World) -> None:  # t
             tour.take(watched.page, pictures, tour.PAGES[route])
         if route == "/sign-in":
             watched.sign_in(password=PASSWORD)
+    for name, (route, card) in tour.PARTS.items():
+        watched.open(there[route].removesuffix("/signal"))
+        watched.page.locator(card).scroll_into_view_if_needed()
+        watched.page.wait_for_selector(f"{card} figure[data-drawn=yes] .heatmaplayer image")
+        watched.charts_drawn()
+        watched.page.evaluate("(card) => document.querySelector(card).scrollIntoView()", card)
+        if pictures:
+            tour.take(watched.page, pictures, name)
     assert watched.errors == []
 
 

@@ -73,6 +73,8 @@ PAGES = {
     "/participants/{code}/analyses/evaluations": "analyse/methods-by-seed",
 }
 """Name of the picture of each page, by its route."""
+PARTS = {"participant/session-samples": ("/sessions/{session_id}/signal", "#signal-card")}
+"""Further pictures of what stands lower on a page: a route whose session it is, and the card that is shown."""
 OF_THE_RANKED = ("evaluate/ranking", "evaluate/policy", "evaluate/compare", "plan/plan", "plan/visit")
 """Made of a study with a judged ranking and a draft, in which there is more to see."""
 

@@ -18,7 +18,7 @@ def test_every_page_has_a_paragraph_and_a_picture_in_the_tour(service_app: Any) 
     pages = {route for route in routes(service_app) if route not in ELSEWHERE and not NOT_PAGES.search(route)}
     assert pages == set(tour.PAGES)
     pictures = re.findall(r"^!\[[^\]]+\]\(tour/([\w/-]+)\.png\)$", TEXT, re.M)
-    assert sorted(pictures) == sorted(tour.PAGES.values())
+    assert sorted(pictures) == sorted([*tour.PAGES.values(), *tour.PARTS])
     for name in pictures:
         before = TEXT[: TEXT.index(f"(tour/{name}.png)")].rsplit("![", 1)[0].rstrip()
         assert not before.endswith(")"), f"{name} has no paragraph before it"
@@ -26,7 +26,7 @@ def test_every_page_has_a_paragraph_and_a_picture_in_the_tour(service_app: Any) 
 
 def test_every_picture_of_the_tour_is_shown_and_small() -> None:
     files = {path.relative_to(ROOT / "docs" / "tour").with_suffix("").as_posix(): path for path in (ROOT / "docs" / "tour").rglob("*.*")}
-    assert set(files) == set(tour.PAGES.values())
+    assert set(files) == {*tour.PAGES.values(), *tour.PARTS}
     for name, path in files.items():
         assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n", name
         assert path.stat().st_size <= tour.MOST_BYTES, name
