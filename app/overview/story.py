@@ -53,7 +53,9 @@ def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[Sett
         for i, (moment, s) in enumerate(dated)
     ]  # fmt: skip
     nothing: list[Cell] = [None] * (2 + len(panels))
-    rows += [[f"{v.day}{' (next visit)' if v.is_next else ''}", Link(v.number, f"/visits/{v.visit_id}"), *nothing] for v in stands if v.empty]
+    rows += [
+        [f"{v.day}{' (next visit)' if v.is_next else ''}", Link(v.number, f"/visits/{v.visit_id}"), *nothing] for v in stands if v.empty
+    ]
     visits_seen = len({s.visit_id for _, s in dated})
     n = f"{counted(len(dated), 'session')} in {counted(visits_seen, 'visit')}"
     subtitle = f"n = {n}, those of a day side by side \u00b7 press a dot for its session, or take it from the table"

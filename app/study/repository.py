@@ -48,12 +48,7 @@ def in_scope(caller: Caller) -> ColumnElement[bool]:
 
 def participant_by_code(db: Session, code: str, caller: Caller) -> Participant:
     """The participant of a code. Raises NotFound."""
-    row = db.scalar(
-        select(Participant)
-        .join(Participant.site)
-        .where(Participant.code == code, in_scope(caller))
-        .options(*_WHOLE)
-    )
+    row = db.scalar(select(Participant).join(Participant.site).where(Participant.code == code, in_scope(caller)).options(*_WHOLE))
     if row is None:
         raise NotFound(f"There is no participant '{code}', or you have no access to it.")
     return row

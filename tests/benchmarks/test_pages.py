@@ -26,4 +26,6 @@ def test_every_page_of_the_service_is_measured() -> None:
     pages = {route: re.compile(re.sub(r"\{\w+\}", "[^/]+", route)) for route in routes}
     found = {path: next((route for route, form in pages.items() if form.fullmatch(path)), None) for path in paths}
     assert set(tour.PAGES) - set(found.values()) == set()
-    assert [path for path, route in found.items() if route is None] == ["/sessions/1/signal.json"], "which draws a chart of the session's page"
+    assert [path for path, route in found.items() if route is None] == ["/sessions/1/signal.json"], (
+        "which draws a chart of the session's page"
+    )

@@ -6,6 +6,7 @@ import io
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 COLOURS = 64
@@ -73,10 +74,23 @@ PAGES = {
     "/participants/{code}/analyses/evaluations": "analyse/methods-by-seed",
 }
 """Name of the picture of each page, by its route."""
-PARTS = {"participant/session-samples": ("/sessions/{session_id}/signal", "#signal-card")}
-"""Further pictures of what stands lower on a page: a route whose session it is, and the card that is shown."""
+PARTS = {"participant/session-samples": "#signal-card"}
+"""Further pictures, of what stands lower on the page of a session with `samples`: the card that is shown."""
 OF_THE_RANKED = ("evaluate/ranking", "evaluate/policy", "evaluate/compare", "plan/plan", "plan/visit")
 """Made of a study with a judged ranking and a draft, in which there is more to see."""
+
+
+def samples() -> bytes:
+    """Three minutes of samples at 250 Hz as a table: noise that falls with the frequency, and bursts of beta that stimulation shortens."""
+    rng = np.random.default_rng(8)
+    t = (np.arange(-20 * 250, 180 * 250) + 1) / 250
+    white = np.fft.rfft(rng.standard_normal(t.size))
+    pink = np.fft.irfft(white / np.sqrt(np.maximum(np.arange(white.size), 50)), t.size)
+    bursts = np.clip(np.sin(2 * np.pi * t / 7) + 0.6 * np.sin(2 * np.pi * t / 3.1), 0, None) * np.where(t > 90, 0.4, 1.0)
+    lfp = 6 * pink / pink.std() + 7 * bursts * np.sin(2 * np.pi * 21 * t)
+    current = np.where(t > 90, 2.4, 1.2)
+    rows = "".join(f"{a:.3f},{b:.2f},{ma}\n" for a, b, ma in zip(t, lfp, current, strict=True))
+    return f"t_s,lfp [uV],amplitude_ma\n{rows}".encode()
 
 
 def take(page: Any, folder: str | Path, name: str) -> None:

@@ -72,7 +72,10 @@ def test_every_dated_visit_is_marked_also_without_a_session_and_the_next_one_tol
     assert low < min(line["x0"] for line in layout["shapes"])
     assert high > max(line["x0"] for line in layout["shapes"])
     words = [row[:2] for row in chart.rows if row[2] is None]
-    assert words[1:] == [["2026-08-03 (next visit)", Link(7, f"/visits/{planned.id}")], ["2026-09-07", Link(8, f"/visits/{planned.id + 1}")]]
+    assert words[1:] == [
+        ["2026-08-03 (next visit)", Link(7, f"/visits/{planned.id}")],
+        ["2026-09-07", Link(8, f"/visits/{planned.id + 1}")],
+    ]
     assert not any("next visit" in a["text"] for a in drawn(db, enrolled, dt.date(2026, 12, 1)).figure["layout"]["annotations"])
 
 
