@@ -47,12 +47,12 @@ def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[Sett
     layout["shapes"], layout["annotations"] = _marks(stands, versions)
     layout["xaxis"] |= _days(stands) | {"range": _range(places, stands, versions)}
     columns = ("Start", "Visit", "Session", "Controller", *(f"{name} ({unit})" for name, unit, _ in panels))
-    rows: list[list[Cell]] = [
+    rows: list[list[Cell | Link]] = [
         [f"{moment:%Y-%m-%d %H:%M}", s.visit, Link(s.session_id, f"/sessions/{s.session_id}"), CONTROLLER_NAMES[s.controller],
          *(values[i] for _, _, values in panels)]
         for i, (moment, s) in enumerate(dated)
     ]  # fmt: skip
-    nothing: list[Cell] = [None] * (2 + len(panels))
+    nothing: list[Cell | Link] = [None] * (2 + len(panels))
     rows += [
         [f"{v.day}{' (next visit)' if v.is_next else ''}", Link(v.number, f"/visits/{v.visit_id}"), *nothing] for v in stands if v.empty
     ]

@@ -30,7 +30,8 @@ CLIPPED = """() => {
     [...card.querySelectorAll("table, figure, svg.drawing, dl, pre")].flatMap((e) => told(e, card, `${e.tagName} past its card`)));
   const charts = [...document.querySelectorAll("figure[data-chart]")].flatMap((figure) => {
     if (figure.dataset.drawn === "failed") return [`${figure.id} was not drawn`];
-    return [...figure.querySelectorAll(".main-svg")].flatMap((e) => [".plot", "main"].flatMap((name) => told(e, e.closest(name), `${figure.id} past ${name}`)));
+    return [...figure.querySelectorAll(".main-svg")].flatMap((e) =>
+      [".plot", "main"].flatMap((name) => told(e, e.closest(name), `${figure.id} past ${name}`)));
   });
   return [...cards, ...charts];
 }"""

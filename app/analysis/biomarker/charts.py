@@ -54,7 +54,7 @@ def scatter(pair: Pairing, beta_unit: str) -> Chart:
         "xaxis": axis(NAMES[pair.x], unit(pair.x, beta_unit)), "yaxis": axis(NAMES[pair.y], unit(pair.y, beta_unit)), "showlegend": False,
         "dragmode": False,
     }  # fmt: skip
-    rows: list[list[Cell]] = [[Link(f"session {i}", f"/sessions/{i}"), v, x, y] for i, v, x, y in points]
+    rows: list[list[Cell | Link]] = [[Link(f"session {i}", f"/sessions/{i}"), v, x, y] for i, v, x, y in points]
     columns = ("Session", "Visit", f"{NAMES[pair.x]} ({unit(pair.x, beta_unit)})", f"{NAMES[pair.y]} ({unit(pair.y, beta_unit)})")
     subtitle = f"n = {counted(len(points), 'session')}"
     name, title = f"{pair.x}-{pair.y}".replace("_", "-"), f"{NAMES[pair.y]} against {NAMES[pair.x].lower()}"

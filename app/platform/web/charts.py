@@ -35,7 +35,7 @@ class Link:
     url: str
 
 
-Cell = str | float | int | Link | None
+Cell = str | float | int | None
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Chart:
     subtitle: str
     figure: dict[str, Any]
     columns: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
+    rows: Sequence[Sequence[Cell | Link]]
     height: int = 320
     digits: int = field(default=4)
     zoom: str = ""

@@ -58,7 +58,8 @@ def _trend_charts(history: History, number: int) -> list[Chart]:
         Chart(
             f"trend-amplitude-{number}", "Trend of the amplitude", f"mA · {span}",
             figure(
-                [_line(t, t.amplitude_ma, "mA", window_s) for t in history.trends], yaxis=axis("Amplitude", "mA", rangemode="tozero"), **layout
+                [_line(t, t.amplitude_ma, "mA", window_s) for t in history.trends],
+                yaxis=axis("Amplitude", "mA", rangemode="tozero"), **layout,
             ),
             ("Day", *(f"Mean amplitude, {t.side} (mA)" for t in history.trends)), _daily(history.trends, "amplitude_ma"), height=220,
         ),

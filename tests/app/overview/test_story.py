@@ -16,7 +16,6 @@ from app.study.models import Visit
 from app.study.repository import participant_by_code
 from tests.app.analysis.conftest import adder
 
-
 LATER = dt.date(2026, 6, 1)
 """After every visit of these tests but those that they date themselves."""
 
