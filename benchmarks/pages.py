@@ -3,6 +3,7 @@
     python benchmarks/pages.py --quick                     2 participants x 3 visits x 4 sessions x 8 policies, 5 requests of each page
     python benchmarks/pages.py                             20 participants x 12 visits x 8 sessions x 40 policies, 40 requests of each page
     python benchmarks/pages.py --only ranking,jobs         pages whose name holds one of these
+    python benchmarks/pages.py --samples                   instead, one session of 1.2 million raw samples: 80 minutes at 250 Hz
 
 The study is made once and kept in --data (var/benchmarks/pages); a worker trains on one of its participants meanwhile. Each request of a
 page is of another participant, so that the first round finds nothing in the service's memory. Times are from the request to its last byte,
@@ -32,8 +33,9 @@ import httpx2 as httpx
 import numpy as np
 import uvicorn
 from sqlalchemy import event, func, select, text
-from support.page_study import EMAIL, PASSWORD, Extent, add_account, add_participant
-from support.page_uploads import callers, complete
+from support.large_study.entries import callers, complete
+from support.large_study.raw_samples import raw_samples
+from support.large_study.rows import EMAIL, PASSWORD, Extent, add_account, add_participant
 
 from app.accounts.permissions import SYSTEM
 from app.learning.repository import candidates
@@ -305,7 +307,11 @@ def main() -> None:
     parser.add_argument("--only", default="", help="parts of names of pages, with commas")
     parser.add_argument("--requests", type=int, help="of each page")
     parser.add_argument("--idle", action="store_true", help="without a training")
+    parser.add_argument("--samples", action="store_true", help="instead of pages, stretches of a session of many raw samples")
     options = parser.parse_args()
+    if options.samples:
+        print(json.dumps(raw_samples(*((60_000, 12) if options.quick else (1_200_000, 60)))))
+        return
     names = [n for n in PAGES if not options.only or any(part in n for part in options.only.split(","))]
     extent = Extent(2, 3, 4, 8) if options.quick else Extent()
     with tempfile.TemporaryDirectory(prefix="betaloop-pages-") as scratch:

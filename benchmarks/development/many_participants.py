@@ -34,7 +34,7 @@ from app.platform.database import Base, owner_url, transaction
 from app.platform.migrate import migrate
 from app.settings import get_settings
 from app.study import repository
-from benchmarks.support.page_study import EMAIL, Extent, add_account, add_participant
+from benchmarks.support.large_study.rows import EMAIL, Extent, add_account, add_participant
 
 PAGES = {
     "today": "/",

@@ -1,17 +1,11 @@
-"""How long the service works until a session of 1.2 million raw samples is drawn, and for every stretch that a reader then zooms to.
-
-    python benchmarks/raw_signal.py                  1.2 million samples: 80 minutes at 250 Hz
-    python benchmarks/raw_signal.py --quick          60 thousand samples
+"""How long the service works until a session of many raw samples is drawn, and for every stretch that a reader then zooms to.
 
 The session is uploaded as a table. The first request of its chart decodes the file in a child, which writes extremes per bin of time (a
-min-max pyramid) and the spectrogram; every later one reads what stands in its window. Prints a JSON line: milliseconds of the first request
-by this machine's clock, of later ones by the clock (median and 95th percentile) and of the processor, and the largest answer in kB.
+min-max pyramid) and the spectrogram; every later one reads what stands in its window.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import tempfile
 import time
@@ -59,11 +53,13 @@ def measured(client: TestClient, address: str, **params: float) -> tuple[float, 
     return 1000 * (time.perf_counter() - wall), 1000 * (time.process_time() - cpu), len(answer.content)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="60 thousand samples, 12 stretches")
-    options = parser.parse_args()
-    samples, count = (60_000, 12) if options.quick else (1_200_000, 60)
+def raw_samples(samples: int, count: int) -> dict[str, Any]:
+    """Upload a session of so many samples to a service of its own, look at it once, then at `count` stretches.
+
+    Returns:
+        Milliseconds of the first request by this machine's clock, of later ones by the clock (median and 95th percentile) and of the
+        processor, and the largest answer in kB.
+    """
     with tempfile.TemporaryDirectory(prefix="betaloop-raw-") as folder:
         os.environ["BETALOOP_DATA_DIR"] = folder
         get_settings.cache_clear()
@@ -80,11 +76,11 @@ def main() -> None:
             sent = client.post("/api/v1/uploads", data=stated, files={"file": ("lfp.csv", table(samples))})
             if not sent.is_success:
                 raise SystemExit(f"the upload answered {sent.status_code}: {sent.text}")
-            print(json.dumps(figures(client, int(sent.json()["sessions"][0]["id"]), samples, count)))
+            return figures(client, int(sent.json()["sessions"][0]["id"]), samples, count)
 
 
 def figures(client: TestClient, session: int, samples: int, count: int) -> dict[str, Any]:
-    """The line that is printed."""
+    """What `raw_samples` returns."""
     address = f"/sessions/{session}/signal.json"
     first, _, largest = measured(client, address)
     later = [measured(client, address, begin_s=b, end_s=e) for b, e in windows(samples / RATE_HZ - LEAD_S, count)]
@@ -97,7 +93,3 @@ def figures(client: TestClient, session: int, samples: int, count: int) -> dict[
         "later_cpu_ms": round(float(np.median([cpu for _, cpu, _ in later])), 1),
         "largest_kb": round(max(largest, *(size for _, _, size in later)) / 1000, 1),
     }
-
-
-if __name__ == "__main__":
-    main()
