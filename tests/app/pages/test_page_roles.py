@@ -12,12 +12,12 @@ from sqlalchemy import text
 
 from app.accounts import repository, second_factor, totp
 from app.accounts.models import Role, Site, Study
-from app.accounts.permissions import PERMISSIONS, READ
+from app.accounts.permissions import PERMISSIONS
 from app.platform.database import new_session, transaction
 from app.settings import get_settings
 from tests.app.every_route import PASSWORD, World
 from tests.app.pages import page_roles as roles
-from tests.app.pages.every_page import ELSEWHERE, addresses
+from tests.app.pages.every_page import ELSEWHERE, addresses, routes
 from tests.app.pages.page_calls import NEW, browser, calls, posts
 
 SHARED = {"/", "/account", "/glossary", "/api-reference", "/styleguide", "/search", "/jobs", "/analyses", "/analyses/figure",
@@ -34,9 +34,11 @@ def _development(world: World) -> None:
 
 
 def may_open(role: Role, path: str) -> bool:
+    if path in roles.WITHOUT_SIGN_IN:
+        return True
     if role is Role.BLINDED_ASSESSOR:
-        return path in roles.BLINDED_PAGES | roles.WITHOUT_SIGN_IN
-    return roles.RESTRICTED.get(path, READ) in PERMISSIONS[role]
+        return path in roles.BLINDED_PAGES
+    return roles.PAGES[path] in PERMISSIONS[role]
 
 
 def may_send(role: Role, path: str) -> bool:
@@ -66,8 +68,10 @@ def test_every_page_and_every_form_is_in_the_table(world: World) -> None:
     assert {path for _, path in posts(world.app)} == named, "say in page_roles.py who may send it"
     assert {method for method, _ in posts(world.app)} == {"post"}
     assert set(calls(world)) == set(roles.FORMS), "say in page_calls.py what a right call sends"
-    open_ones = set(addresses(world)) | set(ELSEWHERE)
-    assert {*roles.RESTRICTED, *roles.BLINDED_PAGES, *roles.WITHOUT_SIGN_IN} <= open_ones
+    without_page = set(ELSEWHERE) - roles.WITHOUT_SIGN_IN
+    assert {*roles.PAGES, *roles.WITHOUT_SIGN_IN} == set(routes(world.app)) - without_page, "say in page_roles.py who may open it"
+    assert roles.PAGES.keys().isdisjoint(roles.WITHOUT_SIGN_IN)
+    assert roles.PAGES.keys() >= roles.BLINDED_PAGES
 
 
 @pytest.mark.parametrize("role", list(Role))
