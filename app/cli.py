@@ -30,6 +30,8 @@ from app.platform.terminal import ACTOR, AsJson, Code, say, show
 from app.platform.upkeep.commands import app as upkeep_app
 from app.settings import Settings, get_settings
 from app.simulation import commands as simulation
+from app.study.closing import commands as closing
+from app.study.participation.commands import participant_app
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -42,6 +44,8 @@ app.add_typer(accounts.user_app, name="user")
 app.add_typer(accounts.token_app, name="token")
 app.add_typer(study_app, name="study")
 studies.register(study_app, accounts.user_app)
+closing.register(study_app)
+app.add_typer(participant_app, name="participant")
 simulation.register(study_app)
 ingest.register(app)
 ranking.register(app)

@@ -71,6 +71,7 @@ API_MODULES = (
     "app.analysis.calibration.api",
     "app.overview.samples.api",
     "app.overview.signals.api",
+    "app.study.closing.api",
 )
 PAGE_MODULES = (
     "app.accounts.pages",
@@ -80,6 +81,7 @@ PAGE_MODULES = (
     "app.study.settings.pages",
     "app.study.margins.pages",
     "app.study.participation.pages",
+    "app.study.closing.pages",
     "app.study.characteristics.pages",
     "app.study.doses.pages",
     "app.study.adverse_events.pages",

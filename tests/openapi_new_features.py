@@ -5,6 +5,28 @@ from __future__ import annotations
 NEW_FEATURES: dict[str, str] = {
     **dict.fromkeys(
         (
+            "components > schemas > Member",
+            "components > schemas > MemberIn",
+            "components > schemas > MemberOut",
+            "components > schemas > Role",
+            "paths > /api/v1/studies/{study_code}/members",
+            "paths > /api/v1/studies/{study_code}/members/end",
+        ),
+        "API: roles of a study's members are listed, given and ended at `/studies/{code}/members`",
+    ),
+    **dict.fromkeys(
+        (
+            "components > schemas > StudyChange",
+            "components > schemas > EndingReason",
+            "paths > /api/v1/studies/{study_code}/end",
+            "paths > /api/v1/studies/{study_code}/reopen",
+            "paths > /api/v1/studies/{study_code}/sites/{site_code}/end",
+            "paths > /api/v1/studies/{study_code}/sites/{site_code}/reopen",
+        ),
+        "API: `POST /studies/{code}/end` and `/reopen`, and the same of `/studies/{code}/sites/{code}`",
+    ),
+    **dict.fromkeys(
+        (
             "components > schemas > AssociationOut",
             "components > schemas > AverageOut",
             "components > schemas > BiomarkerOut",

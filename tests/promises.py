@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.promised.faults import FAULTS
+from tests.promised.people import PEOPLE
 from tests.promised.promise import Promise
 from tests.promised.promise import of as _of
 from tests.promised.records import RECORDS
@@ -183,9 +184,9 @@ PROMISES = [
     ),
     *_of(
         "accounts/permissions",
-        ("a role holds in its study alone", "(study_id is None or g.study_id == study_id)", "True",
+        ("a role holds in its study alone", "return study_id in (None, self.study_id) and", "return",
          f"{ACCOUNTS}::test_a_grant_reaches_its_study_and_site_only"),
-        ("a role holds at its site alone", "(site_id is None or g.site_id is None or g.site_id == site_id)", "True",
+        ("a role holds at its site alone", "(site_id is None or self.site_id in (None, site_id))", "True",
          f"{ACCOUNTS}::test_a_grant_reaches_its_study_and_site_only"),
         ("a scope narrows", "        if left is not None and permission not in left:\n            return ()\n", "",
          f"{TOKENS}::test_a_scope_narrows_what_its_user_may_and_widens_nothing"),
@@ -209,7 +210,7 @@ PROMISES = [
          f"{STUDIES}::test_nobody_changes_the_own_role_and_no_token_gives_one"),
         ("nobody blinds who works in a study of others", "if role is Role.BLINDED_ASSESSOR and not all(", "if False and not all(",
          f"{STUDIES}::test_nobody_blinds_who_works_in_a_study_of_others"),
-        ("a study is added by who administers all", "    if not all(administers(caller, study.id) for study in accounts.studies(db)):\n",
+        ("a study is added by who administers all", "    if not all(administers(caller, study.id) for study in studies):\n",
          "    if False:\n", f"{STUDIES}::test_who_administers_one_study_makes_none_and_sees_no_other"),
     ),
     *_of(
@@ -376,4 +377,5 @@ PROMISES = [
     ),
     *FAULTS,
     *RECORDS,
+    *PEOPLE,
 ]  # fmt: skip

@@ -6,7 +6,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, LargeBinary, String, UniqueConstraint, func
+from sqlalchemy import CheckConstraint, ForeignKey, Index, LargeBinary, String, UniqueConstraint, func, text
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
@@ -35,18 +35,25 @@ class Scope(StrEnum):
 
 
 class Study(Base):
-    """A trial under one protocol."""
+    """A trial under one protocol.
+
+    Every code of a participant that is enrolled in a study with a `code_prefix` begins with it, and none of another study's does: who
+    enrols is never told of codes elsewhere. The first study has none. A study that has ended is read, and nothing in it changes.
+    """
 
     __tablename__ = "study"
+    __table_args__ = (Index("uq_study_code_prefix_lower", func.lower(text("code_prefix")), unique=True),)
 
     id: Mapped[int] = mapped_column(primary_key=True)
     code: Mapped[str] = mapped_column(String(40), unique=True)
     name: Mapped[str] = mapped_column(String(200))
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    code_prefix: Mapped[str | None] = mapped_column(String(20))
+    ended_at: Mapped[datetime | None]
 
 
 class Site(Base):
-    """A clinic that takes part in a study."""
+    """A clinic that takes part in a study. One that has ended takes neither enrolments nor uploads."""
 
     __tablename__ = "site"
     __table_args__ = (UniqueConstraint("study_id", "code"),)
@@ -55,6 +62,7 @@ class Site(Base):
     study_id: Mapped[int] = mapped_column(ForeignKey("study.id"))
     code: Mapped[str] = mapped_column(String(40))
     name: Mapped[str] = mapped_column(String(200))
+    ended_at: Mapped[datetime | None]
     study: Mapped[Study] = relationship()
 
 
@@ -88,6 +96,7 @@ class Membership(Base):
     site_id: Mapped[int | None] = mapped_column(ForeignKey("site.id"), index=True)
     role: Mapped[Role] = mapped_column(String(20))
     user: Mapped[User] = relationship(back_populates="memberships")
+    study: Mapped[Study] = relationship(lazy="joined", innerjoin=True)
 
 
 class SignIn(Base):

@@ -9,6 +9,7 @@ from app.accounts.models import Role, Scope
 from app.platform.database import now
 from app.platform.errors import Forbidden, NotFound
 
+STUDY_ENDED_HINT = "An administrator of the study can open it again."
 CONFIRMED_FOR = timedelta(minutes=5)
 """A confirmation by the sign-on that is older signs nothing."""
 
@@ -28,6 +29,9 @@ APPROVE_PLAN = "plan:approve"
 TAKE_BUNDLES = "bundles:take"  # a signed controller: each one taken is stored and recorded
 READ_AUDIT = "audit:read"
 MANAGE_ACCOUNTS = "accounts:write"
+
+AFTER_END = frozenset({READ, READ_ARMS, READ_AUDIT, MANAGE_ACCOUNTS})
+"""What is left of every role in a study that has ended: to read, and for administrators to open it again."""
 
 _BLINDED = frozenset({READ, WRITE_QOC})
 _VIEWER = frozenset({READ, READ_ARMS})
@@ -56,11 +60,20 @@ SCOPES: dict[Scope, frozenset[str] | None] = {
 
 @dataclass(frozen=True)
 class Grant:
-    """A role in a study, at one site of it or (site_id None) at all."""
+    """A role in a study, at one site of it or (site_id None) at all. `ended`: the study has."""
 
     study_id: int
     site_id: int | None
     role: Role
+    ended: bool = False
+
+    def holds(self, permission: str) -> bool:
+        """Whether the role includes a permission and the study has not ended, or it is one that outlasts studies."""
+        return permission in PERMISSIONS[self.role] and (not self.ended or permission in AFTER_END)
+
+    def covers(self, study_id: int | None, site_id: int | None) -> bool:
+        """Whether this is of a study, and of a site of it; None is every one."""
+        return study_id in (None, self.study_id) and (site_id is None or self.site_id in (None, site_id))
 
 
 @dataclass(frozen=True)
@@ -91,17 +104,14 @@ class Caller:
         """Whether some grant that covers the site holds the permission; without a study: whether any grant does."""
         if self.is_system:
             return True
-        return any(
-            (study_id is None or g.study_id == study_id) and (site_id is None or g.site_id is None or g.site_id == site_id)
-            for g in self.grants_with(permission)
-        )
+        return any(g.covers(study_id, site_id) for g in self.grants_with(permission))
 
     def grants_with(self, permission: str) -> tuple[Grant, ...]:
         """The grants that hold a permission, as far as the scope of the token leaves it. Whoever needs to know where asks this."""
         left = SCOPES[self.token_scope] if self.token_scope is not None else None
         if left is not None and permission not in left:
             return ()
-        return tuple(g for g in self.grants if permission in PERMISSIONS[g.role])
+        return tuple(g for g in self.grants if g.holds(permission))
 
     def require(self, permission: str, study_id: int | None = None, site_id: int | None = None) -> None:
         """Raises NotFound for what the caller may not see, Forbidden for what it may see but not do."""
@@ -111,6 +121,8 @@ class Caller:
             raise NotFound("There is no such record, or you have no access to it.")
         if self.token_scope not in (None, Scope.FULL):
             raise Forbidden(f"A token for '{self.token_scope}' may not do this ('{permission}').", "Make one with a wider scope.")
+        if any(g.ended and permission in PERMISSIONS[g.role] and g.covers(study_id, site_id) for g in self.grants):
+            raise Forbidden("The study has ended: it is read and exported, and nothing in it changes.", STUDY_ENDED_HINT)
         raise Forbidden(f"Your role does not include '{permission}'.", "Ask an administrator of the study for a role that does.")
 
     def require_browser(self) -> None:

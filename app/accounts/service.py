@@ -242,7 +242,11 @@ def caller_of_token(db: Session, token: str) -> Caller | None:
 
 def caller_of(user: User) -> Caller:
     """A user as an acting caller."""
-    return Caller(user.email, user.id, tuple(Grant(m.study_id, m.site_id, Role(m.role)) for m in user.memberships))
+    return Caller(user.email, user.id, tuple(_grant(m) for m in user.memberships))
+
+
+def _grant(m: Membership) -> Grant:
+    return Grant(m.study_id, m.site_id, Role(m.role), ended=m.study.ended_at is not None)
 
 
 def create_token(db: Session, email: str, name: str, scope: Scope = Scope.FULL, days: int = TOKEN_DAYS) -> str:

@@ -100,6 +100,19 @@ def _participant(before: Row, after: Row, _: Names) -> str:
     return f"changed {row['code']}"
 
 
+def _place(what: str) -> Callable[[Row, Row, Names], str]:
+    def said(before: Row, after: Row, _: Names) -> str:
+        row = after or before
+        which = f"{what} {row['code']}"
+        if not before:
+            return f"added {which}"
+        if bool(before.get("ended_at")) != bool(row.get("ended_at")):
+            return f"ended {which}" if row.get("ended_at") else f"opened {which} again"
+        return f"changed {which}"
+
+    return said
+
+
 def _visit(before: Row, after: Row, names: Names) -> str:
     row = after or before
     verb = "removed" if not after else "changed" if before else "added"
@@ -218,6 +231,8 @@ _SAID: dict[str, Callable[[Row, Row, Names], str]] = {
         f"took the bundle of {n.policy(a['policy_id'])}" if a["policy_id"] is not None else "took the bundle of a session without a policy"
     ),
     "buffer_gate_decision": _decided,
+    "study": _place("study"),
+    "site": _place("site"),
     "participant": _participant,
     "settings_version": _version("settings"),
     "margins_version": _version("margins"),

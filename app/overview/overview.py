@@ -81,7 +81,7 @@ def overview(
         paging=paging,
         phases=state.PHASES,
         refresh_s=REFRESH_S,
-        studies=[s for s in studies(db) if caller.may(can.READ, s.id)],
+        studies=[s for s in studies(db) if caller.may(can.READ, s.id) and (withdrawn == "yes" or s.ended_at is None)],
     )
     return HTMLResponse(page)
 

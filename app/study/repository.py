@@ -11,7 +11,7 @@ from sqlalchemy import ARRAY, ColumnElement, Integer, Select, any_, cast, column
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session, contains_eager, joinedload, lazyload, selectinload
 
-from app.accounts.models import Site
+from app.accounts.models import Site, Study
 from app.accounts.permissions import Caller
 from app.platform.audit import AuditEvent
 from app.platform.errors import NotFound
@@ -59,8 +59,13 @@ def sites(db: Session, caller: Caller) -> Sequence[Site]:
     return db.scalars(select(Site).where(in_scope(caller)).order_by(Site.code)).all()
 
 
+def participants_of_study(db: Session, study_id: int) -> Sequence[int]:
+    """Numbers of a study's participants."""
+    return db.scalars(select(Participant.id).join(Participant.site).where(Site.study_id == study_id).order_by(Participant.id)).all()
+
+
 def participants(db: Session, caller: Caller, limit: int, offset: int, withdrawn: bool = True) -> tuple[Sequence[Participant], int]:
-    """A page of participants by code, and how many there are; without those who have withdrawn where `withdrawn` is false."""
+    """A page of participants by code, and how many there are; who has withdrawn, and whose study has ended, only with `withdrawn`."""
     query = _participants(caller, withdrawn)
     rows = db.scalars(query.order_by(Participant.code).limit(limit).offset(offset).options(*_WHOLE)).all()
     return rows, count(db, query)
@@ -76,7 +81,9 @@ def next_visits(db: Session, caller: Caller, today: date, withdrawn: bool = True
 
 def _participants(caller: Caller, withdrawn: bool) -> Select[Participant]:
     query = select(Participant).join(Participant.site).where(in_scope(caller))
-    return query if withdrawn else query.where(Participant.status != "withdrawn")
+    if withdrawn:
+        return query
+    return query.join(Site.study).where(Participant.status != "withdrawn", Study.ended_at.is_(None))
 
 
 def visits(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[Visit], int]:

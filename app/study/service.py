@@ -10,6 +10,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
+from app.accounts.models import Site
 from app.accounts.permissions import Caller
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
@@ -219,6 +220,8 @@ def require(caller: Caller, permission: str, participant: Participant) -> None:
     Raises Conflict where it would be new work for a participant who has withdrawn.
     """
     caller.require(permission, participant.site.study_id, participant.site_id)
+    if caller.is_system and permission not in can.AFTER_END:
+        refuse_ended_study(participant.site)
     if permission in NOT_AFTER_WITHDRAWAL:
         refuse_withdrawn(participant)
 
@@ -230,6 +233,22 @@ def refuse_withdrawn(participant: Participant) -> None:
             f"Participant {participant.code} has withdrawn from the study: nothing new is recorded, computed or planned.",
             "What is there can be read and exported. A mistake is taken back on the participant's page.",
         )
+
+
+def refuse_ended(site: Site) -> None:
+    """Raises Conflict for new participants and new data of a site or a study that has ended."""
+    if site.ended_at is not None:
+        raise Conflict(
+            f"Site '{site.code}' has ended: nobody is enrolled there and nothing is uploaded.",
+            "An administrator of the study can open it again.",
+        )
+    refuse_ended_study(site)
+
+
+def refuse_ended_study(site: Site) -> None:
+    """Raises Conflict for any change in a study that has ended: to people it is refused with their roles (`Grant.holds`)."""
+    if site.study.ended_at is not None:
+        raise Conflict(f"Study '{site.study.code}' has ended: it is read and exported, and nothing in it changes.", can.STUDY_ENDED_HINT)
 
 
 def may(caller: Caller, permission: str, participant: Participant) -> bool:

@@ -98,7 +98,7 @@ class BundleManifest:
             the shares of windows for which it asks for less than B, and for less than the clinician's minimum.
         energy_of_cdbs, charge_of_cdbs: mean square and mean of the amplitude over cDBS, over the logged test windows and within limits.
         int8_bound, int8_planes, int8_bytes: of the fixed-point header; None where there is none.
-        taken_by: who took the bundle and when, so that no two that left are the same bytes; None for one made without a service.
+        taken_by: who took the bundle first, and when; None for one made without a service.
         public_key: Ed25519 key that the bundle is signed with, 64 hexadecimal digits; it names the signer and proves nothing by itself.
         slot: the session of the signed plan that the bundle is for; None for one taken without a plan, which runs on the bench alone.
         schedule: what is delivered where no network decides; None where one does.

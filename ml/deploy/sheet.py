@@ -101,7 +101,7 @@ _SIGNED_BY = """<div class="lines"><div>Clinician, date: limits checked against 
 def _blinded(m: BundleManifest, card: PlanCard) -> str:
     """The sheet of a session of a blinded plan: its letter, common limits and stop rules, and nothing that tells what runs."""
     code = escape(m.participant)
-    taken = f"Taken by {escape(re.sub(r'[.][0-9]{6} ', ' ', m.taken_by))}. " if m.taken_by else ""
+    taken = f"First taken by {escape(re.sub(r'[.][0-9]{6} ', ' ', m.taken_by))}. " if m.taken_by else ""
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Controller bundle {code}, blinded</title><style>{_STYLE}</style></head><body>
@@ -168,7 +168,7 @@ def _implausible(m: BundleManifest) -> str:
 
 
 def _made(m: BundleManifest) -> str:
-    taken = f"Taken by {escape(re.sub(r'[.][0-9]{6} ', ' ', m.taken_by))}. " if m.taken_by else ""
+    taken = f"First taken by {escape(re.sub(r'[.][0-9]{6} ', ' ', m.taken_by))}. " if m.taken_by else ""
     if m.schedule is not None:
         return f"{taken}Bundled by betaloop {escape(m.code_version)}."
     return f"{taken}Trained by betaloop {escape(m.policy_code_version)}, bundled by betaloop {escape(m.code_version)}."

@@ -115,6 +115,12 @@ class World:
             ("patch", "/studies/{study_code}"): {"json": {"name": "Main", "reason": "protocol 2"}},
             ("post", "/studies/{study_code}/sites"): {"json": {"code": "south", "name": "South"}},
             ("patch", "/studies/{study_code}/sites/{site_code}"): {"json": {"name": "Main clinic", "reason": "moved"}},
+            ("put", "/studies/{study_code}/members"): {"json": {"email": "signer@clinic.example", "role": "viewer"}},
+            ("post", "/studies/{study_code}/members/end"): {"json": {"email": "second-drafter@clinic.example"}},
+            **{
+                ("post", f"/studies/{{study_code}}{path}"): {"json": {"reason": "as agreed"}}
+                for path in ("/end", "/reopen", "/sites/{site_code}/end", "/sites/{site_code}/reopen")
+            },
             ("put", "/participants/{code}/settings"): {"code": "P3", "json": {"settings": {"gamma": 0.9}}},
             ("post", "/visits/{visit_id}/lock"): {"json": {"reason": "complete", "password": PASSWORD}},
             ("post", "/visits/{visit_id}/unlock"): {"json": {"reason": "rating misread"}},

@@ -123,8 +123,20 @@ NEEDS: dict[tuple[str, str], str] = {
     ("patch", "/api/v1/studies/{study_code}"): can.MANAGE_ACCOUNTS,
     ("post", "/api/v1/studies/{study_code}/sites"): can.MANAGE_ACCOUNTS,
     ("patch", "/api/v1/studies/{study_code}/sites/{site_code}"): can.MANAGE_ACCOUNTS,
+    ("get", "/api/v1/studies/{study_code}/members"): can.MANAGE_ACCOUNTS,
+    ("put", "/api/v1/studies/{study_code}/members"): can.MANAGE_ACCOUNTS,
+    ("post", "/api/v1/studies/{study_code}/members/end"): can.MANAGE_ACCOUNTS,
+    ("post", "/api/v1/studies/{study_code}/end"): can.MANAGE_ACCOUNTS,
+    ("post", "/api/v1/studies/{study_code}/reopen"): can.MANAGE_ACCOUNTS,
+    ("post", "/api/v1/studies/{study_code}/sites/{site_code}/end"): can.MANAGE_ACCOUNTS,
+    ("post", "/api/v1/studies/{study_code}/sites/{site_code}/reopen"): can.MANAGE_ACCOUNTS,
     **{("get", path): can.READ for path in READABLE},
 }
+BROWSER = {
+    ("put", "/api/v1/studies/{study_code}/members"),
+    ("post", "/api/v1/studies/{study_code}/members/end"),
+}
+"""Open to people who have signed in with a browser, and to no token."""
 BLINDED = {
     # what is open to a blinded assessor while no visit is locked
     ("get", "/healthz"),
@@ -152,8 +164,12 @@ BLINDED = {
 }
 
 
-def may_call(role: Role, method: str, path: str, scope: Scope = Scope.FULL) -> bool:
-    """Whether a route answers to a role, and to a token of it with a scope."""
+def may_call(role: Role, method: str, path: str, scope: Scope | None = Scope.FULL) -> bool:
+    """Whether a route answers to a role: to a token of it with a scope, or (None) to a browser that has signed in."""
+    if scope is None:
+        scope = Scope.FULL
+    elif (method, path) in BROWSER:
+        return False
     if role is Role.BLINDED_ASSESSOR:
         return (method, path) in BLINDED
     left = SCOPES[scope]

@@ -25,7 +25,12 @@ def operations(world: World) -> list[Any]:
     schema = schemathesis.openapi.from_asgi("/api/v1/openapi.json", world.app, headers=dict(world.admin.headers)).exclude(
         path_regex="events$"
     )
-    return sorted((found.ok() for found in schema.get_all_operations()), key=lambda o: o.method.lower() != "get")
+    return sorted((found.ok() for found in schema.get_all_operations()), key=order)
+
+
+def order(operation: Any) -> tuple[bool, bool]:
+    """Changes after what reads, and after them the end of studies and sites, and their opening again."""
+    return operation.method.lower() != "get", operation.path.endswith(("/end", "/reopen"))
 
 
 def conforms(world: World, operation: Any, examples: int, number: int) -> list[int]:

@@ -34,6 +34,11 @@ PAIRS: dict[tuple[str, str], dict[str, Any]] = {
     ("GET", "/participants/{code}/policies/{policy_id}/bundle"): {},
     ("POST", "/participants/{code}/policies/{policy_id}/bundle"): BUNDLE_FORM,
     ("PATCH", "/api/v1/studies/{study_code}/sites/{site_code}"): {"json": {"name": "Moved", "reason": "new house"}},
+    ("POST", "/api/v1/studies/{study_code}/sites/{site_code}/end"): {"json": {"reason": "closed"}},
+    ("POST", "/api/v1/studies/{study_code}/sites/{site_code}/reopen"): {"json": {"reason": "opened"}},
+    ("POST", "/studies/{study_code}/sites/{site_code}"): {"data": {"name": "Moved", "reason": "new house"}},
+    ("POST", "/studies/{study_code}/sites/{site_code}/end"): {"data": {"reason": "closed"}},
+    ("POST", "/studies/{study_code}/sites/{site_code}/reopen"): {"data": {"reason": "opened"}},
 }
 Ids = dict[str, Any]
 
@@ -112,6 +117,9 @@ def test_every_route_with_two_ids_refuses_another_participants(
     service_app: Any, client: TestClient, clinician: TestClient, both: tuple[Ids, Ids], db: Session
 ) -> None:
     others = {RELEASE: clinician}  # nobody releases what they brought from elsewhere themselves
+    signed_in = TestClient(service_app, base_url="http://testserver")
+    assert signed_in.post("/sign-in", data={"email": "admin@clinic.example", "password": PASSWORD}).status_code == 200
+    others |= {path: signed_in for _, path in PAIRS if path.startswith("/studies/")}  # forms that no token sends
     assert routes_with_two_ids(service_app) == set(PAIRS), "say in PAIRS how a matched pair of these is called"
     for (method, path), call in PAIRS.items():
         names = [part.split("}")[0] for part in path.split("{")[1:]]

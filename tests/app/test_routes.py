@@ -13,7 +13,8 @@ from app.accounts import service as accounts
 from app.accounts.models import Role, Scope, Site, Study
 from app.platform.database import transaction
 from tests.app.every_route import TABLE, World, routes, token_of
-from tests.app.route_roles import may_call
+from tests.app.pages.page_calls import browser
+from tests.app.route_roles import BROWSER, may_call
 
 
 def success(app: Any, method: str, path: str) -> int:
@@ -49,10 +50,18 @@ def test_a_token_for_figures_calls_no_route(world: World) -> None:
     assert {route: status for route, status in answers.items() if status != 403} == {}
 
 
-def wrong_answers(world: World, caller: TestClient, role: Role, scope: Scope) -> dict[tuple[str, str], str]:
+@pytest.mark.parametrize("role", list(Role))
+def test_what_no_token_may_is_open_to_who_has_signed_in(world: World, role: Role) -> None:
+    assert set(routes(world.app)) >= BROWSER
+    assert wrong_answers(world, browser(world.app, role), role, None, sorted(BROWSER, reverse=True)) == {}
+
+
+def wrong_answers(
+    world: World, caller: TestClient, role: Role, scope: Scope | None, only: list[tuple[str, str]] | None = None
+) -> dict[tuple[str, str], str]:
     """Routes that answer otherwise than the table says, each with its answer and the right one."""
     found = {}
-    for method, path in routes(world.app):
+    for method, path in only or routes(world.app):
         right = success(world.app, method, path) if may_call(role, method, path, scope) else 403
         status = world.call(caller, method, path)
         if status != right:

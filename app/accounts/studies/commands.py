@@ -1,4 +1,4 @@
-"""Commands of studies, sites and users: `betaloop study add`, `study site`, `user role` and `user remove-second-factor`."""
+"""Commands of studies, sites and users: `betaloop study add`, `study site`, `study rename`, `user role` and others."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM
 from app.accounts.sign_on.repository import remove_links
 from app.accounts.studies import service
-from app.accounts.studies.schemas import HINT, SiteIn, StudyIn
+from app.accounts.studies.schemas import HINT, NameChange, SiteIn, StudyChange, StudyIn
 from app.platform.database import now, transaction
 from app.platform.errors import Invalid, NotFound
-from app.platform.terminal import ACTOR, AsJson, show
+from app.platform.terminal import ACTOR, AsJson, Why, show
 
 Draft = TypeVar("Draft", bound=BaseModel)
 
@@ -25,17 +25,19 @@ def study_add(
     code: Annotated[str, typer.Argument(help="Code of the new study.")],
     name: Annotated[str, typer.Option(help="Its name.")],
     site: Annotated[str | None, typer.Option(help="Code of its first site; the study's when left out.")] = None,
+    prefix: Annotated[str | None, typer.Option(help="Of its participants' codes; code and hyphen when left out.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Add a study with its first site."""
-    draft = _checked(StudyIn, code=code, name=name, site={"code": site or code, "name": name})
+    draft = _checked(StudyIn, code=code, name=name, site={"code": site or code, "name": name}, code_prefix=prefix)
     with transaction(ACTOR) as db:
-        service.add_study(db, draft, SYSTEM)
+        begins = service.add_study(db, draft, SYSTEM).code_prefix
+    codes = f", of whose participants codes begin with {begins}" if begins else ""
     said = (
-        f"Added study {code}. Nobody works in it yet: give somebody a role with `betaloop user role EMAIL admin --study {code}`. "
+        f"Added study {code}{codes}. Nobody works in it yet: give somebody a role with `betaloop user role EMAIL admin --study {code}`. "
         "The audit trail, which covers all studies, is read by who has a role with that right in each of them."
     )
-    show({"code": code, "site": site or code}, as_json, said)
+    show({"code": code, "site": site or code, "code_prefix": begins}, as_json, said)
 
 
 def study_site(
@@ -49,6 +51,39 @@ def study_site(
     with transaction(ACTOR) as db:
         service.add_site(db, service.study_to_manage(db, code, SYSTEM), draft)
     show({"study": code, "site": site}, as_json, f"Added site {site} to study {code}.")
+
+
+def study_rename(
+    code: Annotated[str, typer.Argument(help="Code of the study.")],
+    name: Annotated[str, typer.Option(help="Its new name; the code stays.")],
+    reason: Why,
+    site: Annotated[str | None, typer.Option(help="Code of a site; the study itself when left out.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Give a study or a site another name."""
+    with transaction(ACTOR) as db:
+        study = service.study_to_manage(db, code, SYSTEM)
+        if site is None:
+            service.change_study(db, study, _checked(StudyChange, name=name, reason=reason), SYSTEM)
+        else:
+            change = _checked(NameChange, name=name, reason=reason)
+            service.rename_site(db, study, site, change.name, change.reason)
+    show(
+        {"study": code, "site": site, "name": name}, as_json, f"{f'Study {code}' if site is None else f'Site {site}'} is called {name} now."
+    )
+
+
+def study_prefix(
+    code: Annotated[str, typer.Argument(help="Code of a study that has no prefix.")],
+    prefix: Annotated[str, typer.Argument(help="What codes of its participants begin with from now on.")],
+    reason: Why,
+    as_json: AsJson = False,
+) -> None:
+    """Have codes of a study's new participants begin with a prefix, so that they are never held against those of other studies."""
+    with transaction(ACTOR) as db:
+        change = _checked(StudyChange, code_prefix=prefix, reason=reason)
+        service.change_study(db, service.study_to_manage(db, code, SYSTEM), change, SYSTEM)
+    show({"study": code, "code_prefix": prefix}, as_json, f"Codes of new participants of study {code} begin with {prefix}.")
 
 
 def user_role(
@@ -100,6 +135,8 @@ def user_remove_sign_on(email: Annotated[str, typer.Argument(help="E-mail addres
 def register(study: typer.Typer, user: typer.Typer) -> None:
     """Put the commands where people look for them."""
     study.command("add", epilog="Example: betaloop study add ADAPT --name 'Adaptive DBS' --site north")(study_add)
+    study.command("rename", epilog="Example: betaloop study rename ADAPT --name 'Adaptive DBS' --reason 'protocol 2'")(study_rename)
+    study.command("prefix", epilog="Example: betaloop study prefix ADAPT A- --reason 'codes of their own'")(study_prefix)
     study.command("site", epilog="Example: betaloop study site ADAPT south --name 'Clinic South'")(study_site)
     user.command("role", epilog="Example: betaloop user role ada@clinic.example coordinator --study ADAPT --site north")(user_role)
     example = "Example: betaloop user remove-second-factor ada@clinic.example"

@@ -18,7 +18,7 @@ from app.accounts.models import Role
 from app.accounts.permissions import Caller
 from app.accounts.service import administers, manages
 from app.accounts.studies import repository, service
-from app.accounts.studies.schemas import HINT, SiteIn, StudyIn
+from app.accounts.studies.schemas import HINT, NameChange, SiteIn, StudyChange, StudyIn
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues
@@ -37,19 +37,43 @@ def studies(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
 @router.post("/studies")
 def add_study(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Add a study with its first site."""
-    return _changed(request, db, caller, "study", lambda: service.add_study(db, StudyIn(**_code_and_name(values)), caller))
+
+    def change() -> None:
+        service.add_study(db, StudyIn(**_code_and_name(values), code_prefix=_text(values, "code_prefix")), caller)
+
+    return changed(request, db, caller, "study", change)
+
+
+@router.post("/studies/{study_code}")
+def change_study(request: Request, study_code: str, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Give a study another name, or one without a prefix of codes a prefix."""
+
+    def change() -> None:
+        wanted = StudyChange(name=_text(values, "name"), code_prefix=_text(values, "code_prefix"), reason=reason_of(values))
+        service.change_study(db, service.study_to_manage(db, study_code, caller), wanted, caller)
+
+    return changed(request, db, caller, "changed", change)
 
 
 @router.post("/studies/{study_code}/sites")
 def add_site(request: Request, study_code: str, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Add a site to a study."""
-    return _changed(
-        request,
-        db,
-        caller,
-        "site",
-        lambda: service.add_site(db, service.study_to_manage(db, study_code, caller), SiteIn(**_code_and_name(values))),
-    )
+
+    def change() -> None:
+        service.add_site(db, service.study_to_manage(db, study_code, caller), SiteIn(**_code_and_name(values)))
+
+    return changed(request, db, caller, "site", change)
+
+
+@router.post("/studies/{study_code}/sites/{site_code}")
+def rename_site(request: Request, study_code: str, site_code: str, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Give a site another name."""
+
+    def change() -> None:
+        wanted = NameChange(name=_text(values, "name") or "", reason=reason_of(values))
+        service.rename_site(db, service.study_to_manage(db, study_code, caller), site_code, wanted.name, wanted.reason)
+
+    return changed(request, db, caller, "changed", change)
 
 
 @router.post("/studies/{study_code}/members")
@@ -63,7 +87,7 @@ def grant(request: Request, study_code: str, db: Db, caller: CurrentCaller, valu
         study = service.study_to_manage(db, study_code, caller)
         service.grant(db, study, str(values.get("email", "")), Role(role), str(values.get("site", "")) or None, caller)
 
-    return _changed(request, db, caller, "member", change)
+    return changed(request, db, caller, "member", change)
 
 
 @router.post("/studies/{study_code}/members/end")
@@ -74,10 +98,11 @@ def end_membership(request: Request, study_code: str, db: Db, caller: CurrentCal
         study = service.study_to_manage(db, study_code, caller)
         service.end_membership(db, study, str(values.get("email", "")), str(values.get("site", "")) or None, caller)
 
-    return _changed(request, db, caller, "ended", change)
+    return changed(request, db, caller, "ended", change)
 
 
-def _changed(request: Request, db: Session, caller: Caller, done: str, change: Callable[[], object]) -> Response:
+def changed(request: Request, db: Session, caller: Caller, done: str, change: Callable[[], object]) -> Response:
+    """Do a change and show the page with what was done, or with what is wrong. Raises Forbidden for a token."""
     caller.require_browser()
     try:
         caller.require(can.MANAGE_ACCOUNTS)
@@ -92,6 +117,18 @@ def _changed(request: Request, db: Session, caller: Caller, done: str, change: C
         return _page(request, db, caller, error)
     db.commit()
     return RedirectResponse(f"/studies?done={done}", 303)
+
+
+def reason_of(values: FormData) -> str:
+    """Why something changes. Raises Invalid where nobody says."""
+    reason = str(values.get("reason", "")).strip()
+    if not 1 <= len(reason) <= 1000:
+        raise Invalid("There is no reason, or it has more than 1000 characters.", "Say why this changes; the audit trail keeps it.")
+    return reason
+
+
+def _text(values: FormData, name: str) -> str | None:
+    return str(values.get(name, "")).strip() or None
 
 
 def _code_and_name(values: FormData) -> dict[str, Any]:

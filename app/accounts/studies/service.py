@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from sqlalchemy.orm import Session
 
 from app.accounts import repository as accounts
 from app.accounts.models import Membership, Role, Site, Study, User
 from app.accounts.permissions import READ, Caller
 from app.accounts.service import administers
-from app.accounts.studies import repository
-from app.accounts.studies.schemas import SiteIn, StudyIn
-from app.platform.database import set_reason
+from app.accounts.studies import prefixes, repository
+from app.accounts.studies.schemas import SiteIn, StudyChange, StudyIn
+from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound
 
 
@@ -18,15 +20,18 @@ def add_study(db: Session, draft: StudyIn, caller: Caller) -> Study:
     """Add a study with its first site; who adds it administers it.
 
     Raises:
-        Forbidden: the caller does not administer every study that there is. Conflict: the code is taken.
+        Forbidden: the caller does not administer every study that there is. Conflict: the code is taken, or the prefix cannot be used.
+        Invalid: the code is too long to make a prefix of, and none is stated.
     """
-    if not all(administers(caller, study.id) for study in accounts.studies(db)):
-        raise Forbidden("A study is added by an administrator of all studies.", "Ask one.")
+    others = accounts.studies(db)
+    _require_all(others, caller)
     if repository.study_by_code(db, draft.code):
         raise Conflict(f"There is already a study '{draft.code}'.", "Choose another code.")
     study = Study(code=draft.code, name=draft.name)
     db.add(study)
     db.flush()
+    if draft.code_prefix is not None or others:
+        prefixes.claim(db, study, draft.code_prefix or prefixes.default_of(draft.code))
     first = draft.site or SiteIn(code=draft.code, name=draft.name)
     db.add(Site(study_id=study.id, code=first.code, name=first.name))
     if caller.user_id is not None:
@@ -49,10 +54,31 @@ def study_to_manage(db: Session, code: str, caller: Caller) -> Study:
     return study
 
 
-def rename_study(db: Session, study: Study, name: str, reason: str) -> None:
-    """Give a study another name; its code stays."""
+def change_study(db: Session, study: Study, change: StudyChange, caller: Caller) -> None:
+    """Give a study another name, or the prefix that it lacks; its code stays, and so do codes of participants.
+
+    Raises:
+        Invalid: neither. Conflict: a prefix that cannot be used. Forbidden: one by somebody who does not administer all studies, for what
+            stands in its way may be another study's.
+    """
+    if change.name is None and change.code_prefix is None:
+        raise Invalid("Nothing is to change.", "Give a name or a prefix.")
+    set_reason(db, change.reason)
+    if change.code_prefix is not None:
+        _require_all(accounts.studies(db), caller)
+        prefixes.claim(db, study, change.code_prefix)
+    study.name = change.name or study.name
+    db.flush()
+
+
+def set_ended(db: Session, row: Study | Site, ended: bool, reason: str) -> None:
+    """End a study or a site, or open it again. Raises Conflict where it is so already."""
+    db.refresh(row, with_for_update={"of": type(row)})
+    what = f"{'Study' if isinstance(row, Study) else 'Site'} '{row.code}'"
+    if (row.ended_at is not None) is ended:
+        raise Conflict(f"{what} {'has ended already' if ended else 'has not ended'}.", "Load the page again.")
     set_reason(db, reason)
-    study.name = name
+    row.ended_at = now() if ended else None
     db.flush()
 
 
@@ -124,6 +150,11 @@ def end_membership(db: Session, study: Study, email: str, site_code: str | None,
         raise NotFound(f"{user.email} has no role {where} of study '{study.code}'.")
     db.delete(found)
     db.flush()
+
+
+def _require_all(studies: Iterable[Study], caller: Caller) -> None:
+    if not all(administers(caller, study.id) for study in studies):
+        raise Forbidden("Studies and their prefixes are added by an administrator of all studies.", "Ask one.")
 
 
 def _user(db: Session, email: str) -> User:

@@ -166,9 +166,11 @@ def receive(
     `beta` says what the columns of a table are; the participant's unit and source are taken, and said, where it is silent.
 
     Raises:
-        TooLarge: every file exceeds the installation's limit. Invalid: no file. CutShort: a fault, after something was kept.
+        TooLarge: every file exceeds the installation's limit. Invalid: no file. Conflict: the site has ended. CutShort: a fault, after
+            something was kept.
     """
     study_service.require(caller, can.UPLOAD, participant)
+    study_service.refuse_ended(participant.site)
     if not incoming:
         raise Invalid("The upload holds no file.", "Choose at least one file.", field="file")
     beta = beta or BetaStated()

@@ -37,7 +37,8 @@ def read_bundle(
 ) -> Response:
     """The signed controller bundle as a ZIP: network, C header, reference runner, test vectors, the clinician's limits, a sheet.
 
-    Each is stored as it left, and the audit trail says who took it, for whom and within which limits.
+    It is stored when it is first taken; who takes the same again gets the same bytes, with the name of who took it first. The audit trail
+    says of each time who took it, for whom and within which limits.
     """
     participant = db.get_one(Participant, policy.participant_id)
     content = bundles.bundle(db, participant, policy, bundles.Limits(min_ma, max_ma, ramp_ma_per_s), hemisphere, caller)
@@ -57,7 +58,7 @@ def read_session_bundle(
     """The signed bundle of one session of the visit's signed plan: it runs on the day of the visit, once.
 
     Sessions of policies hold the network, random and cDBS sessions their schedule. A plan that is not signed, was changed since, or holds
-    a withdrawn policy has none.
+    a withdrawn policy has none. It is stored when it is first taken; later it is the same bytes, and the audit trail has each time.
     """
     name, content = slots.bundle(db, visit, position, caller)
     db.commit()

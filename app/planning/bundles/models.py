@@ -17,7 +17,8 @@ class BundleRelease(Base):
     """A controller bundle that left the service: who took which policy within which limits, and with whose approval. Insert only.
 
     `policy_id` is null where the session's amplitudes were laid out beforehand, `plan_item_id` where the bundle is for no planned session.
-    `approvals` holds the sign-offs that stood in the manifest; null for bundles taken before they were recorded here.
+    `approvals` holds the sign-offs that stood in the manifest; null for bundles taken before they were recorded here. `content_sha256` is
+    of what the bundle holds but who took it first and when: who takes the same gets the same bytes; null for bundles of earlier versions.
     """
 
     __tablename__ = "bundle_release"
@@ -32,6 +33,7 @@ class BundleRelease(Base):
     policy_id: Mapped[int | None] = mapped_column(ForeignKey("policy.id"), index=True)
     plan_item_id: Mapped[int | None] = mapped_column(ForeignKey("plan_item.id"), index=True)
     sha256: Mapped[str] = mapped_column(ForeignKey("stored_file.sha256"))
+    content_sha256: Mapped[str | None] = mapped_column(String(64), index=True)
     hemisphere: Mapped[Hemisphere | None] = mapped_column(String(10))
     min_ma: Mapped[float]
     max_ma: Mapped[float]

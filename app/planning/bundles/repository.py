@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sqlalchemy import or_, select
+from sqlalchemy import or_, select, text
 from sqlalchemy.orm import Session
 
 from app.learning.models import Policy
@@ -23,6 +23,17 @@ def releases(db: Session, policy_id: int) -> Sequence[BundleRelease]:
 def releases_of_slots(db: Session, item_ids: Sequence[int]) -> Sequence[BundleRelease]:
     """Bundles that left for sessions of plans, newest first."""
     return db.scalars(select(BundleRelease).where(BundleRelease.plan_item_id.in_(item_ids)).order_by(BundleRelease.id.desc())).all()
+
+
+def lock_content(db: Session, content_sha256: str) -> None:
+    """Let one transaction at a time take a content for the first time."""
+    db.execute(text("select pg_advisory_xact_lock(hashtextextended(:key, 0))"), {"key": f"bundle:{content_sha256}"})
+
+
+def kept(db: Session, participant_id: int, content_sha256: str) -> str | None:
+    """The newest file of a participant's bundle with a content, by its SHA-256; None where nobody has taken it yet."""
+    mine = (BundleRelease.participant_id == participant_id) & (BundleRelease.content_sha256 == content_sha256)
+    return db.scalar(select(BundleRelease.sha256).where(mine).order_by(BundleRelease.id.desc()).limit(1))
 
 
 def withdrawn_policies(db: Session) -> Sequence[int]:

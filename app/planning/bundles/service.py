@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -74,7 +76,7 @@ def public_key() -> str:
 
 
 def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller) -> bytes:
-    """The controller bundle of a policy, signed. It is stored, and its release is recorded.
+    """The controller bundle of a policy, signed. It is stored when it is first taken; every release is recorded.
 
     Raises:
         NotFound: the policy is another participant's.
@@ -83,7 +85,8 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
     """
     study.require(caller, can.TAKE_BUNDLES, participant)
     manifest, windows = manifest_of(db, participant, policy, limits, hemisphere, caller)
-    return store(db, participant, policy_bundle(policy, manifest, windows), manifest, caller)
+    content = content_of(manifest, windows, policy, caller.label if limits.stated else None)
+    return take(db, participant, manifest, content, lambda: policy_bundle(policy, manifest, windows), caller)
 
 
 def policy_bundle(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64]) -> bytes:
@@ -94,16 +97,49 @@ def policy_bundle(policy: Policy, manifest: BundleManifest, windows: NDArray[np.
         raise _unmade(policy, error) from error
 
 
-def store(
-    db: Session, participant: Participant, signed: bytes, manifest: BundleManifest, caller: Caller, plan_item_id: int | None = None
+def content_of(manifest: BundleManifest, windows: NDArray[np.float64] | None, policy: Policy | None, stated_by: str | None) -> str:
+    """The SHA-256 of what a bundle holds, but who takes it and when.
+
+    Args:
+        manifest: as the bundle's, before its files are filled in. windows: of the test vectors, and policy: whose network runs; None where
+            a schedule does. stated_by: who stated the limits.
+    """
+    slot = manifest.slot and replace(manifest.slot, issued_at=datetime.min.replace(tzinfo=UTC).isoformat())
+    digest = hashlib.sha256(replace(manifest, taken_by=None, limits_stated_by=stated_by, slot=slot).to_bytes())
+    if policy is not None:
+        digest.update(policy.onnx_sha256.encode())
+    if windows is not None:
+        digest.update(np.ascontiguousarray(windows).tobytes())
+    return digest.hexdigest()
+
+
+def take(
+    db: Session,
+    participant: Participant,
+    manifest: BundleManifest,
+    content_sha256: str,
+    make: Callable[[], bytes],
+    caller: Caller,
+    plan_item_id: int | None = None,
 ) -> bytes:
-    """Keep a signed bundle as it leaves, and record its release. Returns it."""
+    """The signed bundle of a content: the bytes that left when it was first taken, or those that `make` makes, which are kept.
+
+    The release is recorded either way. Bytes that were kept and have been lost or damaged are made anew; the doctor names them.
+    """
     set_reason(db, wording.release_reason(manifest))
+    repository.lock_content(db, content_sha256)
+    sha256 = repository.kept(db, participant.id, content_sha256)
+    if sha256 is not None and files.is_whole(sha256):
+        signed = files.read(sha256)
+    else:
+        signed = make()
+        sha256 = files.store(db, signed).sha256
     release = BundleRelease(
         participant_id=participant.id,
         policy_id=manifest.policy_id,
         plan_item_id=plan_item_id,
-        sha256=files.store(db, signed).sha256,
+        sha256=sha256,
+        content_sha256=content_sha256,
         hemisphere=Hemisphere(manifest.hemisphere) if manifest.hemisphere else None,
         min_ma=manifest.min_ma,
         max_ma=manifest.max_ma,

@@ -35,7 +35,7 @@ from ml.designs import Decision, DesignSettings, lay_out
 
 
 def bundle(db: Session, visit: Visit, position: int, caller: Caller, at: datetime | None = None) -> tuple[str, bytes]:
-    """The signed bundle of one session of a visit's signed plan, and its file name. It is stored, and its release is recorded.
+    """The signed bundle of one session of a visit's signed plan, and its file name. Stored when first taken; each release is recorded.
 
     Args:
         at: when it is taken; now, but in the study in silico, whose calendar lies in the past.
@@ -52,6 +52,7 @@ def bundle(db: Session, visit: Visit, position: int, caller: Caller, at: datetim
         raise NotFound(f"Plan {view.plan.id} has no session {position}.", f"Name one from 1 to {len(view.lines)}.")
     code = visit.participant.code
     slot = _slot(view, line.item, signature, at or datetime.now(UTC))
+    windows = None
     if line.policy is not None:
         limits = service.Limits(line.item.min_ma, line.item.max_ma, line.item.ramp_ma_per_s)
         side = Hemisphere(line.item.hemisphere) if line.item.hemisphere else None
@@ -59,14 +60,19 @@ def bundle(db: Session, visit: Visit, position: int, caller: Caller, at: datetim
         manifest = replace(
             manifest, slot=slot, card=_card(view, line), approvals=_approvals(view, signature), limits_stated_by=_stated_by(signature)
         )
-        content = service.policy_bundle(line.policy, manifest, windows)
     else:
         manifest = _scheduled(db, view, line, slot, signature, caller)
-        content = sign(build_scheduled_bundle(manifest), service.signing_key())
-    if view.sealed:
-        content = _blinded(view, content)
-    service.store(db, visit.participant, content, manifest, caller, line.item.id)
-    return f"{code}-visit-{visit.number}-session-{position}.zip", content
+
+    def make() -> bytes:
+        if line.policy is not None and windows is not None:
+            made = service.policy_bundle(line.policy, manifest, windows)
+        else:
+            made = sign(build_scheduled_bundle(manifest), service.signing_key())
+        return _blinded(view, made) if view.sealed else made
+
+    content = service.content_of(manifest, windows, line.policy, manifest.limits_stated_by)
+    signed = service.take(db, visit.participant, manifest, content, make, caller, line.item.id)
+    return f"{code}-visit-{visit.number}-session-{position}.zip", signed
 
 
 def _blinded(view: PlanView, content: bytes) -> bytes:

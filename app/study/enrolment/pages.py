@@ -52,7 +52,7 @@ def enrol(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -
 def _enrolment(
     request: Request, db: Session, caller: Caller, known: dict[str, str], values: dict[str, str], error: BetaloopError | None = None
 ) -> HTMLResponse:
-    sites = [s for s in repository.sites(db, caller) if caller.may(can.WRITE_STUDY, s.study_id, s.id)]
+    sites = [s for s in repository.sites(db, caller) if caller.may(can.WRITE_STUDY, s.study_id, s.id) and s.ended_at is None]
     page = render(
         request,
         "study/participant_new.html",
@@ -61,6 +61,7 @@ def _enrolment(
         stated=form.AT_ENROLMENT,
         constants=form.LATER,
         sites=[(service.in_study(s), s.name, s.study.name) for s in sites],
+        prefixes=sorted({(s.study.name, s.study.code_prefix) for s in sites if s.study.code_prefix}),
         questioned=bool(error and any("field" not in q for q in error.extra.get("questions", ()))),
         remarks=field_notes(error, known | values),
         problem=error.problem(request.url.path) if error else None,

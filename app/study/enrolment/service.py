@@ -8,6 +8,7 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.models import Site
 from app.accounts.permissions import Caller
+from app.accounts.studies import prefixes
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import repository, wording
@@ -16,7 +17,7 @@ from app.study.enrolment.schemas import ParticipantIn
 from app.study.margins.models import MarginsVersion
 from app.study.margins.schemas import MarginsFields
 from app.study.models import Participant
-from app.study.service import add_settings
+from app.study.service import add_settings, refuse_ended
 from app.study.usual.questions import require_sure
 
 RESERVED_CODES = {"new"}
@@ -26,16 +27,17 @@ def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
     """Add a participant with its first settings version and the default margins.
 
     Raises:
-        Invalid: the code is a page's address, or looks like somebody's identity and nobody said that it is a study code (the problem's
-            `questions` say what it looks like).
-        Unusual: the cDBS amplitude is outside the usual, and nobody is sure of it. Conflict: the code is taken. NotFound: no such site.
-        Forbidden: not the caller's to enrol.
+        Invalid: the code is a page's address, lacks the prefix of the study's codes or has another's, or looks like somebody's identity and
+            nobody said that it is a study code (the problem's `questions` say what it looks like).
+        Unusual: the cDBS amplitude is outside the usual, and nobody is sure of it. Conflict: the code is taken, or the site has ended.
+        NotFound: no such site. Forbidden: not the caller's to enrol.
     """
     if draft.code.lower() in RESERVED_CODES:
         raise Invalid(f"'{draft.code}' cannot be a participant's code: it is the address of a page.", "Choose another code.")
     site = _site(db, draft.site, caller)
     caller.require(can.WRITE_STUDY, site.study_id, site.id)
-    asked = codes.questions(draft.code, now().date())
+    refuse_ended(site)
+    asked = codes.questions(prefixes.require_own(db, site.study, draft.code), now().date())
     if asked and not draft.is_study_code:
         told = wording.code_questions(draft.code, asked)
         raise Invalid(told, wording.CODE_HINT, questions=[{"code": q.value, "text": wording.CODE_QUESTIONS[q]} for q in asked])
@@ -62,7 +64,7 @@ def _site(db: Session, code: str | None, caller: Caller) -> Site:
     readable = [s for s in repository.sites(db, caller) if code in (None, s.code, in_study(s))]
     if not readable:
         raise NotFound(f"There is no site '{code}', or you have no access to it.")
-    sites = [s for s in readable if caller.may(can.WRITE_STUDY, s.study_id, s.id)] or readable
+    sites = [s for s in readable if caller.may(can.WRITE_STUDY, s.study_id, s.id) and (code or not s.ended_at)] or readable
     if len(sites) == 1:
         return sites[0]
     raise Invalid("There are several sites.", f"Name one: {', '.join(map(in_study, sites))}.")

@@ -10,7 +10,7 @@ from app.platform.database import set_reason
 from app.platform.jobs import service as jobs
 from app.study.models import Participant
 from app.study.participation.schemas import StatusChange
-from app.study.service import WITHDRAWN
+from app.study.service import WITHDRAWN, require
 
 
 def change_status(db: Session, participant: Participant, change: StatusChange, caller: Caller) -> Participant:
@@ -22,7 +22,7 @@ def change_status(db: Session, participant: Participant, change: StatusChange, c
     Raises:
         NotFound, Forbidden: as `require`.
     """
-    caller.require(can.WRITE_STUDY, participant.site.study_id, participant.site_id)
+    require(caller, can.WRITE_STUDY, participant)
     if participant.status == change.status:
         return participant
     set_reason(db, change.reason)

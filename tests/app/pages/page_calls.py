@@ -53,6 +53,12 @@ def _of_people(people: dict[str, int]) -> dict[str, Call]:
     person = {"email": "new@clinic.example", "name": "New", "role": "viewer", "study": "main", "password": NEW}
     return {
         "/studies": {"data": {"code": "ADAPT", "name": "Adaptive"}},
+        "/studies/{study_code}": {"data": {"name": "Main", "reason": "protocol 2"}},
+        "/studies/{study_code}/sites/{site_code}": {"data": {"name": "Main clinic", "reason": "moved"}},
+        **{
+            f"/studies/{{study_code}}{path}": {"data": {"reason": "as agreed"}}
+            for path in ("/end", "/reopen", "/sites/{site_code}/end", "/sites/{site_code}/reopen")
+        },
         "/studies/{study_code}/sites": {"data": {"code": "south", "name": "South"}},
         "/studies/{study_code}/members": {"data": {"email": "signer@clinic.example", "role": "viewer", "site": ""}},
         "/studies/{study_code}/members/end": {"data": {"email": "second-drafter@clinic.example", "site": ""}},

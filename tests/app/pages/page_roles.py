@@ -6,7 +6,9 @@ from app.accounts import permissions as can
 
 FORMS = {
     "/studies": can.MANAGE_ACCOUNTS,
+    "/studies/{study_code}": can.MANAGE_ACCOUNTS,
     "/studies/{study_code}/sites": can.MANAGE_ACCOUNTS,
+    "/studies/{study_code}/sites/{site_code}": can.MANAGE_ACCOUNTS,
     "/studies/{study_code}/members": can.MANAGE_ACCOUNTS,
     "/studies/{study_code}/members/end": can.MANAGE_ACCOUNTS,
     "/accounts": can.MANAGE_ACCOUNTS,
@@ -56,6 +58,10 @@ FORMS = {
     "/visit-day/{visit_id}": can.WRITE_QOC,
     "/visits/{visit_id}/slots/confirm": can.WRITE_STUDY,
     "/participants/{code}/status": can.WRITE_STUDY,
+    "/studies/{study_code}/sites/{site_code}/end": can.MANAGE_ACCOUNTS,
+    "/studies/{study_code}/sites/{site_code}/reopen": can.MANAGE_ACCOUNTS,
+    "/studies/{study_code}/end": can.MANAGE_ACCOUNTS,
+    "/studies/{study_code}/reopen": can.MANAGE_ACCOUNTS,
 }
 """Forms about a study, in the order in which they are sent: what one takes away, those before it had."""
 OWN_FORMS = (

@@ -15,6 +15,8 @@ from tests.app.pages.every_page import ELSEWHERE, addresses, ended_jobs, routes
 from tests.app.words import above_fold, drawn, drawn_above_fold, methods_named, miscounted, said_by_script
 
 MOST_BYTES = 60_000
+INLINE = re.compile(r'<script(?![^>]*(?:src=|application/json))[^>]*>|\son\w+="|javascript:|(?:src|action)="(?:https?:)?//')
+"""Scripts that stand in a page itself, and what it would load from, or send to, elsewhere."""
 METHODS_EXPLAINED = {"/glossary": "says what the words of the folds mean"}
 """Pages that are about these words."""
 WITHOUT_A_READER = {"/sign-in", "/visit-day/shell"}
@@ -26,7 +28,7 @@ def test_every_address_of_a_browser_answers_and_every_page_is_small(world: World
     assert set(ELSEWHERE) <= set(routes(world.app))
     reader = TestClient(world.app, headers={"Accept": "text/html", "Accept-Encoding": "gzip"}, follow_redirects=False)
     assert reader.post("/sign-in", data={"email": "admin@clinic.example", "password": PASSWORD}).status_code == 303
-    refused, large, pages = {}, {}, 0
+    refused, large, inline, pages = {}, {}, {}, 0
     get_settings().development = True
     for route, path in addresses(world).items():
         with reader.stream("get", path) as answer:
@@ -37,11 +39,14 @@ def test_every_address_of_a_browser_answers_and_every_page_is_small(world: World
             sent = b"".join(answer.iter_raw())
         pages += 1
         assert answer.headers["content-encoding"] == "gzip", route
-        assert zlib.decompress(sent, 31).rstrip().endswith(b"</html>"), route
+        text = zlib.decompress(sent, 31).decode()
+        assert text.rstrip().endswith("</html>"), route
+        inline |= {route: found} if (found := INLINE.findall(text)) else {}
         if len(sent) > MOST_BYTES:
             large[route] = len(sent)
     assert refused == {}, "give the page a row to show in every_page.py"
     assert large == {}
+    assert inline == {}, "scripts stand in files of our own, which the policy of the page's content allows alone"
     assert pages >= 50
 
 

@@ -126,6 +126,7 @@ def test_a_server_error_has_every_header_and_logs_no_values(
     assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
     assert answer.headers["X-Request-ID"] in answer.json()["hint"]
+    assert not any(told in answer.text for told in (patient, "Traceback", "division", "cast("))
     printed = capsys.readouterr()
     assert "division by zero" in printed.err
     assert patient not in printed.out + printed.err

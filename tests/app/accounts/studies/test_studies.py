@@ -43,12 +43,11 @@ def enrol(client: TestClient, code: str, site: str) -> int:
 
 def test_a_study_and_its_sites_are_made_renamed_and_audited(client: TestClient, second: None) -> None:
     changed = client.patch("/api/v1/studies/ADAPT", json={"name": "Adaptive DBS", "reason": "protocol 2"}).json()
+    north, south = ({"code": code, "name": code.capitalize(), "ended_at": None} for code in ("north", "south"))
     assert changed == {
-        "code": "ADAPT",
-        "name": "Adaptive DBS",
-        "sites": [{"code": "north", "name": "North"}, {"code": "south", "name": "South"}],
-    }
-    assert client.patch("/api/v1/studies/ADAPT/sites/south", json={"name": "S", "reason": "x"}).json() == {"code": "south", "name": "S"}
+        "code": "ADAPT", "name": "Adaptive DBS", "code_prefix": "ADAPT-", "ended_at": None, "sites": [north, south],
+    }  # fmt: skip
+    assert client.patch("/api/v1/studies/ADAPT/sites/south", json={"name": "S", "reason": "x"}).json() == south | {"name": "S"}
     assert client.post("/api/v1/studies", json={"code": "ADAPT", "name": "x"}).status_code == 409
     assert client.post("/api/v1/studies/ADAPT/sites", json={"code": "south", "name": "x"}).status_code == 409
     assert client.post("/api/v1/studies", json={"code": "../x", "name": "x"}).status_code == 422
@@ -67,18 +66,18 @@ def test_who_administers_one_study_makes_none_and_sees_no_other(client: TestClie
 def test_a_role_holds_at_its_site_alone_and_ends_at_once(client: TestClient, client_as: Clients) -> None:
     person = client_as("viewer")
     add_second(client)
-    assert [enrol(client, code, site) for code, site in (("N1", "north"), ("S1", "south"))] == [201, 201]
+    assert [enrol(client, code, site) for code, site in (("ADAPT-N1", "north"), ("ADAPT-S1", "south"))] == [201, 201]
     admin = browser(client, "admin@clinic.example")
     given = admin.post("/studies/ADAPT/members", data={"email": "viewer@clinic.example", "role": "coordinator", "site": "north"})
     assert given.headers["location"] == "/studies?done=member"
     seen = {p["code"] for p in person.get("/api/v1/participants").json()["items"]}
-    assert seen == {"N1"}
-    assert person.get("/api/v1/participants/S1").status_code == 404
-    visits = [person.post(f"/api/v1/participants/{code}/visits", json={"number": 1}).status_code for code in ("N1", "S1")]
+    assert seen == {"ADAPT-N1"}
+    assert person.get("/api/v1/participants/ADAPT-S1").status_code == 404
+    visits = [person.post(f"/api/v1/participants/{code}/visits", json={"number": 1}).status_code for code in ("ADAPT-N1", "ADAPT-S1")]
     assert visits == [201, 404]
     ended = admin.post("/studies/ADAPT/members/end", data={"email": "viewer@clinic.example", "site": "north"})
     assert ended.status_code == 303
-    assert person.get("/api/v1/participants/N1").status_code == 404
+    assert person.get("/api/v1/participants/ADAPT-N1").status_code == 404
 
 
 @pytest.mark.parametrize(
@@ -173,7 +172,7 @@ def test_sites_of_one_code_in_two_studies_are_told_apart(client: TestClient, sec
     refused = client.post("/api/v1/participants", json={"code": "P9", "site": "north"})
     assert refused.status_code == 422
     assert "ADAPT/north, main/north" in refused.json()["hint"]
-    assert enrol(client, "P9", "ADAPT/north") == 201
+    assert enrol(client, "ADAPT-9", "ADAPT/north") == 201
     assert 'value="main/north"' in client.get("/participants/new").text
     form = {"code": "P10", "site": "main/north", "beta_unit": "uV", "beta_source": "table"}
     assert client.post("/participants", data=form, follow_redirects=False).status_code == 303

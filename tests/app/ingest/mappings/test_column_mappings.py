@@ -126,10 +126,10 @@ def _flat(traces: Any) -> list[dict[str, Any]]:
 def test_another_study_is_asked_for_itself(client: TestClient, send: Send, waiting: int) -> None:
     client.put(f"{API}/uploaded-files/{waiting}/mapping", json=STEPS)
     assert client.post(f"{API}/studies", json={"code": "other", "name": "Another study"}).status_code == 201
-    person = client.post(f"{API}/participants", json={"code": "Q1", "site": "other"})
+    person = client.post(f"{API}/participants", json={"code": "other-1", "site": "other"})
     assert person.status_code == 201, person.text
-    assert client.post(f"{API}/participants/Q1/visits", json={"number": 1, "date": "2026-03-02"}).status_code == 201
-    answer = client.post(f"{API}/uploads", data={"participant": "Q1"}, files=[("file", ("t.csv", strange(beta=9.0)))])
+    assert client.post(f"{API}/participants/other-1/visits", json={"number": 1, "date": "2026-03-02"}).status_code == 201
+    answer = client.post(f"{API}/uploads", data={"participant": "other-1"}, files=[("file", ("t.csv", strange(beta=9.0)))])
     assert answer.status_code == 422, answer.text
     assert len(answer.json()["waits_for_mapping"]) == 1
 

@@ -22,6 +22,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
+from app.platform import files as stored
 from app.platform.errors import Invalid
 from app.tablet.command import control, lines
 from app.tablet.sources import Wish
@@ -256,6 +257,7 @@ def test_the_audit_trail_gives_no_limits_of_a_sealed_plans_bundles(
     assert kept == [f"session bundle of a blinded plan: session {n} of plan {plan['id']}, P1" for n in bundles]
     old = "controller bundle of P1, policy 7: 0.5 to 3 mA"  # as earlier versions wrote it
     monkeypatch.setattr("app.planning.wording.release_reason", lambda manifest: old)
+    stored.remove(db.scalar(text("select sha256 from bundle_release order by id limit 1")))  # so that the file is stored anew
     assert client.get(f"/api/v1/visits/{studied.visit}/plan/sessions/1/bundle").status_code == 200
     sealed = trail()
     assert "took the bundle of a session of a blinded plan" in sealed

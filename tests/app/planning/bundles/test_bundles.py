@@ -191,11 +191,37 @@ def test_each_side_has_its_own_bundle_and_another_is_refused(client: TestClient,
     assert client.get(f"/api/v1/policies/{policy}/bundle").status_code == 422, "which side must be said"
 
 
-def test_the_same_bundle_taken_twice_stands_twice_in_the_audit_trail(client: TestClient, policy: int, db: Session) -> None:
-    first, second = take(client, policy).content, take(client, policy).content
-    assert verify_bundle(first).files["model.onnx"] == verify_bundle(second).files["model.onnx"]
-    assert verify_bundle(first).taken_by != verify_bundle(second).taken_by
-    assert db.query(AuditEvent).filter(AuditEvent.entity == "stored_file", AuditEvent.reason.like("controller bundle%")).count() == 2
+def stored(db: Session) -> int:
+    return db.query(AuditEvent).filter(AuditEvent.entity == "stored_file", AuditEvent.reason.like("controller bundle%")).count()
+
+
+def test_the_same_bundle_taken_twice_is_one_file_and_stands_twice_in_the_audit_trail(
+    client: TestClient, client_as: Any, policy: int, db: Session
+) -> None:
+    first, second, others = (take(who, policy).content for who in (client, client, client_as("clinician")))
+    assert first == second == others
+    assert verify_bundle(first).taken_by.startswith("admin@clinic.example, 20"), "the sheet says who took it first"
+    events = db.query(AuditEvent).filter(AuditEvent.entity == "bundle_release").order_by(AuditEvent.id).all()
+    assert [e.actor for e in events] == ["admin@clinic.example", "admin@clinic.example", "clinician@clinic.example"]
+    assert (stored(db), len({e.after["sha256"] for e in events if e.after})) == (1, 1)
+    path = files.path_of(releases(db, policy)[0].sha256)
+    path.chmod(0o600)
+    path.write_bytes(b"no bundle")
+    assert verify_bundle(take(client, policy).content).taken_by != verify_bundle(first).taken_by, "what was damaged is made anew"
+
+
+def test_what_a_bundle_holds_makes_it_another(client: TestClient, client_as: Any, policy: int, db: Session) -> None:
+    """Other limits, another stater of them, and other settings are other bundles; each is stored once."""
+    for _ in range(2):
+        for who, limits in ((client, {}), (client, {"max_ma": 3.2}), (client, {"max_ma": 3.4})):
+            assert take(who, policy, **limits).status_code == 200
+    assert stored(db) == 3
+    assert verify_bundle(take(client_as("clinician"), policy, max_ma=3.2).content).limits_stated_by.startswith("clinician@")
+    assert stored(db) == 4
+    changed = {"settings": {"cdbs_amplitude_ma": 2.9}, "reason": "follow-up"}
+    assert client.put("/api/v1/participants/P1/settings", json=changed).status_code == 200
+    assert verify_bundle(take(client, policy).content).cdbs_ma == 2.9
+    assert stored(db) == 5
 
 
 def test_who_may_only_read_takes_no_bundle_and_leaves_no_trace(client_as: Any, policy: int, db: Session) -> None:

@@ -19,6 +19,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.planning.plans.view import read_plan
 from app.planning.sheet.content import card_of
+from app.platform import files
 from app.platform.errors import Invalid
 from app.study.models import Visit
 from app.tablet.command import control, lines, verified
@@ -95,8 +96,11 @@ def test_each_session_of_a_signed_plan_has_its_bundle_within_the_signed_limits(
         assert (m.schedule is None) == (session["policy_id"] is not None)
         assert m.frozen_after == 5
         assert m.beta_max is not None
-    rows = db.execute(text("select policy_id, plan_item_id from bundle_release order by id")).all()
-    assert len(rows) == len(signed["sessions"]) - 1
+    again = taken(client, studied.visit, signed["sessions"][0]["position"]).content
+    assert again == taken(client, studied.visit, signed["sessions"][0]["position"]).content
+    rows = db.execute(text("select policy_id, plan_item_id, sha256 from bundle_release order by id")).all()
+    assert len(rows) == len(signed["sessions"]) - 1 + 2, "each time is a row"
+    assert len({row.sha256 for row in rows}) == len(signed["sessions"]) - 1, "what is taken again is the same file"
     assert all(row.plan_item_id for row in rows)
     page = client.get(f"/visits/{studied.visit}/bundles", headers={"Accept": "text/html"}).text
     assert page.count('/bundle" download') == len(signed["sessions"]) - 1
@@ -155,10 +159,13 @@ def test_the_sheet_of_a_blinded_session_tells_letters_and_stop_rules_and_not_wha
 
 @pytest.mark.hazard("H23")
 def test_the_draws_of_a_random_session_are_in_its_bundle_and_the_same_each_time(
-    client: TestClient, studied: Any, signed: dict[str, Any]
+    client: TestClient, db: Session, studied: Any, signed: dict[str, Any]
 ) -> None:
     session = next(s for s in signed["sessions"] if s["controller"] == "random")
-    first, second = (manifest_of(client, studied.visit, session["position"]).schedule for _ in range(2))
+    first = manifest_of(client, studied.visit, session["position"]).schedule
+    for sha256 in db.scalars(text("select sha256 from bundle_release")):
+        files.remove(sha256)  # so that it is made anew
+    second = manifest_of(client, studied.visit, session["position"]).schedule
     assert first is not None
     assert first == second
     assert sum(hold.steps for hold in first.holds) == 150

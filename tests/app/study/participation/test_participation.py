@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy.orm import Session
+from typer.testing import CliRunner
+
+from app import cli
+from app.platform.audit import AuditEvent
+from app.platform.errors import Invalid
 
 Upload = Callable[..., int]
 
@@ -61,3 +68,19 @@ def test_the_page_asks_for_a_reason(client: TestClient, enrolled: str) -> None:
 
 def test_who_only_reads_changes_nothing(client: TestClient, enrolled: str, client_as: Callable[[str], TestClient]) -> None:
     assert withdraw(client_as("viewer")).status_code == 403
+
+
+def test_the_command_line_does_the_same_with_a_reason(client: TestClient, upload: Upload, db: Session) -> None:
+    def run(*words: str) -> Any:
+        return CliRunner().invoke(cli.app, ["participant", "status", "P1", *words])
+
+    upload("cdbs")
+    assert run("withdrawn").exit_code == 2, "without a reason"
+    assert isinstance(run("asleep", "--reason", "x").exception, Invalid)
+    done = run("withdrawn", "--reason", "moved away", "--json")
+    assert (done.exit_code, done.output) == (0, '{"participant": "P1", "status": "withdrawn"}\n')
+    with pytest.raises(AssertionError, match="has withdrawn from the study"):
+        upload("cdbs")
+    assert run("active", "--reason", "mistaken").exit_code == 0
+    told = db.query(AuditEvent).filter(AuditEvent.entity == "participant", AuditEvent.action == "update").order_by(AuditEvent.id)
+    assert [(e.actor, e.reason) for e in told] == [("command line", "moved away"), ("command line", "mistaken")]
