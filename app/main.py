@@ -18,7 +18,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from starlette.concurrency import run_in_threadpool
 
 from app import __version__
-from app.accounts.deps import METRICS, CurrentCaller, judge, reader_of_figures, results_viewed
+from app.accounts.deps import METRICS, CurrentCaller, judge, reader_of_figures
 from app.analysis.primary.outlook import outlook
 from app.planning.slots.pages import facts as slots_of_visit
 from app.platform import logs
@@ -31,6 +31,7 @@ from app.platform.web import middleware as web
 from app.platform.web.compressed import CompressedFiles
 from app.platform.web.schemas import problems
 from app.platform.web.templates import STATIC
+from app.study.deps import ResultsViewed
 
 log = structlog.get_logger()
 
@@ -132,8 +133,9 @@ class _Static(StaticFiles):
 
 
 def _watched(module: str) -> list[Any]:
-    """What routes of a module depend on beside their own: analyses tell the audit trail who looked at results."""
-    return [Depends(results_viewed, scope="function")] if module.startswith("app.analysis.") else []
+    """What routes of a module depend on beside their own: analyses tell the audit trail who looked at results. Other routes that show some
+    name it themselves."""
+    return [ResultsViewed] if module.startswith("app.analysis.") else []
 
 
 def create_app() -> FastAPI:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Annotated
 
 from fastapi import Depends, Request
@@ -14,7 +14,6 @@ from app.accounts import service
 from app.accounts.blinded import is_open
 from app.accounts.models import Scope
 from app.accounts.permissions import Caller
-from app.platform.audit import record_view
 from app.platform.database import Db, new_session, set_actor
 from app.platform.errors import EntriesOfAnother, Forbidden, Unauthorized
 from app.platform.sources import from_this_machine
@@ -110,13 +109,3 @@ def caller_now(request: Request) -> Callable[[Session], Caller | None]:
 
 
 CallerNow = Annotated[Callable[[Session], Caller | None], Depends(caller_now)]
-
-
-def results_viewed(request: Request, db: Db, caller: CurrentCaller) -> Iterator[None]:
-    """For routes that show results by controller: the audit trail says who looked at which, at most once in a quarter of an hour.
-
-    It is written before the answer leaves, and not where there was nothing to see: addresses of nothing would fill the trail.
-    """
-    yield
-    if request.method == "GET" and not caller.is_blinded and record_view(db, request.scope["path"]):
-        db.commit()

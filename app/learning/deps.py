@@ -1,7 +1,8 @@
-"""FastAPI dependencies: the policy, snapshot or sweep that a path names, within what the caller may read."""
+"""FastAPI dependencies: the policy, snapshot or sweep that a path names, within what the caller may read; and who looked at a sweep."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated
 
 from fastapi import Depends
@@ -9,6 +10,7 @@ from fastapi import Depends
 from app.accounts.deps import CurrentCaller
 from app.learning import repository
 from app.learning.models import BufferSnapshot, Policy, Sweep
+from app.platform.audit import record_view
 from app.platform.database import Db
 from app.platform.web.schemas import RowId
 from app.study import service as study
@@ -45,3 +47,13 @@ def current_sweep(sweep_id: RowId, db: Db, caller: CurrentCaller) -> Sweep:
 
 
 CurrentSweep = Annotated[Sweep, Depends(current_sweep)]
+
+
+def sweep_viewed(sweep: CurrentSweep, db: Db) -> Iterator[None]:
+    """For routes that show what the policies of a sweep are predicted to bring: the audit trail says who looked, as `app.study.deps` does."""
+    yield
+    if record_view(db, "sweep", sweep.id):
+        db.commit()
+
+
+SweepViewed = Depends(sweep_viewed, scope="function")

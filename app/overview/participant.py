@@ -29,7 +29,7 @@ from app.platform.web.charts import Chart
 from app.platform.web.templates import render
 from app.study import repository as study
 from app.study.characteristics.service import fields_of
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, ResultsViewed
 from app.study.models import Participant, SettingsVersion, Visit
 from app.study.service import may
 from app.study.visits.service import days_of
@@ -38,7 +38,7 @@ from app.study.wording import characteristics_words
 router = APIRouter()
 
 
-@router.get("/participants/{code}")
+@router.get("/participants/{code}", dependencies=[ResultsViewed])
 def participant_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """One participant."""
     visits, _ = study.visits(db, participant.id, 1000, 0)

@@ -15,6 +15,7 @@ from app.analysis.evidence.service import of_all
 from app.analysis.pooled.service import readable
 from app.platform.database import Db
 from app.platform.web.templates import render
+from app.study.deps import ResultsViewed
 from app.study.models import Controller, Participant
 from app.study.service import withdrawn_codes
 
@@ -58,7 +59,7 @@ def overall(saved: Sequence[Saved]) -> Saved | None:
     return Saved("", sum(s.share * s.minutes for s in saved) / minutes, minutes, sum(s.sessions for s in saved))
 
 
-@router.get("/energy-saved")
+@router.get("/energy-saved", dependencies=[ResultsViewed])
 def energy_saved_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Energy saved so far; the home page takes its numbers from here once it stands."""
     participants = readable(db, caller)

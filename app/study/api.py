@@ -9,7 +9,7 @@ from app.platform.database import Db
 from app.platform.web.schemas import Page, PagingQuery, problems
 from app.study import repository, service
 from app.study.blinding import require_known
-from app.study.deps import CurrentParticipant, CurrentSession, CurrentVisit
+from app.study.deps import CurrentParticipant, CurrentSession, CurrentVisit, SessionViewed, VisitViewed
 from app.study.enrolment import service as enrolment
 from app.study.enrolment.schemas import ParticipantIn
 from app.study.outcomes import values as outcome_values
@@ -131,14 +131,14 @@ def unlock_visit(visit: CurrentVisit, why: VisitUnlockIn, db: Db, caller: Curren
     return lock_rows(db, visit)[-1]
 
 
-@router.get("/visits/{visit_id}/sessions")
+@router.get("/visits/{visit_id}/sessions", dependencies=[VisitViewed])
 def list_sessions(visit: CurrentVisit, db: Db, caller: CurrentCaller, paging: PagingQuery) -> Page[SessionOut]:
     """Confirmed sessions of a visit, in order; proposals stand under the participant's."""
     rows, total = repository.sessions_of_visit(db, visit.id, paging.limit, paging.offset)
     return Page(items=[session_out(s, caller) for s in rows], total=total, limit=paging.limit, offset=paging.offset)
 
 
-@router.get("/sessions/{session_id}")
+@router.get("/sessions/{session_id}", dependencies=[SessionViewed])
 def read_session(session: CurrentSession, caller: CurrentCaller) -> SessionOut:
     """One session."""
     return session_out(session, caller)
@@ -152,14 +152,14 @@ def change_session(session: CurrentSession, change: SessionChange, db: Db, calle
     return session_out(session, caller)
 
 
-@router.get("/sessions/{session_id}/trace")
+@router.get("/sessions/{session_id}/trace", dependencies=[SessionViewed])
 def read_trace(session: CurrentSession, db: Db, caller: CurrentCaller) -> TraceOut:
     """Beta and amplitude on the 2 s grid; rows with t_s <= 0 are the window before the session."""
     require_known(session.visit, caller)
     return trace_out(session_data(db, session))
 
 
-@router.get("/sessions/{session_id}/traces")
+@router.get("/sessions/{session_id}/traces", dependencies=[SessionViewed])
 def read_traces(session: CurrentSession, db: Db, caller: CurrentCaller) -> list[RecordedTraceOut]:
     """Every trace of every recording of the session: all channels and powers, the amplitudes of all programs and sides."""
     require_known(session.visit, caller)

@@ -1,15 +1,22 @@
-"""FastAPI dependencies: the participant, visit or session that a path names, within what the caller may read."""
+"""FastAPI dependencies: the participant, visit or session that a path names, within what the caller may read; and who looked at results.
+
+Every route that shows outcomes by controller, or opens controllers to blinded assessors once a visit is locked, depends on one of
+`ResultsViewed`, `VisitViewed` and `SessionViewed`. They write the trail before the answer leaves, and not where there was nothing to see:
+addresses of nothing would fill it. Looks at one thing within a quarter of an hour are one row; each table or figure that is taken is its own.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated
 
-from fastapi import Depends, Path
+from fastapi import Depends, Path, Request
 
 from app.accounts.deps import CurrentCaller
+from app.platform.audit import record, record_view
 from app.platform.database import Db
 from app.platform.web.schemas import RowId
-from app.study import repository
+from app.study import blinding, repository
 from app.study.models import Participant, StudySession, Visit
 
 
@@ -35,3 +42,47 @@ CurrentVisit = Annotated[Visit, Depends(current_visit)]
 
 
 CurrentSession = Annotated[StudySession, Depends(current_session)]
+
+
+FILE_FORMS = ("csv", "svg")
+"""Forms in which results are taken away as a file: the end of a path, or the member `format` of a query."""
+
+
+def results_viewed(request: Request, db: Db, caller: CurrentCaller) -> Iterator[None]:
+    """For routes of a participant, or of all, that show results by controller. Of a blinded assessor nothing is written while nothing that
+    the route tells of was unblinded for them."""
+    yield
+    if request.method != "GET" or (caller.is_blinded and not repository.tells_some_arm(db, caller, request.path_params.get("code"))):
+        return
+    path = request.scope["path"]
+    form = _file_form(request)
+    if form is not None:
+        record(db, "export", "results", path, {"format": form})
+        db.commit()
+    elif record_view(db, "results", path):
+        db.commit()
+
+
+def visit_viewed(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Iterator[None]:
+    """For routes that show what ran at a visit and what came of it. Nothing is written while that is hidden from the caller."""
+    yield
+    if request.method == "GET" and blinding.may_know(visit, caller) and record_view(db, "visit", visit.id):
+        db.commit()
+
+
+def session_viewed(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller) -> Iterator[None]:
+    """The same for routes of a session."""
+    yield
+    if request.method == "GET" and blinding.may_know(session.visit, caller) and record_view(db, "session", session.id):
+        db.commit()
+
+
+def _file_form(request: Request) -> str | None:
+    """Which of FILE_FORMS the answer has; None of a page or of JSON."""
+    stated = request.scope["path"].rpartition(".")[2], request.query_params.get("format", "")
+    return next((form for form in FILE_FORMS if form in stated), None)
+
+
+ResultsViewed = Depends(results_viewed, scope="function")
+VisitViewed = Depends(visit_viewed, scope="function")
+SessionViewed = Depends(session_viewed, scope="function")

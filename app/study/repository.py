@@ -12,7 +12,7 @@ from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session, contains_eager, joinedload, lazyload, selectinload
 
 from app.accounts.models import Site, Study
-from app.accounts.permissions import Caller
+from app.accounts.permissions import READ_ARMS, Caller
 from app.platform.audit import AuditEvent
 from app.platform.errors import NotFound
 from app.study.models import (
@@ -132,6 +132,18 @@ def hidden_visits(db: Session, participant_ids: Collection[int]) -> HiddenVisits
     locked = func.coalesce(newest.correlate(Visit).scalar_subquery(), false())
     query = select(Visit.participant_id, Visit.id, Visit.sealed, locked).where(Visit.participant_id.in_(participant_ids))
     return HiddenVisits([(row[0], row[1], row[2], row[3]) for row in db.execute(query)])
+
+
+def tells_some_arm(db: Session, caller: Caller, code: str | None) -> bool:
+    """Whether a blinded assessor is told what ran at some visit: of the participant with a code, or without one of all that they may read.
+
+    At sites where they have a role that tells them at once, every visit whose key is not sealed counts.
+    """
+    told = [(Site.study_id == g.study_id) & (Site.id == g.site_id if g.site_id else true()) for g in caller.grants_with(READ_ARMS)]
+    newest = select(VisitLock.locked).where(VisitLock.visit_id == Visit.id).order_by(VisitLock.id.desc()).limit(1)
+    locked = func.coalesce(newest.correlate(Visit).scalar_subquery(), false())
+    query = select(Visit.id).join(Visit.participant).join(Participant.site).where(in_scope(caller), ~Visit.sealed, or_(locked, *told))
+    return db.scalar((query if code is None else query.where(Participant.code == code)).limit(1)) is not None
 
 
 def lock_row(db: Session, visit: Visit) -> None:

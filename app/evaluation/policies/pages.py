@@ -22,14 +22,14 @@ from app.platform.database import Db
 from app.platform.errors import NotFound
 from app.platform.web.templates import render
 from app.study import repository as study_repository
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, ResultsViewed
 from app.study.service import may
 from ml.policies.logged_range import LARGEST_SHARE_BELOW
 
 router = APIRouter()
 
 
-@router.get("/participants/{code}/policies/{policy_id}")
+@router.get("/participants/{code}/policies/{policy_id}", dependencies=[ResultsViewed])
 def policy_page(request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """One policy: its verdict and picture, where it comes from, its learning curves, its bundle."""
     try:

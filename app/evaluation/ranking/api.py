@@ -12,7 +12,7 @@ from app.evaluation.ranking.export import csv_of
 from app.evaluation.schemas import Kind, Method, RankingFilter, RankingOut
 from app.platform.database import Db
 from app.platform.web.schemas import problems
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, ResultsViewed
 
 router = APIRouter(responses=problems(401, 403, 404, 422))
 
@@ -21,6 +21,7 @@ router = APIRouter(responses=problems(401, 403, 404, 422))
     "/participants/{code}/ranking",
     tags=["evaluation"],
     response_model=RankingOut,
+    dependencies=[ResultsViewed],
     responses={200: {"content": {"text/csv": {"schema": {"type": "string"}}}}},
 )
 def read_ranking(

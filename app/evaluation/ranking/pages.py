@@ -27,7 +27,7 @@ from app.platform.jobs import repository as jobs
 from app.platform.jobs.models import JobStatus
 from app.platform.web.forms import parse
 from app.platform.web.templates import render, render_part
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, ResultsViewed
 from app.study.models import Participant
 from app.study.service import may
 from ml.ope import registry as estimators
@@ -37,7 +37,7 @@ router = APIRouter()
 REFRESH_S = 4
 
 
-@router.get("/participants/{code}/ranking")
+@router.get("/participants/{code}/ranking", dependencies=[ResultsViewed])
 def ranking_page(
     request: Request,
     participant: CurrentParticipant,
@@ -128,7 +128,7 @@ def glossary(request: Request, caller: CurrentCaller) -> HTMLResponse:
     return HTMLResponse(render(request, "evaluation/glossary.html"))
 
 
-@router.get("/participants/{code}/ranking.csv")
+@router.get("/participants/{code}/ranking.csv", dependencies=[ResultsViewed])
 def ranking_csv(participant: CurrentParticipant, db: Db, caller: CurrentCaller, method: str | None = None) -> Response:
     """The ranking as CSV, by the method that the page ranks by."""
     return csv_of(ranking.current_ranking(db, participant, caller, method))

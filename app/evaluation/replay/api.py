@@ -12,12 +12,12 @@ from app.evaluation.replay.service import MOST, replay
 from app.learning import repository as learning
 from app.platform.database import Db
 from app.platform.web.schemas import RowId, problems
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, ResultsViewed
 
 router = APIRouter(tags=["evaluation"], responses=problems(401, 403, 404, 422))
 
 
-@router.get("/participants/{code}/replay")
+@router.get("/participants/{code}/replay", dependencies=[ResultsViewed])
 def read_replay(
     participant: CurrentParticipant,
     db: Db,

@@ -20,12 +20,12 @@ from app.platform.errors import BetaloopError
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.study import blinding
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, ResultsViewed
 
 router = APIRouter()
 
 
-@router.get("/participants/{code}/compare")
+@router.get("/participants/{code}/compare", dependencies=[ResultsViewed])
 def compare(
     request: Request,
     participant: CurrentParticipant,

@@ -25,6 +25,7 @@ from app.ingest.uploads.receiving import Receiver, StoredContent
 from app.ingest.uploads.reports import ASIDE
 from app.ingest.uploads.service import UploadOutcome
 from app.platform import files
+from app.platform.audit import record
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
 from app.platform.raw_bytes import RawFile, raw_file
@@ -44,6 +45,7 @@ def review(db: Session, file_id: int, caller: Caller) -> Iterator[bytes]:
     with ExitStack() as held:
         original = held.enter_context(_original(file))  # all of it is checked before the first byte leaves
         file.reviewed_by, file.reviewed_at = caller.label, now()
+        record(db, "export", "upload_file", file.id)
         db.commit()
         return _pieces(original, held.pop_all())
 

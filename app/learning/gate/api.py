@@ -11,12 +11,12 @@ from app.learning.serializers import gate_out
 from app.platform.database import Db
 from app.platform.web.schemas import problems
 from app.study import repository as study_repository
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, ResultsViewed
 
 router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
 
 
-@router.get("/participants/{code}/buffer-gate")
+@router.get("/participants/{code}/buffer-gate", dependencies=[ResultsViewed])
 def read_gate(participant: CurrentParticipant, db: Db) -> GateOut:
     """Whether sessions of learned policies may enter the replay buffer, with the tests behind it."""
     return gate_out(gates.gate(db, participant, study_repository.sessions_of_participant(db, participant.id)))

@@ -19,7 +19,7 @@ from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
 from app.study import repository as study_repository
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, ResultsViewed
 from app.study.models import Participant
 
 router = APIRouter()
@@ -27,7 +27,7 @@ router = APIRouter()
 LABELS = {"reason": "Reason", "choice": "Decision"}
 
 
-@router.get("/participants/{code}/buffer-gate")
+@router.get("/participants/{code}/buffer-gate", dependencies=[ResultsViewed])
 def gate_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Whether sessions of learned policies enter the replay buffer, the tests behind it, and the form to decide otherwise."""
     return _page(request, participant, db, caller)

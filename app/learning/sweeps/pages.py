@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 
 from app.learning import wording
-from app.learning.deps import CurrentSweep
+from app.learning.deps import CurrentSweep, SweepViewed
 from app.learning.schemas import ALGORITHM_NAMES
 from app.learning.sweeps import comparison, parallel
 from app.platform.database import Db
@@ -16,7 +16,7 @@ from app.study.models import Participant
 router = APIRouter()
 
 
-@router.get("/sweeps/{sweep_id}")
+@router.get("/sweeps/{sweep_id}", dependencies=[SweepViewed])
 def sweep_page(request: Request, sweep: CurrentSweep, db: Db) -> HTMLResponse:
     """One sweep: its policies on sessions they did not learn from, beside controllers without learning."""
     found = comparison.candidates(sweep)

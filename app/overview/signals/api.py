@@ -12,14 +12,14 @@ from app.overview.signals.serializers import signal_out
 from app.overview.signals.service import signals_of
 from app.platform.database import Db
 from app.platform.web.schemas import problems
-from app.study.deps import CurrentSession
+from app.study.deps import CurrentSession, SessionViewed
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 409, 422))
 
 Points = Annotated[int, Query(ge=50, le=4000, description="Bins wanted; there are at most four times as many.")]
 
 
-@router.get("/sessions/{session_id}/signal")
+@router.get("/sessions/{session_id}/signal", dependencies=[SessionViewed])
 def read_signal(
     session: CurrentSession,
     db: Db,

@@ -15,7 +15,7 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError
 from app.platform.web.charts import written
 from app.platform.web.templates import render
-from app.study.deps import CurrentSession
+from app.study.deps import CurrentSession, SessionViewed
 
 router = APIRouter()
 
@@ -23,7 +23,7 @@ POINTS = 1200
 """Bins of a chart: about one for each pixel of its width."""
 
 
-@router.get("/sessions/{session_id}/signal.json")
+@router.get("/sessions/{session_id}/signal.json", dependencies=[SessionViewed])
 def signal_figure(
     session: CurrentSession,
     db: Db,
@@ -46,7 +46,7 @@ def signal_figure(
     return JSONResponse(content)
 
 
-@router.get("/sessions/{session_id}/signal")
+@router.get("/sessions/{session_id}/signal", dependencies=[SessionViewed])
 def signal_page(
     request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, channel: str = "0", begin_s: str = "", end_s: str = ""
 ) -> HTMLResponse:

@@ -66,7 +66,7 @@ class _Scope:
         code = func.substring(AuditEvent.entity_id, "/participants/([^/?]+)")
         participant = Base.metadata.tables["participant"]
         by_code = code.in_(select(participant.c.code).where(participant.c.site_id.in_(self._sites)))
-        named = {name: self._inside(name, number) for name in ("participant", "session", "plan", "visit", "policy")}
+        named = {name: self._inside(name, number) for name in ("participant", "session", "plan", "visit", "policy", "sweep", "upload_file")}
         return case(named | {"results": by_code}, value=AuditEvent.entity, else_=false())
 
     def _inside(self, name: str, number: ColumnElement[int], removed: bool = True) -> ColumnElement[bool]:

@@ -28,7 +28,7 @@ from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.settings import get_settings
-from app.study.deps import CurrentParticipant, CurrentVisit
+from app.study.deps import CurrentParticipant, CurrentVisit, ResultsViewed
 from app.study.models import Hemisphere, Participant
 from app.study.service import may
 from ml.deploy.wording import battery_life_words, energy_words, warning_sentences
@@ -49,7 +49,7 @@ class StatedLimits(BaseModel):
     hemisphere: Hemisphere | None = None
 
 
-@router.get("/participants/{code}/policies/{policy_id}/bundle")
+@router.get("/participants/{code}/policies/{policy_id}/bundle", dependencies=[ResultsViewed])
 def bundle_page(request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """What the bundle would hold under the default limits."""
     return _page(request, participant, policy, db, caller)

@@ -34,14 +34,14 @@ from app.platform.audit import record
 from app.platform.database import Db, now
 from app.platform.signatures.schemas import SignatureOut
 from app.platform.web.schemas import problems
-from app.study.deps import CurrentVisit
+from app.study.deps import CurrentVisit, VisitViewed
 
 router = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 422))
 
 _PDF: dict[int | str, dict[str, Any]] = {200: {"content": {"application/pdf": {}}, "description": "The sheet."}}
 
 
-@router.get("/visits/{visit_id}/plan")
+@router.get("/visits/{visit_id}/plan", dependencies=[VisitViewed])
 def read_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> PlanOut:
     """The plan of a visit."""
     return plan_out(plan_of(db, visit, caller))

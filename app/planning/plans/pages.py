@@ -27,7 +27,7 @@ from app.platform.errors import BetaloopError, NotFound
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.schemas import Int, Model, PagingQuery
 from app.platform.web.templates import render
-from app.study.deps import CurrentParticipant, CurrentVisit
+from app.study.deps import CurrentParticipant, CurrentVisit, VisitViewed
 from app.study.models import Controller, Participant, Visit
 from app.study.service import may, require
 
@@ -42,7 +42,7 @@ class VisitChoice(Model):
     visit_date: dt.date | None = None
 
 
-@router.get("/visits/{visit_id}/plan")
+@router.get("/visits/{visit_id}/plan", dependencies=[VisitViewed])
 def plan(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, replace: str = "") -> HTMLResponse:
     """The visit day to scale, its sessions, approval, and the form for a new draft; of a signed plan where it shall be replaced."""
     return HTMLResponse(_page(request, db, visit, caller, replacing=replace == "yes"))

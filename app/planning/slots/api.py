@@ -10,12 +10,12 @@ from app.planning.slots.schemas import SlotConfirmation, SlotsConfirmed, VisitCo
 from app.planning.slots.serializers import comparison_out
 from app.platform.database import Db
 from app.platform.web.schemas import problems
-from app.study.deps import CurrentVisit
+from app.study.deps import CurrentVisit, VisitViewed
 
 router = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 409, 422))
 
 
-@router.get("/visits/{visit_id}/slots")
+@router.get("/visits/{visit_id}/slots", dependencies=[VisitViewed])
 def read_slots(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> VisitComparisonOut:
     """The slots of the visit's signed plan with the sessions that fill them, planned against done against predicted."""
     return comparison_out(service.compare(db, visit, caller))

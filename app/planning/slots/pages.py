@@ -21,14 +21,14 @@ from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues
 from app.platform.web.templates import render
 from app.settings import get_settings
-from app.study.deps import CurrentVisit
+from app.study.deps import CurrentVisit, VisitViewed
 from app.study.models import Visit
 from app.study.service import may
 
 router = APIRouter()
 
 
-@router.get("/visits/{visit_id}/slots")
+@router.get("/visits/{visit_id}/slots", dependencies=[VisitViewed])
 def slots(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Each slot of the plan with its session, and what is missing."""
     return HTMLResponse(_page(request, db, visit, caller))

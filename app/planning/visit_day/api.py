@@ -10,7 +10,7 @@ from app.planning.visit_day.schemas import DayOut, EntriesIn, EntriesOut, EntryO
 from app.planning.visit_day.serializers import day_out
 from app.platform.database import Db, now
 from app.platform.web.schemas import Page, PagingQuery, problems
-from app.study.deps import CurrentVisit
+from app.study.deps import CurrentVisit, VisitViewed
 
 router = APIRouter(tags=["clinic day"], responses=problems(401, 403, 404, 422))
 
@@ -21,7 +21,7 @@ def read_day(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> DayOut:
     return day_out(service.read_day(db, visit, caller), caller)
 
 
-@router.get("/visits/{visit_id}/day/entries")
+@router.get("/visits/{visit_id}/day/entries", dependencies=[VisitViewed])
 def list_entries(visit: CurrentVisit, db: Db, caller: CurrentCaller, paging: PagingQuery) -> Page[EntryOut]:
     """Everything that was entered on the clinic day of a visit, also under a plan that was replaced since, as it arrived."""
     rows, total = repository.entries_of_visit(db, visit.id, paging.limit, paging.offset)

@@ -41,7 +41,7 @@ from app.platform.errors import BetaloopError, Invalid, NotFound
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.schemas import Model
 from app.platform.web.templates import STATIC, render
-from app.study.deps import CurrentVisit
+from app.study.deps import CurrentVisit, VisitViewed
 from app.study.models import Visit
 from app.study.wording import DRUG_NAMES, EVENT_KINDS
 
@@ -104,7 +104,7 @@ def key(caller: CurrentCaller) -> JSONResponse:
     return JSONResponse({"owner": found.owner, "name": caller.label, "key": found.key, "until": found.until.isoformat()})
 
 
-@router.get("/visit-day/{visit_id}")
+@router.get("/visit-day/{visit_id}", dependencies=[VisitViewed])
 def visit_day(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """The clinic day of a visit."""
     return HTMLResponse(_page(request, db, visit, caller))

@@ -119,11 +119,12 @@ def record_once(db: Session, action: str, entity: str, entity_id: str, details: 
     return True
 
 
-def record_view(db: Session, what: str) -> bool:
-    """Record that the acting user looked at `what`, once in VIEW_EVERY; whether a row was written. The caller commits."""
-    user_id = db.info.get("actor", {}).get("user_id")
-    same = (AuditEvent.entity == "results") & (AuditEvent.entity_id == what) & (AuditEvent.user_id == user_id)
-    if db.scalar(select(AuditEvent.id).where(same, AuditEvent.at > now() - VIEW_EVERY).limit(1)) is not None:
+def record_view(db: Session, entity: str, entity_id: str | int) -> bool:
+    """Record that the acting user looked at something, once in VIEW_EVERY; whether a row was written. The caller commits."""
+    what, user_id = str(entity_id), db.info.get("actor", {}).get("user_id")
+    same = (AuditEvent.entity == entity) & (AuditEvent.entity_id == what) & (AuditEvent.user_id == user_id)
+    mine = select(AuditEvent.id).where(same, AuditEvent.action == "view", AuditEvent.at > now() - VIEW_EVERY)
+    if db.scalar(mine.limit(1)) is not None:
         return False
-    record(db, "view", "results", what)
+    record(db, "view", entity, what)
     return True

@@ -21,7 +21,7 @@ from app.study import repository, service
 from app.study.adverse_events.repository import events_of_session
 from app.study.blinding import CONTROLLER_NAMES, arm, may_know, require_known
 from app.study.data_queries.repository import not_closed_of_session
-from app.study.deps import CurrentSession
+from app.study.deps import CurrentSession, SessionViewed
 from app.study.doses.since import since_last_dose
 from app.study.form_changes import Shown, own_changes
 from app.study.models import QocRevision, Recording, StudySession
@@ -105,7 +105,7 @@ def summarise(data: SessionData) -> Summary:
     )
 
 
-@router.get("/sessions/{session_id}")
+@router.get("/sessions/{session_id}", dependencies=[SessionViewed])
 def session_page(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller) -> Response:
     """One session; a proposal is looked at where it is confirmed."""
     if session.status == "proposed":

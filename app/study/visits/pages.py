@@ -19,7 +19,7 @@ from app.platform.web.templates import render
 from app.settings import get_settings
 from app.study import cdbs_amplitude, repository, service
 from app.study.blinding import arm, may_know, visible_arm
-from app.study.deps import CurrentParticipant, CurrentVisit
+from app.study.deps import CurrentParticipant, CurrentVisit, ResultsViewed, VisitViewed
 from app.study.doses.serializers import dose_out
 from app.study.doses.since import since_last_dose
 from app.study.form_changes import Shown, own_changes, reason_of
@@ -44,7 +44,7 @@ _VISIT_LABELS = {"number": "Number", "date": "Date", "note": "Note", "amplitude_
 _FIRST_PROGRAM = ("cdbs_left", "cdbs_right")
 
 
-@router.get("/participants/{code}/visits")
+@router.get("/participants/{code}/visits", dependencies=[ResultsViewed])
 def visits(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """All visits of a participant with their sessions."""
     rows, _ = repository.visits(db, participant.id, 1000, 0)
@@ -80,7 +80,7 @@ def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller:
     return RedirectResponse(f"/visits/{visit.id}?done=added", 303)
 
 
-@router.get("/visits/{visit_id}")
+@router.get("/visits/{visit_id}", dependencies=[VisitViewed])
 def visit_page(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """One visit day: its sessions in order; to a blinded assessor without what gives the controllers away."""
     if not may_know(visit, caller) and not (visit.sealed and may(caller, can.READ_ARMS, visit.participant)):
