@@ -19,6 +19,7 @@ from app.accounts.studies import commands as studies
 from app.evaluation.ranking import commands as ranking
 from app.ingest import commands as ingest
 from app.overview.package import commands as package
+from app.overview.trail import commands as trail
 from app.pipeline.next_generation import commands as next_generation
 from app.platform import logs
 from app.platform.audit.commands import app as audit_app
@@ -51,6 +52,7 @@ ingest.register(app)
 ranking.register(app)
 next_generation.register(app)
 package.register(app)
+trail.register(audit_app)
 app.add_typer(audit_app, name="audit")
 app.add_typer(upkeep_app)
 

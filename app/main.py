@@ -114,6 +114,7 @@ PAGE_MODULES = (
     "app.analysis.biomarker.pages",
     "app.analysis.calibration.pages",
     "app.overview.overview",
+    "app.overview.trail.pages",
     "app.overview.participant",
     "app.overview.search",
     "app.overview.reference",

@@ -58,7 +58,7 @@ PROMISES = [
     ),
     *_of(
         "platform/audit/trail",
-        ("looks at results are in the trail", '    record(db, "view", "results", what)\n', "",
+        ("looks at results are in the trail", '    record(db, "view", entity, what)\n', "",
          f"{CHAIN}::test_what_leaves_and_who_looked_is_in_the_trail"),
     ),
     *_of(
@@ -67,7 +67,7 @@ PROMISES = [
          f"{CHAIN}::test_what_leaves_and_who_looked_is_in_the_trail"),
     ),
     *_of(
-        "overview/trail/repository",
+        "overview/trail/scope",
         ("nobody reads the trail of another study", "select(Site.id).where(or_(false(), *allowed))", "select(Site.id)",
          f"{SCOPE}::test_every_row_of_ones_own_study_is_shown_and_none_of_another"),
     ),
@@ -237,7 +237,7 @@ PROMISES = [
          f"{KEY}::test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened"),
     ),
     *_of(
-        "overview/overview",
+        "overview/trail/acts",
         ("the trail tells no arm of a sealed plan", "    if sealed:\n        hidden", "    if False:\n        hidden",
          f"{KEY}::test_the_audit_trail_tells_no_arm_of_a_sealed_plan"),
     ),

@@ -50,7 +50,7 @@ CurrentSweep = Annotated[Sweep, Depends(current_sweep)]
 
 
 def sweep_viewed(sweep: CurrentSweep, db: Db) -> Iterator[None]:
-    """For routes that show what the policies of a sweep are predicted to bring: the audit trail says who looked, as `app.study.deps` does."""
+    """For routes that show what policies of a sweep are predicted to bring: the trail says who looked, as `app.study.deps` does."""
     yield
     if record_view(db, "sweep", sweep.id):
         db.commit()

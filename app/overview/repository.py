@@ -6,90 +6,17 @@ import datetime as dt
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, Select, false, func, select
+from sqlalchemy import Row, false, func, select
 from sqlalchemy.orm import Session, joinedload
 
 from app.accounts.permissions import Caller
 from app.evaluation.models import EstimateRow, Evaluation
 from app.evaluation.schemas import RANKING_KINDS
 from app.learning.models import BufferSnapshot, Policy
-from app.overview.audit_words import Names
-from app.planning.bundles.models import BundleRelease
-from app.planning.plans.models import SEALED, Plan, PlanItem
-from app.platform.audit import AuditEvent
+from app.planning.plans.models import Plan
 from app.platform.jobs.models import Job, JobStatus
 from app.study.models import Participant, QocRevision, StudySession, Visit
 from app.study.repository import in_scope
-
-
-def audit_events(
-    db: Session, within: ColumnElement[bool], entity: str, entity_id: str, actor: str, limit: int, offset: int
-) -> tuple[Sequence[AuditEvent], int]:
-    """A page of the audit trail, newest first, and how many rows match; empty filters match all. `within`: rows that may be read."""
-    query: Select[AuditEvent] = select(AuditEvent).where(within)
-    for column, wanted in ((AuditEvent.entity, entity), (AuditEvent.entity_id, entity_id), (AuditEvent.actor, actor)):
-        if wanted:
-            query = query.where(column == wanted)
-    total = db.scalar(select(func.count()).select_from(query.subquery())) or 0
-    return db.scalars(query.order_by(AuditEvent.id.desc()).limit(limit).offset(offset)).all(), total
-
-
-def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
-    """Names of the rows that these events are about, in a query per kind of row."""
-    rows = [(e.entity, row) for e in events for row in (e.before, e.after) if row]
-
-    def numbers(entity: str, column: str) -> set[int]:
-        own = {int(r["id"]) for name, r in rows if name == entity and "id" in r}
-        return own | {int(r[column]) for _, r in rows if r.get(column) is not None}
-
-    sessions = {
-        i: (ordinal, visit)
-        for i, ordinal, visit in db.execute(
-            select(StudySession.id, StudySession.ordinal, StudySession.visit_id).where(
-                StudySession.id.in_(numbers("session", "session_id"))
-            )
-        )
-    }
-    plans = dict(db.execute(select(Plan.id, Plan.visit_id).where(Plan.id.in_(numbers("plan", "plan_id")))).all())
-    wanted = numbers("visit", "visit_id") | {visit for _, visit in sessions.values()} | set(plans.values())
-    visits = {i: (n, p) for i, n, p in db.execute(select(Visit.id, Visit.number, Visit.participant_id).where(Visit.id.in_(wanted)))}
-    policies = {
-        i: (name, p)
-        for i, name, p in db.execute(
-            select(Policy.id, Policy.name, Policy.participant_id).where(Policy.id.in_(numbers("policy", "policy_id")))
-        )
-    }
-    whose = numbers("participant", "participant_id") | {p for _, p in (*visits.values(), *policies.values())}
-    codes = dict(db.execute(select(Participant.id, Participant.code).where(Participant.id.in_(whose))).all())
-    return Names(codes, visits, sessions, plans, policies)
-
-
-def sealed_events(db: Session, events: Sequence[AuditEvent]) -> frozenset[int]:
-    """Those of the events that changed a blinded plan whose key is sealed, a row of it, a file of its bundles, or sessions of its visit."""
-    plans = set(db.scalars(select(Plan.id).where(SEALED)))
-    if not plans:
-        return frozenset()
-    items = set(db.scalars(select(PlanItem.id).where(PlanItem.plan_id.in_(plans))))
-    visits = set(db.scalars(select(Visit.id).where(Visit.sealed)))
-    named = {row["session_id"] for e in events for row in (e.before, e.after) if row and row.get("session_id") is not None}
-    open_to_all = StudySession.id.in_(named) & StudySession.visit_id.not_in(visits)
-    sessions = named - set(db.scalars(select(StudySession.id).where(open_to_all)))  # a proposal that is gone may have been of any visit
-    within = {
-        "session": ("visit_id", visits),
-        "plan_item": ("plan_id", plans),
-        "session_proposal": ("session_id", sessions),
-        "session_conditions": ("session_id", sessions),
-        "bundle_release": ("plan_item_id", items),
-        "stored_file": ("sha256", set(db.scalars(select(BundleRelease.sha256).where(BundleRelease.plan_item_id.in_(items))))),
-        "plan": ("id", plans),
-        "adverse_event": ("visit_id", visits),
-    }
-
-    def tells(event: AuditEvent) -> bool:
-        column, sealed = within.get(event.entity, ("", set()))
-        return any((row or {}).get(column) in sealed for row in (event.before, event.after))
-
-    return frozenset(e.id for e in events if tells(e))
 
 
 def visit_days(db: Session, ids: Sequence[int], today: dt.date) -> Iterable[Row[int, int, dt.date | None, dt.date | None]]:

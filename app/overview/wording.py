@@ -34,9 +34,6 @@ _TASKS: dict[Task, str | Callable[[int], str]] = {
 }
 
 
-SEALED_ACT = "took the bundle of a session of a blinded plan"
-
-
 def what(step: NextStep) -> str:
     """What is to be done."""
     said = _TASKS[step.task]

@@ -1,8 +1,9 @@
 """FastAPI dependencies: the participant, visit or session that a path names, within what the caller may read; and who looked at results.
 
 Every route that shows outcomes by controller, or opens controllers to blinded assessors once a visit is locked, depends on one of
-`ResultsViewed`, `VisitViewed` and `SessionViewed`. They write the trail before the answer leaves, and not where there was nothing to see:
-addresses of nothing would fill it. Looks at one thing within a quarter of an hour are one row; each table or figure that is taken is its own.
+`ResultsViewed`, `VisitViewed` and `SessionViewed`. They write the trail before the answer leaves, and not where there was nothing to
+see: addresses of nothing would fill it. Looks at one thing within a quarter of an hour are one row; each table or figure that is taken is
+its own.
 """
 
 from __future__ import annotations

@@ -7,7 +7,6 @@ from typing import Any
 
 from app.study.adverse_events.models import EventKind, Severity
 from app.study.characteristics.schemas import CharacteristicsFields, Symptom, Target
-from app.study.data_queries.models import QueriedField
 from app.study.doses.drugs import DRUGS, Drug
 from app.study.doses.models import Dose
 from app.study.enrolment.codes import CodeQuestion
@@ -15,6 +14,7 @@ from app.study.models import Controller
 from app.study.sessions.contradictions import Contradiction, Kind
 from app.study.sessions.designs import Drawn
 from app.study.sessions.models import Activity
+from app.study.settings.form import LABELS as SETTING_LABELS
 from app.study.usual.values import Question, Why
 
 EVENT_KINDS = {
@@ -82,17 +82,36 @@ CODE_HINT = "Choose a code that tells nothing about the person, or confirm that 
 CODE_CONFIRMED = "looked at by a person: a study code"
 
 QUERIED_FIELDS = {
-    QueriedField.GRASP_HZ: "Grasp frequency",
-    QueriedField.RATING: "Rating",
-    QueriedField.TREMOR_PERCENT: "Tremor",
-    QueriedField.CONTROLLER: "Controller",
-    QueriedField.STARTED_AT: "Start",
-    QueriedField.HEMISPHERE: "Hemisphere",
-    QueriedField.MEDICATION_H: "Time since the last dose",
-    QueriedField.STOPPED_REASON: "Early stop",
-    QueriedField.FILE: "Uploaded file",
-    QueriedField.OTHER: "Something else",
+    "grasp_hz": "Grasp frequency",
+    "rating": "Rating",
+    "tremor_percent": "Tremor",
+    "controller": "Controller",
+    "started_at": "Start",
+    "hemisphere": "Hemisphere",
+    "medication_h": "Time since the last dose",
+    "stopped_reason": "Early stop",
+    "file": "Uploaded file",
+    "date": "Date",
+    "cdbs_left": "cDBS amplitude, left",
+    "cdbs_right": "cDBS amplitude, right",
+    "note": "Note",
+    "drug": "Drug",
+    "mg": "Dose",
+    "taken_at": "Time it was taken",
+    "kind": "What happened",
+    "severity": "Severity",
+    "serious": "Whether it is serious",
+    "occurred_at": "When it happened",
+    "leads": "Leads",
+    "symptoms": "Symptoms",
+    "hand": "Hand of the grasp test",
+    "medication": "Medication of a visit day",
+    **SETTING_LABELS,
+    "other": "Something else",
 }
+"""Values that a data query may be about, by the name of their field."""
+ASKED_ABOUT = {name: said[:1].lower() + said[1:] if said[:2] not in ("cD", "r_") else said for name, said in QUERIED_FIELDS.items()}
+"""The same within a sentence."""
 
 _SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be without DBS"}
 

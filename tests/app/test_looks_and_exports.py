@@ -24,7 +24,8 @@ from tests.conftest import PASSWORD as PASSWORD_OF_TESTS
 ROOT = Path(__file__).resolve().parents[2]
 SHOWS_NO_RESULTS = {
     # accounts, studies, and what is about no participant
-    "/sign-in", "/account", "/accounts", "/studies", "/glossary", "/api-reference", "/styleguide", "/audit", "/search", "/healthz", "/readyz",
+    "/sign-in", "/account", "/accounts", "/studies", "/glossary", "/api-reference", "/styleguide", "/audit", "/search",
+    "/healthz", "/readyz",
     "/api/v1/studies", "/studies/{study_code}/column-mappings", "/api/v1/studies/{study_code}/column-mappings",
     "/api/v1/bundle-key", "/api/v1/bundle-withdrawals",
     # who takes part, and what is agreed: the home page has its energy from /energy-saved
@@ -53,7 +54,7 @@ SHOWS_NO_RESULTS = {
     "/participants/{code}/plans", "/visits/{visit_id}/bundles", "/api/v1/visits/{visit_id}/day",
     "/visit-day/shell", "/visit-day/worker.js", "/visit-day/key",
 }  # fmt: skip
-"""Whatever a browser or a program may read beside these shows outcomes by controller, or hands out a file, and leaves a row of the trail."""
+"""Whatever else a browser or a program may read shows outcomes by controller, or hands out a file, and leaves a row of the trail."""
 NO_FILES = ("text/html", "application/json", "text/plain", "text/javascript", "text/event-stream")
 
 
@@ -125,7 +126,9 @@ def test_who_looked_at_results_and_who_took_a_file_is_in_the_trail(world: World,
     get_settings().development = True
     refused, untold, told, unmarked, read, files = {}, set(), set(), set(), set(), set()
     for route, path, query in every_read(world):
-        found = ask(world.admin, "get", path, params=query) if route.startswith(("/api/", "/healthz", "/readyz")) else ask(browser, "get", path)
+        found = (
+            ask(world.admin, "get", path, params=query) if route.startswith(("/api/", "/healthz", "/readyz")) else ask(browser, "get", path)
+        )
         if found.status not in (200, 303):
             refused[path, str(query)] = found.status
         read.add(route)
@@ -142,7 +145,8 @@ def test_who_looked_at_results_and_who_took_a_file_is_in_the_trail(world: World,
     assert set(read) >= SHOWS_NO_RESULTS, "no such route"
     assert unmarked == set(), "a file left and the trail does not say so"
     ways = {route.rpartition(".")[2] if "." in route else form for route, form in files}
-    assert ways >= {"csv", "svg", "pdf", "zip"} and len(files) >= 18
+    assert ways >= {"csv", "svg", "pdf", "zip"}
+    assert len(files) >= 18
     assert ("/api/v1/sessions/{session_id}/samples", None) in files
 
 
@@ -167,7 +171,8 @@ def test_no_other_module_hands_out_a_file() -> None:
         if any(isinstance(node, ast.Constant) and node.value == "Content-Disposition" for node in ast.walk(tree)):
             naming.add(str(path.relative_to(ROOT)))
     assert naming == {
-        "app/analysis/metrics/export.py", "app/ingest/quarantine/serializers.py", "app/overview/package/pages.py", "app/overview/samples/api.py",
+        "app/analysis/metrics/export.py", "app/ingest/quarantine/serializers.py", "app/overview/package/pages.py",
+        "app/overview/samples/api.py",
         "app/planning/bundles/api.py", "app/planning/bundles/pages.py", "app/planning/plans/api.py", "app/platform/web/csv_files.py",
     }  # fmt: skip
 

@@ -1,122 +1,206 @@
-"""Which rows of the audit trail belong to the studies and sites of a reader: by the foreign keys of what they tell of."""
+"""Queries of the audit trail: the rows that a reader asks for, names of what they tell of, and which of them hide what ran."""
 
 from __future__ import annotations
 
+import datetime as dt
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import Column, ColumnElement, Integer, Table, and_, case, cast, false, func, or_, select, true
+from sqlalchemy import ColumnElement, Select, Text, and_, cast, false, func, not_, or_, select
 from sqlalchemy.dialects.postgresql import JSONB
-from sqlalchemy.orm import QueryableAttribute, aliased
+from sqlalchemy.orm import QueryableAttribute, Session
 
-from app.accounts.models import Site
-from app.accounts.permissions import READ_AUDIT, Caller
+from app.overview.trail.names import Names
+from app.overview.trail.schemas import ACTION_WORDS, KINDS, SHOWN_NAMES, TrailFilter
+from app.overview.trail.scope import of_participants
+from app.planning.bundles.models import BundleRelease
+from app.planning.plans.models import SEALED, Plan, PlanItem
 from app.platform.audit import AUDITED, AuditEvent
 from app.platform.database import Base
+from app.study.models import Participant, StudySession, Visit
 
-_ROOTS = ("participant", "site", "study")
-_SIGNED = ("plan", "policy", "visit_lock", "margins_lock")
-"""Tables whose rows are signed; a signature names them by kind."""
-_REMOVED = ("visit", "session", "plan")
-"""Tables with rows below them of which the service removes some: empty visits, discarded proposals, drafts."""
-_ROW_CHANGES = ("insert", "update", "delete")
-_NUMBER = r"^[0-9]{1,9}$"
+_BATCH = 500
+_SEALED_BY = {"session": "visit_id", "plan_item": "plan_id", "session_proposal": "session_id", "session_conditions": "session_id",
+              "bundle_release": "plan_item_id", "stored_file": "sha256", "plan": "id", "adverse_event": "visit_id"}  # fmt: skip
+"""Tables whose rows would tell what ran under a sealed key, and the column by which they belong to a visit, plan, session, or file."""
 
 
-def of_reader(caller: Caller) -> ColumnElement[bool]:
-    """Condition on `AuditEvent`: rows of the studies and sites in which the caller reads the trail.
-
-    Rows of accounts, sign-ins, tokens and stored files belong to no study and are left out; so are refused sign-ins, and looks at results
-    of several participants. A row that was moved counts where both its old and its new place do.
-    """
-    scope = _Scope(caller)
-    changed = case(
-        {name: and_(scope.told(name, AuditEvent.after, AuditEvent.before), scope.told(name, AuditEvent.before, AuditEvent.after))
-         for name in AUDITED if name in scope.tables},
-        value=AuditEvent.entity,
-        else_=false(),
-    )  # fmt: skip
-    return case((AuditEvent.action.in_(_ROW_CHANGES), changed), else_=scope.recorded())
+def audit_events(
+    db: Session, within: ColumnElement[bool], wanted: TrailFilter, limit: int, offset: int
+) -> tuple[Sequence[AuditEvent], int]:
+    """A page of the audit trail, newest first, and how many rows match. `within`: rows that may be read."""
+    query = _matching(db, within, wanted)
+    total = db.scalar(select(func.count()).select_from(query.subquery())) or 0
+    return db.scalars(query.order_by(AuditEvent.id.desc()).limit(limit).offset(offset)).all(), total
 
 
-class _Scope:
-    """The sites of a reader, and conditions that lead to them."""
+def batches(db: Session, within: ColumnElement[bool], wanted: TrailFilter) -> Iterator[Sequence[AuditEvent]]:
+    """All rows that match, newest first, some hundred at a time: those that stand in the trail when the first are read."""
+    query = _matching(db, within, wanted)
+    last: int | None = None
+    while True:
+        below = query if last is None else query.where(AuditEvent.id < last)
+        rows = db.scalars(below.order_by(AuditEvent.id.desc()).limit(_BATCH)).all()
+        if not rows:
+            return
+        last = rows[-1].id
+        yield rows
 
-    def __init__(self, caller: Caller) -> None:
-        grants = caller.grants_with(READ_AUDIT)
-        allowed = [(Site.study_id == g.study_id) & (Site.id == g.site_id if g.site_id else true()) for g in grants]
-        self._sites = select(Site.id).where(or_(false(), *allowed))
-        self._studies = sorted({g.study_id for g in grants if g.site_id is None})
-        self.tables = {name for name in AUDITED if name == "signature" or _leads_to_root(Base.metadata.tables[name])}
 
-    def told(self, name: str, first: QueryableAttribute[Any], second: QueryableAttribute[Any]) -> ColumnElement[bool]:
-        """Whether a change of a row of a table is in scope, by the row as it was told."""
-        row = cast(func.coalesce(first, second), JSONB)
-        if name == "signature":
-            number = row["subject_id"].as_integer()
-            return case({kind: self._inside(kind, number) for kind in _SIGNED}, value=row["subject_kind"].as_string(), else_=false())
-        if name in _ROOTS:
-            return self._inside(name, row["id"].as_integer())
-        key = _key(Base.metadata.tables[name])
-        assert key is not None
-        return self._inside(_parent(key), row[key.name].as_integer())
+def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
+    """Names of the rows that these events are about, in a query per kind of row."""
+    rows = [(e.entity, row) for e in events for row in (e.before, e.after) if row]
+    noted = [(e.entity, int(e.entity_id)) for e in events if e.action not in ("insert", "update", "delete") and e.entity_id.isdecimal()]
+    signed = [(row["subject_kind"], row["subject_id"]) for name, row in rows if name == "signature"]
 
-    def recorded(self) -> ColumnElement[bool]:
-        """Whether something that changed no row is in scope: exports, downloads, looks at one participant's results."""
-        number = case((AuditEvent.entity_id.regexp_match(_NUMBER), cast(AuditEvent.entity_id, Integer)), else_=None)
-        code = func.substring(AuditEvent.entity_id, "/participants/([^/?]+)")
-        participant = Base.metadata.tables["participant"]
-        by_code = code.in_(select(participant.c.code).where(participant.c.site_id.in_(self._sites)))
-        named = {name: self._inside(name, number) for name in ("participant", "session", "plan", "visit", "policy", "sweep", "upload_file")}
-        return case(named | {"results": by_code}, value=AuditEvent.entity, else_=false())
+    def numbers(entity: str, *columns: str) -> set[int]:
+        own = {int(r["id"]) for name, r in rows if name == entity and "id" in r} | {n for name, n in (*noted, *signed) if name == entity}
+        return own | {int(r[c]) for _, r in rows for c in columns if r.get(c) is not None and str(r[c]).isdecimal()}
 
-    def _inside(self, name: str, number: ColumnElement[int], removed: bool = True) -> ColumnElement[bool]:
-        """Whether the row of a table with this number belongs to the reader's sites.
-
-        `removed`: it may be gone since, and is looked up in the trail's own row of its removal then; what a present row names is there.
-        """
-        if name == "site":
-            return number.in_(self._sites)
-        if name == "study":
-            return number.in_(self._studies)
+    def read(name: str, wanted: Collection[int], *columns: str) -> dict[int, tuple[Any, ...]]:
+        """Those of the table's rows that are still there."""
+        if not wanted:
+            return {}
         table = Base.metadata.tables[name]
-        key = _key(table)
-        assert key is not None
-        present = number.in_(select(table.c.id).where(self._inside(_parent(key), key, removed=False)))
-        if not removed or name not in _REMOVED:
-            return present
-        gone = aliased(AuditEvent)
-        last = cast(gone.before, JSONB)[key.name].as_integer()
-        removals = select(cast(gone.entity_id, Integer)).where(
-            gone.entity == name, gone.action == "delete", self._inside(_parent(key), last)
-        )
-        return or_(present, number.in_(removals))
+        found = db.execute(select(table.c.id, *(table.c[c] for c in columns)).where(table.c.id.in_(wanted)))
+        return {row[0]: tuple(row[1:]) for row in found}
+
+    queries = read("data_query", numbers("data_query", "query_id"), *_QUERY)
+    asked = {i: dict(zip(_QUERY, row, strict=True)) for i, row in queries.items()}
+    events_ = read("adverse_event", numbers("adverse_event", "event_id"), "participant_id", "visit_id", "session_id")
+    of_queries = {q["session_id"] for q in asked.values() if q["session_id"]}
+    sessions = read("session", numbers("session", "session_id") | of_queries, "ordinal", "visit_id")
+    items = read("plan_item", numbers("plan_item", "plan_item_id"), "position", "plan_id")
+    plans = read("plan", numbers("plan", "plan_id") | {plan for _, plan in items.values()}, "visit_id")
+    locks = read("visit_lock", numbers("visit_lock"), "visit_id")
+    margins = read("margins_lock", numbers("margins_lock"), "participant_id")
+    snapshots = read("buffer_snapshot", numbers("buffer_snapshot", "snapshot_id"), "participant_id")
+    sweeps = read("sweep", numbers("sweep", "sweep_id"), "name", "participant_id")
+    paths = [e.entity_id.split("/policies/")[1].split("/")[0] for e in events if e.entity == "results" and "/policies/" in e.entity_id]
+    policies = read("policy", numbers("policy", "policy_id") | {int(n) for n in paths if n.isdecimal()}, "name", "participant_id")
+    of_visits = {v for _, v in sessions.values()} | {v for (v,) in (*plans.values(), *locks.values())}
+    of_visits |= {v for _, v, _ in events_.values() if v is not None} | {q["visit_id"] for q in asked.values() if q["visit_id"]}
+    visits = read("visit", numbers("visit", "visit_id") | of_visits, "number", "participant_id")
+    whose = {p for _, p in (*visits.values(), *policies.values(), *sweeps.values())} | {
+        p for (p,) in (*margins.values(), *snapshots.values())
+    }
+    whose |= {p for p, _, _ in events_.values()} | {q["participant_id"] for q in asked.values()}
+    sites = read("site", numbers("site", "site_id"), "code", "study_id")
+    studies = read("study", numbers("study", "study_id"), "code")
+    return Names(
+        participants=_first(read("participant", numbers("participant", "participant_id") | whose, "code")),
+        visits=visits,
+        sessions=sessions,
+        plans=_first(plans),
+        policies=policies,
+        items=items,
+        events={i: (p, v) for i, (p, v, _) in events_.items()},
+        queries=asked,
+        locks=_first(locks),
+        margins_locks=_first(margins),
+        people=_first(read("app_user", numbers("app_user", "user_id"), "email")),
+        studies=_first(studies),
+        sites=_first(sites),
+        sweeps=sweeps,
+        snapshots=_first(snapshots),
+    )
 
 
-def _leads_to_root(table: Table) -> bool:
-    return table.name in _ROOTS or _key(table) is not None
+def sealed_events(db: Session, events: Sequence[AuditEvent]) -> frozenset[int]:
+    """Those of the events that changed a blinded plan whose key is sealed, a row of it, a file of its bundles, or sessions of its visit."""
+    hidden = hidden_rows(db)
+    if hidden is None or not events:
+        return frozenset()
+    return frozenset(db.scalars(select(AuditEvent.id).where(AuditEvent.id.in_([e.id for e in events]), hidden)))
 
 
-def _key(table: Table) -> Column[int] | None:
-    """The foreign key that leads from a table to a participant, site or study over the fewest others; None where none does."""
-    found = min(((length, name) for name, length in _lengths(table)), default=None)
-    return None if found is None else table.c[found[1]]
+def hidden_rows(db: Session) -> ColumnElement[bool] | None:
+    """Condition on `AuditEvent`: rows that would tell what ran at a visit whose key is sealed; None while no key is."""
+    plans = set(db.scalars(select(Plan.id).where(SEALED)))
+    if not plans:
+        return None
+    items = select(PlanItem.id).where(PlanItem.plan_id.in_(plans))
+    visits = list(db.scalars(select(Visit.id).where(Visit.sealed)))
+    open_to_all = select(StudySession.id).where(StudySession.visit_id.not_in(visits))
+    files = select(BundleRelease.sha256).where(BundleRelease.plan_item_id.in_(items))
+
+    def tells(entity: str, row: ColumnElement[Any]) -> ColumnElement[bool]:
+        value = row[_SEALED_BY[entity]]
+        if entity == "stored_file":
+            known: ColumnElement[bool] = value.as_string().in_(files)
+            return known
+        number: ColumnElement[int] = value.as_integer()
+        if _SEALED_BY[entity] == "session_id":  # a proposal that is gone may have been of any visit
+            return and_(number.is_not(None), number.not_in(open_to_all))
+        if _SEALED_BY[entity] == "plan_item_id":
+            return number.in_(items)
+        return number.in_(visits if _SEALED_BY[entity] == "visit_id" else plans)
+
+    told = [
+        and_(AuditEvent.entity == entity, func.coalesce(tells(entity, cast(row, JSONB)), false()))
+        for entity in _SEALED_BY
+        for row in (AuditEvent.before, AuditEvent.after)
+    ]
+    return or_(*told)
 
 
-def _lengths(table: Table, seen: frozenset[str] = frozenset()) -> list[tuple[str, int]]:
-    """(column, keys up to a root) of each foreign key by number that leads to one; a key that may be empty counts as the longer way."""
-    found = []
-    for key in table.foreign_keys:
-        parent = key.column.table
-        if not isinstance(key.parent.type, Integer) or parent.name in seen | {table.name}:
-            continue
-        own = 10 if key.parent.nullable else 1
-        if parent.name in _ROOTS:
-            found.append((key.parent.name, own))
-        elif further := _lengths(parent, seen | {table.name}):
-            found.append((key.parent.name, own + min(length for _, length in further)))
-    return found
+_QUERY = ("participant_id", "session_id", "upload_id", "field", "visit_id")
 
 
-def _parent(key: Column[int]) -> str:
-    (foreign,) = key.foreign_keys
-    return str(foreign.column.table.name)
+def _first(rows: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
+    return {i: row[0] for i, row in rows.items()}
+
+
+def _matching(db: Session, within: ColumnElement[bool], wanted: TrailFilter) -> Select[AuditEvent]:
+    """The rows of a filter. Values that are hidden from every reader are not searched either: a search that finds tells them."""
+    query: Select[AuditEvent] = select(AuditEvent).where(within)
+    for column, value in (
+        (AuditEvent.entity, wanted.entity),
+        (AuditEvent.entity_id, wanted.entity_id),
+        (AuditEvent.actor, wanted.actor.strip().lower()),
+    ):
+        if value:
+            query = query.where(column == value)
+    if wanted.action:
+        query = query.where(_of_kind(wanted.action))
+    if wanted.begin is not None:
+        query = query.where(AuditEvent.at >= _midnight(wanted.begin))
+    if wanted.end is not None:
+        query = query.where(AuditEvent.at < _midnight(wanted.end) + dt.timedelta(days=1))
+    if code := wanted.participant.strip().lower():
+        query = query.where(of_participants(db.scalars(select(Participant.id).where(func.lower(Participant.code) == code)).all()))
+    words = wanted.words.split()
+    hidden = hidden_rows(db) if words else None
+    for word in words:
+        query = query.where(_mentions(db, word, hidden))
+    return query
+
+
+def _of_kind(name: str) -> ColumnElement[bool]:
+    kind = KINDS[name]
+    return or_(false(), AuditEvent.action.in_(kind.actions), and_(AuditEvent.entity.in_(kind.tables), AuditEvent.action == "insert"))
+
+
+def _midnight(day: dt.date) -> dt.datetime:
+    return dt.datetime.combine(day, dt.time(), dt.UTC)
+
+
+def _mentions(db: Session, word: str, hidden: ColumnElement[bool] | None) -> ColumnElement[bool]:
+    """Whether a row's sentence, or a value of it, has a word: who, what kind of act, what it was done to, whose, why, from and to what."""
+
+    def holds(value: ColumnElement[Any] | QueryableAttribute[Any]) -> ColumnElement[bool]:
+        return func.coalesce(value.icontains(word, autoescape=True), false())
+
+    low = word.lower()
+    tables = [name for name in AUDITED if low in SHOWN_NAMES.get(name, name.replace("_", " ")) or low in name]
+    actions = [action for action, said in ACTION_WORDS.items() if low in said]
+    values = or_(holds(AuditEvent.reason), holds(cast(AuditEvent.before, Text)), holds(cast(AuditEvent.after, Text)))
+    named = db.scalars(select(Participant.id).where(Participant.code.icontains(word, autoescape=True))).all()
+    return or_(
+        holds(AuditEvent.actor),
+        holds(AuditEvent.entity_id),
+        AuditEvent.entity.in_(tables),
+        AuditEvent.action.in_(actions),
+        values if hidden is None else and_(not_(hidden), values),
+        of_participants(named) if named else false(),
+    )

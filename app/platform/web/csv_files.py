@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import csv
+import io
+from collections.abc import Iterable, Iterator, Sequence
+
 from fastapi import Response
+from fastapi.responses import StreamingResponse
 
 CSV = "text/csv; charset=utf-8"
 
@@ -10,6 +15,24 @@ CSV = "text/csv; charset=utf-8"
 def download(content: str, name: str) -> Response:
     """A CSV file under a name."""
     return Response(content, media_type=CSV, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+def stream(pieces: Iterable[str], name: str) -> Response:
+    """A CSV file under a name, sent piece by piece while it is made."""
+    return StreamingResponse(iter(pieces), media_type=CSV, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+def in_pieces(columns: Sequence[str], batches: Iterable[Iterable[Sequence[object]]]) -> Iterator[str]:
+    """A table as text: its header, then the rows of each batch; what is not there is empty."""
+    yield _written([columns])
+    for batch in batches:
+        yield _written(batch)
+
+
+def _written(rows: Iterable[Sequence[object]]) -> str:
+    sink = io.StringIO()
+    csv.writer(sink, lineterminator="\n").writerows([safe_cell(cell) for cell in row] for row in rows)
+    return sink.getvalue()
 
 
 _BEGINS_FORMULA = frozenset("=+-@\t\n＝＋－＠")

@@ -26,7 +26,7 @@ def list_data_queries(participant: CurrentParticipant, db: Db, state: QueryState
 
 @router.post("/participants/{code}/data-queries", status_code=201)
 def ask_data_query(participant: CurrentParticipant, draft: DataQueryIn, db: Db, caller: CurrentCaller) -> DataQueryOut:
-    """Ask about a value of a session, or about an upload."""
+    """Ask about a value of a session, visit, dose, adverse event, the settings or the characteristics; or about an upload."""
     row = service.ask(db, participant, draft, caller)
     db.commit()
     return query_out(row)

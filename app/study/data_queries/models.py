@@ -20,36 +20,60 @@ class QueryState(StrEnum):
     CLOSED = "closed"
 
 
-class QueriedField(StrEnum):
-    """What of a session or an upload is asked about; anything else is `other`, said in the text."""
+class Subject(StrEnum):
+    """What the value that is asked about stands in."""
 
-    GRASP_HZ = "grasp_hz"
-    RATING = "rating"
-    TREMOR_PERCENT = "tremor_percent"
-    CONTROLLER = "controller"
-    STARTED_AT = "started_at"
-    HEMISPHERE = "hemisphere"
-    MEDICATION_H = "medication_h"
-    STOPPED_REASON = "stopped_reason"
-    FILE = "file"
-    OTHER = "other"
+    SESSION = "session"
+    UPLOAD = "upload"
+    VISIT = "visit"
+    DOSE = "dose"
+    EVENT = "event"
+    SETTINGS = "settings"
+    CHARACTERISTICS = "characteristics"
+
+
+OF_PARTICIPANT = (Subject.SETTINGS, Subject.CHARACTERISTICS)
+"""Subjects of which a participant has one, in versions; the others have a number."""
 
 
 class DataQuery(Base):
-    """A question about one value of a session, or about an upload. What was said, and its state, are its entries."""
+    """A question about one value, or about an upload. What was said, and its state, are its entries."""
 
     __tablename__ = "data_query"
-    __table_args__ = (CheckConstraint("(session_id is null) <> (upload_id is null)", name="one_subject"),)
+    __table_args__ = (
+        CheckConstraint("num_nonnulls(session_id, upload_id, visit_id, dose_id, event_id, record) = 1", name="one_subject"),
+        CheckConstraint(f"record in ({', '.join(repr(s.value) for s in OF_PARTICIPANT)})", name="record"),
+    )
 
     id: Mapped[int] = mapped_column(primary_key=True)
     participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
     session_id: Mapped[int | None] = mapped_column(ForeignKey("session.id"), index=True)
     upload_id: Mapped[int | None] = mapped_column(ForeignKey("upload.id"), index=True)
-    field: Mapped[QueriedField] = mapped_column(String(20))
+    visit_id: Mapped[int | None] = mapped_column(ForeignKey("visit.id"), index=True)
+    dose_id: Mapped[int | None]
+    """Without a foreign key: what was asked about a dose stays when somebody takes the dose back."""
+    event_id: Mapped[int | None] = mapped_column(ForeignKey("adverse_event.id"), index=True)
+    record: Mapped[str | None] = mapped_column(String(20))
+    """`settings` or `characteristics`: the participant's, whose present version holds the value."""
+    field: Mapped[str] = mapped_column(String(40))
+    """Which value, by its name in the API (`app.study.data_queries.fields`)."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     participant: Mapped[Participant] = relationship()
     session: Mapped[StudySession | None] = relationship()
     entries: Mapped[list[DataQueryEntry]] = relationship(order_by="DataQueryEntry.id")
+
+    @property
+    def subject(self) -> Subject:
+        """What the value stands in."""
+        if self.record is not None:
+            return Subject(self.record)
+        return next(s for s in Subject if s not in OF_PARTICIPANT and getattr(self, f"{s.value}_id") is not None)
+
+    @property
+    def subject_id(self) -> int | None:
+        """The number of what the value stands in; None of settings and characteristics."""
+        number: int | None = None if self.record is not None else getattr(self, f"{self.subject.value}_id")
+        return number
 
     @property
     def state(self) -> QueryState:

@@ -15,7 +15,8 @@ from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
 from app.study.data_queries import repository, service
 from app.study.data_queries.deps import CurrentDataQuery
-from app.study.data_queries.models import QueryState
+from app.study.data_queries.fields import FIELDS
+from app.study.data_queries.models import OF_PARTICIPANT, DataQuery, QueryState, Subject
 from app.study.data_queries.schemas import DataQueryEntryIn, DataQueryIn
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
@@ -24,16 +25,24 @@ from app.study.wording import QUERIED_FIELDS
 
 router = APIRouter()
 
-_LABELS = {"session_id": "Session", "upload_id": "Upload", "field": "About", "text": "Text", "state": "State", "entries": "Entries"}
+_LABELS = {
+    "session_id": "Session", "upload_id": "Upload", "visit_id": "Visit", "dose_id": "Dose", "event_id": "Adverse event", "record": "Record",
+    "field": "About", "text": "Text", "state": "State", "entries": "Entries",
+}  # fmt: skip
+_NAMES = {
+    Subject.SESSION: "Session", Subject.UPLOAD: "Upload", Subject.VISIT: "Visit", Subject.DOSE: "Dose", Subject.EVENT: "Adverse event",
+    Subject.SETTINGS: "Settings", Subject.CHARACTERISTICS: "Characteristics",
+}  # fmt: skip
 _ORDER = {QueryState.OPEN: 0, QueryState.ANSWERED: 1, QueryState.CLOSED: 2}
 
 
 @router.get("/participants/{code}/data-queries")
-def data_queries(
-    request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, session: str = "", upload: str = ""
-) -> HTMLResponse:
-    """A participant's queries, open ones first, and a form to ask; `session` and `upload` fill it in."""
-    return _page(request, participant, db, caller, {"session_id": session[:10], "upload_id": upload[:10]})
+def data_queries(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
+    """A participant's queries, open ones first, and a form to ask. A subject in the address (`visit=3`) makes it a form about that."""
+    linked = {s: request.query_params.get(s.value, "")[:10] for s in Subject}
+    typed = {f"{s.value}_id": number for s, number in linked.items() if s not in OF_PARTICIPANT and number}
+    record = request.query_params.get("record", "")
+    return _page(request, participant, db, caller, typed | ({"record": record} if record in OF_PARTICIPANT else {}))
 
 
 @router.post("/participants/{code}/data-queries")
@@ -67,10 +76,15 @@ def _page(
     request: Request, participant: Participant, db: Session, caller: Caller, typed: dict[str, str], error: BetaloopError | None = None
 ) -> HTMLResponse:
     found = repository.queries_of_participant(db, participant.id)
+    subject = _subject(typed)
     page = render(
         request,
         "study/data_queries.html",
         participant=participant,
+        places={q.id: _place(participant, db, q) for q in found},
+        subject=subject,
+        subject_name=_NAMES[subject] if subject else "",
+        offered=FIELDS[subject] if subject else dict.fromkeys((*FIELDS[Subject.SESSION], *FIELDS[Subject.UPLOAD])),
         queries=sorted(found, key=lambda q: (_ORDER[q.state], -q.id)),
         fields=QUERIED_FIELDS,
         typed=typed,
@@ -79,3 +93,27 @@ def _page(
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)
+
+
+def _subject(typed: dict[str, str]) -> Subject | None:
+    """What the form is about, where it names one thing that is neither a session nor an upload typed by its number."""
+    if (record := typed.get("record", "")) in OF_PARTICIPANT:
+        return Subject(record)
+    named = [s for s in Subject if s not in OF_PARTICIPANT and typed.get(f"{s.value}_id", "").isdecimal()]
+    return named[0] if len(named) == 1 else None
+
+
+def _place(participant: Participant, db: Session, query: DataQuery) -> tuple[str, str]:
+    """What a query is about, and the page where its value stands."""
+    subject, number, home = query.subject, query.subject_id, f"/participants/{participant.code}"
+    if subject is Subject.DOSE and number is not None:
+        dose = repository.dose_of(db, participant.id, number)
+        return ("Dose", f"/visits/{dose.visit_id}#doses") if dose else ("Dose, taken back", f"{home}/visits")
+    if subject is Subject.VISIT:
+        visit = repository.visit_number(db, number)
+        return f"Visit {visit}", f"/visits/{number}"
+    if subject is Subject.EVENT:
+        return f"Adverse event {number}", f"{home}/adverse-events"
+    if number is None:
+        return _NAMES[subject], f"{home}/{subject.value}"
+    return f"{_NAMES[subject]} {number}", f"/{subject.value}s/{number}"

@@ -10,7 +10,8 @@ from sqlalchemy.orm import Session, joinedload, selectinload
 from app.accounts.permissions import Caller
 from app.platform.errors import NotFound
 from app.study.data_queries.models import DataQuery, DataQueryEntry, QueryState
-from app.study.models import Participant
+from app.study.doses.models import Dose
+from app.study.models import Participant, Visit
 from app.study.repository import in_scope
 
 
@@ -39,6 +40,16 @@ def lock_query(db: Session, row: DataQuery) -> None:
     """Hold a query for this transaction and read its entries again, so that two answers at once are taken in turn."""
     db.execute(select(DataQuery.id).where(DataQuery.id == row.id).with_for_update())
     db.expire(row, ["entries"])
+
+
+def dose_of(db: Session, participant_id: int, dose_id: int) -> Dose | None:
+    """A dose of the participant; None without one, or where it was taken back."""
+    return db.scalar(select(Dose).join(Visit, Visit.id == Dose.visit_id).where(Dose.id == dose_id, Visit.participant_id == participant_id))
+
+
+def visit_number(db: Session, visit_id: int | None) -> int | None:
+    """The number that people give a visit."""
+    return db.scalar(select(Visit.number).where(Visit.id == visit_id))
 
 
 def upload_of(db: Session, participant_id: int, upload_id: int) -> bool:

@@ -3,32 +3,51 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from app.platform.web.schemas import Int, Model, Text
-from app.study.data_queries.models import QueriedField, QueryState
+from app.study.data_queries.fields import FIELDS
+from app.study.data_queries.models import OF_PARTICIPANT, QueryState, Subject
+
+_NAMED = "; ".join(f"of {subject.value} {', '.join(names[:-1])}" for subject, names in FIELDS.items())
 
 
 class DataQueryIn(Model):
-    """A question about a value of a session, or about an upload."""
+    """A question about a value, or about an upload: of a session, upload, visit, dose or adverse event, or of the participant's settings or
+    characteristics."""
 
     session_id: Int | None = Field(None, ge=1)
     upload_id: Int | None = Field(None, ge=1)
-    field: QueriedField
+    visit_id: Int | None = Field(None, ge=1)
+    dose_id: Int | None = Field(None, ge=1)
+    event_id: Int | None = Field(None, ge=1, description="Of an adverse event.")
+    record: Literal["settings", "characteristics"] | None = Field(None, description="Of the participant: the present version.")
+    field: Text = Field(min_length=1, max_length=40, description="Which value, by its name: " + _NAMED + ". `other` is said in the text.")
     text: Text = Field(min_length=1, max_length=2000, description="What is asked, without names or dates.")
 
     @model_validator(mode="after")
     def _one_subject(self) -> Self:
-        if (self.session_id is None) == (self.upload_id is None):
-            raise PydanticCustomError("subject", "name a session or an upload, one of the two")
-        if self.upload_id is not None and self.field not in (QueriedField.FILE, QueriedField.OTHER):
-            raise PydanticCustomError("field", "an upload is asked about as 'file' or 'other'")
-        if self.session_id is not None and self.field is QueriedField.FILE:
-            raise PydanticCustomError("field", "a file is asked about at its upload")
+        if len(self._stated()) != 1:
+            raise PydanticCustomError("subject", "name one thing that is asked about: a session, upload, visit, dose, event or record")
+        if self.field not in FIELDS[self.subject]:
+            raise PydanticCustomError(
+                "field",
+                "a {subject} is asked about as one of {fields}",
+                {"subject": self.subject.value, "fields": ", ".join(FIELDS[self.subject])},
+            )
         return self
+
+    def _stated(self) -> list[Subject]:
+        numbered = [s for s in Subject if s not in OF_PARTICIPANT and getattr(self, f"{s.value}_id") is not None]
+        return [*numbered, *([Subject(self.record)] if self.record is not None else [])]
+
+    @property
+    def subject(self) -> Subject:
+        """What the value stands in."""
+        return self._stated()[0]
 
 
 class DataQueryEntryIn(Model):
@@ -56,6 +75,10 @@ class DataQueryOut(Model):
     participant: str
     session_id: int | None
     upload_id: int | None
-    field: QueriedField
+    visit_id: int | None
+    dose_id: int | None
+    event_id: int | None
+    record: Literal["settings", "characteristics"] | None
+    field: str
     state: QueryState
     entries: list[DataQueryEntryOut]

@@ -13,14 +13,13 @@ from app.accounts.permissions import Caller
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import repository as study_repository
 from app.study import service as study
+from app.study.adverse_events import repository as events
 from app.study.data_queries import repository
-from app.study.data_queries.models import DataQuery, DataQueryEntry, QueriedField, QueryState
+from app.study.data_queries.fields import Found, value_of
+from app.study.data_queries.models import OF_PARTICIPANT, DataQuery, DataQueryEntry, QueryState, Subject
 from app.study.data_queries.schemas import DataQueryEntryIn, DataQueryIn
-from app.study.models import Participant, StudySession
+from app.study.models import Participant
 
-NOT_KEPT = frozenset({QueriedField.CONTROLLER, QueriedField.FILE, QueriedField.OTHER})
-"""Of these no value is kept with an entry: controllers are told by the blinding gate alone, and the others are not one value."""
-_OF_QOC = frozenset({QueriedField.GRASP_HZ, QueriedField.RATING, QueriedField.TREMOR_PERCENT})
 _FOLLOWS: dict[QueryState, frozenset[QueryState]] = {
     QueryState.OPEN: frozenset({QueryState.ANSWERED, QueryState.CLOSED}),
     QueryState.ANSWERED: frozenset({QueryState.CLOSED, QueryState.OPEN}),
@@ -29,20 +28,18 @@ _FOLLOWS: dict[QueryState, frozenset[QueryState]] = {
 
 
 def ask(db: Session, participant: Participant, draft: DataQueryIn, caller: Caller) -> DataQuery:
-    """Ask about a value of a session, or about an upload.
+    """Ask about a value, or about an upload.
 
     Raises:
-        Forbidden: the caller may not ask. NotFound: the session or upload is not the participant's. Invalid: nothing was asked.
+        Forbidden: the caller may not ask. NotFound: what is asked about is not the participant's. Invalid: nothing was asked.
     """
     study.require(caller, can.ASK_QUERIES, participant)
-    session = None
-    if draft.session_id is not None:
-        session = study_repository.session(db, draft.session_id, caller)
-        study.require_own(participant, session.visit, f"session {draft.session_id}")
-    elif draft.upload_id is None or not repository.upload_of(db, participant.id, draft.upload_id):
-        raise NotFound(f"Participant {participant.code} has no upload {draft.upload_id}.")
-    row = DataQuery(participant_id=participant.id, session_id=draft.session_id, upload_id=draft.upload_id, field=draft.field)
-    row.entries.append(_entry(QueryState.OPEN, draft.text, draft.field, session, caller))
+    named = {f"{s.value}_id": getattr(draft, f"{s.value}_id") for s in Subject if s not in OF_PARTICIPANT}
+    row = DataQuery(participant_id=participant.id, participant=participant, record=draft.record, field=draft.field, **named)
+    found = _found(db, row, caller)
+    if found is None and not (row.upload_id is not None and repository.upload_of(db, participant.id, row.upload_id)):
+        raise NotFound(f"Participant {participant.code} has no {draft.subject.value} {row.subject_id}.")
+    row.entries.append(_entry(QueryState.OPEN, draft.text, row, found, caller))
     db.add(row)
     db.flush()
     return repository.data_query(db, row.id, caller)
@@ -61,19 +58,34 @@ def follow(db: Session, query: DataQuery, given: DataQueryEntryIn, caller: Calle
         raise Conflict(f"{query.entries[-1].entered_by} said something to data query {query.id} after you opened it.", "Load it again.")
     if given.state not in _FOLLOWS[query.state]:
         raise Conflict(f"Data query {query.id} is {query.state.value}, and cannot become {given.state.value}.", "Load it again.")
-    query.entries.append(_entry(given.state, given.text, query.field, query.session, caller))
+    query.entries.append(_entry(given.state, given.text, query, _found(db, query, caller), caller))
     db.flush()
     return query
 
 
-def _entry(state: QueryState, said: str, field: QueriedField, session: StudySession | None, caller: Caller) -> DataQueryEntry:
+def _entry(state: QueryState, said: str, query: DataQuery, found: Found, caller: Caller) -> DataQueryEntry:
     if not said.strip():
         raise Invalid("Nothing is said.", "Write what you ask, answer, or why the query is closed.")
-    return DataQueryEntry(state=state, text=said.strip(), value=_value(session, QueriedField(field)), entered_by=caller.label)
+    value = value_of(query.subject, query.field, found)
+    return DataQueryEntry(state=state, text=said.strip(), value=value, entered_by=caller.label)
 
 
-def _value(session: StudySession | None, field: QueriedField) -> str | None:
-    if session is None or field in NOT_KEPT:
-        return None
-    found = getattr(session.qoc, field.value, None) if field in _OF_QOC else getattr(session, field.value)
-    return None if found is None else str(found)
+def _found(db: Session, query: DataQuery, caller: Caller) -> Found:
+    """The row that holds the value; None of an upload, and of a dose that was taken back. Raises NotFound for another participant's."""
+    participant, number = query.participant, query.subject_id
+    if number is None:
+        return participant
+    what = f"{query.subject.value} {number}"
+    if query.subject is Subject.SESSION:
+        session = study_repository.session(db, number, caller)
+        study.require_own(participant, session.visit, what)
+        return session
+    if query.subject is Subject.VISIT:
+        visit = study_repository.visit(db, number, caller)
+        study.require_own(participant, visit, what)
+        return visit
+    if query.subject is Subject.EVENT:
+        event = events.event(db, number, caller)
+        study.require_own(participant, event, what)
+        return event
+    return repository.dose_of(db, participant.id, number) if query.subject is Subject.DOSE else None

@@ -13,8 +13,9 @@ from sqlalchemy.orm import Session
 from app.accounts import service as accounts
 from app.accounts.models import Membership, Role, Site, Study
 from app.accounts.permissions import Caller, Grant
-from app.overview.repository import audit_events
-from app.overview.trail.repository import of_reader
+from app.overview.trail.repository import audit_events
+from app.overview.trail.schemas import TrailFilter
+from app.overview.trail.scope import of_reader
 from app.platform.audit import AUDITED, AuditEvent
 from tests.conftest import PASSWORD
 
@@ -60,14 +61,14 @@ def reader(db: Session, study: str, name: str, site: int | None = None) -> str:
 
 
 def seen(db: Session, caller: Caller) -> list[AuditEvent]:
-    return list(audit_events(db, of_reader(caller), "", "", "", 10_000, 0)[0])
+    return list(audit_events(db, of_reader(caller), TrailFilter(), 10_000, 0)[0])
 
 
 def test_every_row_of_ones_own_study_is_shown_and_none_of_another(client: TestClient, upload: Upload, north: Study, db: Session) -> None:
     session = upload("cdbs")
     client.put(f"/api/v1/sessions/{session}/qoc", json={"rating": 7})
     main = db.scalars(select(Study).where(Study.code == "main")).one()
-    whole, _ = audit_events(db, true(), "", "", "", 10_000, 0)
+    whole, _ = audit_events(db, true(), TrailFilter(), 10_000, 0)
     of = {s.code: seen(db, Caller("x", 1, (Grant(s.id, None, Role.MONITOR),))) for s in (main, north)}
     numbers = {code: {e.id for e in events} for code, events in of.items()}
     assert numbers["main"].isdisjoint(numbers["north"])

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from app.overview.audit_words import Names, headline, sentence
+from app.overview.trail.names import Names
+from app.overview.trail.words import headline, sentence
 from app.platform.audit import AuditEvent
 
 NAMES = Names({1: "P1"}, {4: (2, 1)}, {7: (3, 4)}, {9: 4}, {5: ("rl-01", 1)})
