@@ -124,7 +124,6 @@ NEW_FEATURES: dict[str, str] = {
             "components > schemas > DataQueryEntryOut",
             "components > schemas > DataQueryIn",
             "components > schemas > DataQueryOut",
-            "components > schemas > QueriedField",
             "components > schemas > QueryState",
             "paths > /api/v1/data-queries/{query_id}/entries",
             "paths > /api/v1/participants/{code}/data-queries",

@@ -154,7 +154,8 @@ def test_only_routes_pages_commands_and_jobs_commit() -> None:
         "app/ingest/uploads/service.py",
         "app/ingest/uploads/in_progress.py",  # ends the statement of its lock, on a connection of its own
         "app/ingest/quarantine/service.py",  # bytes are erased only after the decision is safe
-        "app/accounts/deps.py",  # that results were looked at is kept whatever becomes of the answer
+        "app/study/deps.py",  # that results were looked at is kept whatever becomes of the answer
+        "app/learning/deps.py",  # the same of sweeps
         "app/accounts/sign_on/service.py",  # a refusal stands in the trail whatever becomes of the request
         "app/accounts/service.py",  # when a session or token was last used is no part of the request
         # the simulated study is a command in parts: it commits what a clinic would have committed

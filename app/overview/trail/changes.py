@@ -205,11 +205,18 @@ def about(row: Row, names: Names) -> str:
     """What a data query is about: a value in words, and where it stands."""
     field = str(row["field"])
     value = ASKED_ABOUT.get(field, field.replace("_", " "))
+    whose = names.participant(row["participant_id"])
     if row.get("session_id") is not None:
         return f"{value} of {names.session(row['session_id'])}"
-    if row.get("upload_id") is not None:
-        return f"{value} of upload {row['upload_id']} of {names.participant(row['participant_id'])}"
-    return f"{value} of {names.participant(row['participant_id'])}"
+    if row.get("visit_id") is not None:
+        return f"{value} of {names.visit(row['visit_id'])}"
+    if row.get("event_id") is not None:
+        return f"{value} of an adverse event of {names.event(row['event_id'])}"
+    if row.get("record") is not None:
+        return f"{value} in the {row['record']} of {whose}"
+    if row.get("dose_id") is not None:
+        return f"{value} of a dose of {whose}"
+    return f"{value} of upload {row['upload_id']} of {whose}"
 
 
 def _query(_before: Row, after: Row, names: Names) -> str:

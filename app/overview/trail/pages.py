@@ -17,7 +17,7 @@ from app.overview.trail import repository
 from app.overview.trail.acts import acts
 from app.overview.trail.export import as_csv
 from app.overview.trail.schemas import KINDS, SHOWN_NAMES, TrailFilter
-from app.overview.trail.scope import of_reader
+from app.overview.trail.scope.repository import of_reader
 from app.platform.audit import AUDITED
 from app.platform.database import Db
 from app.platform.errors import Invalid
@@ -54,7 +54,7 @@ def audit(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) 
         tables=sorted(((name, SHOWN_NAMES.get(name, name.replace("_", " "))) for name in AUDITED), key=lambda option: option[1]),
         kinds=[(name, kind.said) for name, kind in KINDS.items()],
         labels=LABELS,
-        filters=typed,
+        filters=dict.fromkeys(LABELS, "") | typed,
         query=urlencode(typed),
         problem=problem,
     )

@@ -12,7 +12,7 @@ from sqlalchemy.orm import QueryableAttribute, Session
 
 from app.overview.trail.names import Names
 from app.overview.trail.schemas import ACTION_WORDS, KINDS, SHOWN_NAMES, TrailFilter
-from app.overview.trail.scope import of_participants
+from app.overview.trail.scope.repository import of_participants
 from app.planning.bundles.models import BundleRelease
 from app.planning.plans.models import SEALED, Plan, PlanItem
 from app.platform.audit import AUDITED, AuditEvent
@@ -30,8 +30,10 @@ def audit_events(
 ) -> tuple[Sequence[AuditEvent], int]:
     """A page of the audit trail, newest first, and how many rows match. `within`: rows that may be read."""
     query = _matching(db, within, wanted)
-    total = db.scalar(select(func.count()).select_from(query.subquery())) or 0
-    return db.scalars(query.order_by(AuditEvent.id.desc()).limit(limit).offset(offset)).all(), total
+    rows = db.scalars(query.order_by(AuditEvent.id.desc()).limit(limit).offset(offset)).all()
+    if (rows and len(rows) < limit) or (not rows and offset == 0):
+        return rows, offset + len(rows)  # all of them were seen: they need not be looked for again to be counted
+    return rows, db.scalar(select(func.count()).select_from(query.subquery())) or 0
 
 
 def batches(db: Session, within: ColumnElement[bool], wanted: TrailFilter) -> Iterator[Sequence[AuditEvent]]:
@@ -67,7 +69,8 @@ def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
 
     queries = read("data_query", numbers("data_query", "query_id"), *_QUERY)
     asked = {i: dict(zip(_QUERY, row, strict=True)) for i, row in queries.items()}
-    events_ = read("adverse_event", numbers("adverse_event", "event_id"), "participant_id", "visit_id", "session_id")
+    of_queries = {q["event_id"] for q in asked.values() if q["event_id"]}
+    events_ = read("adverse_event", numbers("adverse_event", "event_id") | of_queries, "participant_id", "visit_id")
     of_queries = {q["session_id"] for q in asked.values() if q["session_id"]}
     sessions = read("session", numbers("session", "session_id") | of_queries, "ordinal", "visit_id")
     items = read("plan_item", numbers("plan_item", "plan_item_id"), "position", "plan_id")
@@ -79,12 +82,12 @@ def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
     paths = [e.entity_id.split("/policies/")[1].split("/")[0] for e in events if e.entity == "results" and "/policies/" in e.entity_id]
     policies = read("policy", numbers("policy", "policy_id") | {int(n) for n in paths if n.isdecimal()}, "name", "participant_id")
     of_visits = {v for _, v in sessions.values()} | {v for (v,) in (*plans.values(), *locks.values())}
-    of_visits |= {v for _, v, _ in events_.values() if v is not None} | {q["visit_id"] for q in asked.values() if q["visit_id"]}
+    of_visits |= {v for _, v in events_.values() if v is not None} | {q["visit_id"] for q in asked.values() if q["visit_id"]}
     visits = read("visit", numbers("visit", "visit_id") | of_visits, "number", "participant_id")
     whose = {p for _, p in (*visits.values(), *policies.values(), *sweeps.values())} | {
         p for (p,) in (*margins.values(), *snapshots.values())
     }
-    whose |= {p for p, _, _ in events_.values()} | {q["participant_id"] for q in asked.values()}
+    whose |= {p for p, _ in events_.values()} | {q["participant_id"] for q in asked.values()}
     sites = read("site", numbers("site", "site_id"), "code", "study_id")
     studies = read("study", numbers("study", "study_id"), "code")
     return Names(
@@ -94,7 +97,7 @@ def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
         plans=_first(plans),
         policies=policies,
         items=items,
-        events={i: (p, v) for i, (p, v, _) in events_.items()},
+        events=events_,
         queries=asked,
         locks=_first(locks),
         margins_locks=_first(margins),
@@ -144,7 +147,7 @@ def hidden_rows(db: Session) -> ColumnElement[bool] | None:
     return or_(*told)
 
 
-_QUERY = ("participant_id", "session_id", "upload_id", "field", "visit_id")
+_QUERY = ("participant_id", "session_id", "upload_id", "visit_id", "dose_id", "event_id", "record", "field")
 
 
 def _first(rows: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
@@ -191,16 +194,17 @@ def _mentions(db: Session, word: str, hidden: ColumnElement[bool] | None) -> Col
     def holds(value: ColumnElement[Any] | QueryableAttribute[Any]) -> ColumnElement[bool]:
         return func.coalesce(value.icontains(word, autoescape=True), false())
 
+    def has_value(row: QueryableAttribute[Any]) -> ColumnElement[bool]:
+        """Names of columns are no values: every row of a session would be found by "visit"."""
+        value = func.jsonb_each_text(cast(row, JSONB)).table_valued("key", "value")
+        return select(value.c.key).where(value.c.value.icontains(word, autoescape=True)).exists()
+
     low = word.lower()
     tables = [name for name in AUDITED if low in SHOWN_NAMES.get(name, name.replace("_", " ")) or low in name]
     actions = [action for action, said in ACTION_WORDS.items() if low in said]
-    values = or_(holds(AuditEvent.reason), holds(cast(AuditEvent.before, Text)), holds(cast(AuditEvent.after, Text)))
+    values = or_(holds(AuditEvent.reason), has_value(AuditEvent.before), has_value(AuditEvent.after))
     named = db.scalars(select(Participant.id).where(Participant.code.icontains(word, autoescape=True))).all()
-    return or_(
-        holds(AuditEvent.actor),
-        holds(AuditEvent.entity_id),
-        AuditEvent.entity.in_(tables),
-        AuditEvent.action.in_(actions),
-        values if hidden is None else and_(not_(hidden), values),
-        of_participants(named) if named else false(),
-    )
+    exactly = or_(holds(AuditEvent.actor), holds(AuditEvent.entity_id), values if hidden is None else and_(not_(hidden), values))
+    e = AuditEvent
+    whole = func.concat_ws(" ", e.actor, e.entity_id, e.reason, cast(e.before, Text), cast(e.after, Text))  # one look before the exact ones
+    return or_(e.entity.in_(tables), e.action.in_(actions), of_participants(named) if named else false(), and_(holds(whole), exactly))

@@ -21,7 +21,7 @@ from app.study.data_queries.schemas import DataQueryEntryIn, DataQueryIn
 from app.study.deps import CurrentParticipant
 from app.study.models import Participant
 from app.study.service import may
-from app.study.wording import QUERIED_FIELDS
+from app.study.wording import ASKED_ABOUT, QUERIED_FIELDS
 
 router = APIRouter()
 
@@ -87,6 +87,7 @@ def _page(
         offered=FIELDS[subject] if subject else dict.fromkeys((*FIELDS[Subject.SESSION], *FIELDS[Subject.UPLOAD])),
         queries=sorted(found, key=lambda q: (_ORDER[q.state], -q.id)),
         fields=QUERIED_FIELDS,
+        asked=ASKED_ABOUT,
         typed=typed,
         may_ask=may(caller, can.ASK_QUERIES, participant),
         may_answer=may(caller, can.WRITE_STUDY, participant),

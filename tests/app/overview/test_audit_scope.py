@@ -15,7 +15,7 @@ from app.accounts.models import Membership, Role, Site, Study
 from app.accounts.permissions import Caller, Grant
 from app.overview.trail.repository import audit_events
 from app.overview.trail.schemas import TrailFilter
-from app.overview.trail.scope import of_reader
+from app.overview.trail.scope.repository import of_reader
 from app.platform.audit import AUDITED, AuditEvent
 from tests.conftest import PASSWORD
 

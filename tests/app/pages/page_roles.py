@@ -85,6 +85,7 @@ PAGES = {
     "/analyses/results.svg": can.READ,
     "/api-reference": can.READ,
     "/audit": can.READ_AUDIT,
+    "/audit.csv": can.READ_AUDIT,
     "/energy-saved": can.READ,
     "/glossary": can.READ,
     "/jobs": can.READ,

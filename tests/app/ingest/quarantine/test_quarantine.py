@@ -52,9 +52,10 @@ def test_a_review_gives_the_bytes_and_leaves_a_trace(held: dict[str, Any], clien
     answer = decide(client, held, "review")
     assert answer.content == SECRET
     assert answer.headers["content-disposition"].startswith("attachment")
-    last = events(db, held)[-1]
-    assert last.after is not None
-    assert (last.actor, last.after["reviewed_by"]) == ("admin@clinic.example", "admin@clinic.example")
+    looked, taken = events(db, held)[-2:]
+    assert looked.after is not None
+    assert (looked.actor, looked.after["reviewed_by"]) == ("admin@clinic.example", "admin@clinic.example")
+    assert (taken.actor, taken.action) == ("admin@clinic.example", "export")
 
 
 def test_a_discarded_file_loses_its_bytes_and_keeps_its_row(held: dict[str, Any], client: TestClient, db: Session) -> None:

@@ -218,6 +218,24 @@ def test_the_audit_trail_tells_no_arm_of_a_sealed_plan(
     assert re.search(r"\brandom\b", trail())
 
 
+def test_no_search_and_no_table_of_the_trail_tells_an_arm_of_a_sealed_plan(
+    client: TestClient, studied: Any, plan: Plan, held: dict[int, int]
+) -> None:
+    """A search that finds a row by a hidden value tells the value."""
+
+    def found(entity: str, word: str) -> tuple[int, str]:
+        address = f"entity={entity}&words={word}"
+        table = client.get(f"/audit.csv?{address}").text
+        assert ("Nothing matches" in client.get(f"/audit?{address}", headers=PAGE).text) == (table.count("\n") == 1)
+        return table.count("\n") - 1, table
+
+    assert found("plan_item", "random")[0] == 0
+    assert not re.search(r"random|rl-0\d", found("plan_item", "P1")[1])
+    open_key(client, studied.visit)
+    assert found("plan_item", "random")[0] > 0
+    assert re.search(r"random", found("plan_item", "P1")[1])
+
+
 def test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened(
     client: TestClient, db: Session, studied: Any, plan: Plan, held: dict[int, int]
 ) -> None:

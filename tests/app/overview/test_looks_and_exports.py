@@ -21,7 +21,7 @@ from tests.app.every_route import routes as api_routes
 from tests.app.pages.every_page import addresses
 from tests.conftest import PASSWORD as PASSWORD_OF_TESTS
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 SHOWS_NO_RESULTS = {
     # accounts, studies, and what is about no participant
     "/sign-in", "/account", "/accounts", "/studies", "/glossary", "/api-reference", "/styleguide", "/audit", "/search",
