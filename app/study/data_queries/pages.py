@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
@@ -83,7 +85,7 @@ def _page(
         participant=participant,
         places={q.id: _place(participant, db, q) for q in found},
         subject=subject,
-        subject_name=_NAMES[subject] if subject else "",
+        subject_name=_named(db, subject, typed) if subject else "",
         offered=FIELDS[subject] if subject else dict.fromkeys((*FIELDS[Subject.SESSION], *FIELDS[Subject.UPLOAD])),
         queries=sorted(found, key=lambda q: (_ORDER[q.state], -q.id)),
         fields=QUERIED_FIELDS,
@@ -100,8 +102,16 @@ def _subject(typed: dict[str, str]) -> Subject | None:
     """What the form is about, where it names one thing that is neither a session nor an upload typed by its number."""
     if (record := typed.get("record", "")) in OF_PARTICIPANT:
         return Subject(record)
-    named = [s for s in Subject if s not in OF_PARTICIPANT and typed.get(f"{s.value}_id", "").isdecimal()]
+    named = [s for s in Subject if s not in OF_PARTICIPANT and re.fullmatch("[0-9]{1,9}", typed.get(f"{s.value}_id", ""))]
     return named[0] if len(named) == 1 else None
+
+
+def _named(db: Session, subject: Subject, typed: dict[str, str]) -> str:
+    """What the form is about; a visit by the number that people give it."""
+    number: int | str | None = typed.get(f"{subject.value}_id")
+    if subject is Subject.VISIT and number is not None:
+        number = repository.visit_number(db, int(number))
+    return f"{_NAMES[subject]} {number}" if number is not None else _NAMES[subject]
 
 
 def _place(participant: Participant, db: Session, query: DataQuery) -> tuple[str, str]:

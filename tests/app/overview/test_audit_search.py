@@ -84,7 +84,7 @@ def test_a_filter_leaves_what_it_says_on_the_page_and_in_the_table(client: TestC
         name, right = urlencode(filters), rows_of(db, condition)
         page = client.get(f"/audit?{name}&limit=200", headers=PAGE).text
         found = {int(row["number"]) for row in table(client, **filters)} - rows_of(db, "entity = 'audit'")
-        told = f"{len(right)} changed rows in all" if right else "Nothing matches"
+        told = f"{len(right)} row{'s' if len(right) != 1 else ''} in all" if right else "Nothing matches"
         if (
             found != right - rows_of(db, "entity = 'audit'")
             or told not in page

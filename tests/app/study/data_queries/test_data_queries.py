@@ -146,6 +146,14 @@ def test_the_value_of_a_dose_stays_readable_when_the_dose_is_taken_back(client: 
     assert "100 or 1000?" in client.get("/participants/P1/data-queries", headers={"Accept": "text/html"}).text
 
 
+@pytest.mark.parametrize("number", ["99999999999999999999", "-1", "x", "\u0663", ""])
+def test_a_form_about_no_number_is_the_common_one(client: TestClient, enrolled: str, number: str) -> None:
+    page = client.get("/participants/P1/data-queries", params={"visit": number}, headers={"Accept": "text/html"})
+    assert (page.status_code, 'name="session_id"' in page.text) == (200, True)
+    sent = {"visit_id": number, "field": "date", "text": "?"}
+    assert client.post("/participants/P1/data-queries", data=sent, headers={"Accept": "text/html"}).status_code in (404, 422)
+
+
 def test_values_of_another_participant_are_not_asked_about(client: TestClient, values: dict[str, int]) -> None:
     assert client.post("/api/v1/participants", json={"code": "P2", "site": "main"}).status_code == 201
     for (name, number), field in zip(values.items(), ("date", "mg", "kind"), strict=True):
@@ -198,8 +206,10 @@ def test_a_blinded_assessor_neither_reads_queries_nor_is_led_to_them(
     assert blinded.get(f"/sessions/{session_id}").status_code == 403
     visit = client.get(f"/api/v1/sessions/{session_id}").json()["visit_id"]
     assert client.post(f"/api/v1/visits/{visit}/lock", json={"reason": "data complete", "password": PASSWORD}).status_code == 200
-    page = blinded.get(f"/sessions/{session_id}")
-    assert (page.status_code, "data-queries" in page.text) == (200, False)
+    assert "data-queries" in client.get(f"/visits/{visit}").text
+    for path in (f"/sessions/{session_id}", f"/visits/{visit}"):
+        page = blinded.get(path)
+        assert (page.status_code, "data-queries" in page.text) == (200, False)
     for closed in (HOME, "/participants/P1/data-queries"):
         assert blinded.get(closed).status_code == 403
 
