@@ -108,7 +108,8 @@ def _version(of: str) -> Callable[[Row, Row, Names], str]:
 
 def _dose(before: Row, after: Row, names: Names) -> str:
     row = after or before
-    return f"{'took back' if not after else 'wrote down'} a dose of {str(row['drug']).replace('_', ' ')} at {names.visit(row['visit_id'])}"
+    verb = "took back" if not after or after.get("removed_at") else "wrote down"
+    return f"{verb} a dose of {str(row['drug']).replace('_', ' ')} at {names.visit(row['visit_id'])}"
 
 
 def _of_session(first: str, later: str) -> Callable[[Row, Row, Names], str]:
@@ -177,7 +178,10 @@ def _place(kind: str) -> Callable[[Row, Row, Names], str]:
     def said(before: Row, after: Row, names: Names) -> str:
         row = after or before
         of = f" of study {names.studies.get(row['study_id'], row['study_id'])}" if "study_id" in row else ""
-        return f"{'removed' if not after else 'changed' if before else 'made'} the {kind} {row['code']}{of}"
+        verb = "removed" if not after else "changed" if before else "made"
+        if before and bool(before.get("ended_at")) != bool(row.get("ended_at")):
+            verb = "ended" if row.get("ended_at") else "opened again"
+        return f"{verb} the {kind} {row['code']}{of}"
 
     return said
 

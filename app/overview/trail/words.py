@@ -49,6 +49,7 @@ def _recorded(event: AuditEvent, names: Names) -> str:
         ("export", "audit"): lambda: "exported the audit trail" + _filtered(event),
         ("download", "plan"): lambda: f"printed {names.plan(number)}",
         ("refuse", "sign_in"): lambda: f"refused a sign-in of {event.entity_id}",
+        ("refuse", "confirmation"): lambda: f"refused {event.entity_id} a signature or a new password",
         ("refuse", "sign_on"): lambda: f"refused a sign-on of {event.entity_id}",
     }
     known = said.get((event.action, event.entity))

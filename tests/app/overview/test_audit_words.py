@@ -48,6 +48,7 @@ def recorded(action: str, entity: str, entity_id: str) -> AuditEvent:
 
 
 DRAFT = {"id": 9, "visit_id": 4, "status": "draft"}
+DOSE = {"drug": "levodopa", "visit_id": 4}
 REVISION = {"event_id": 2, "revision": 1, "kind": "fall", "cleared_reason": None}
 MEMBER = {"user_id": 2, "study_id": 1, "site_id": None, "role": "viewer"}
 FILE = {"id": 1, "upload_id": 2, "reviewed_at": None}
@@ -126,6 +127,9 @@ SESSION = {"id": 7, "visit_id": 4, "ordinal": 3, "status": "confirmed", "exclude
         ),
         (event("membership", MEMBER, MEMBER | {"role": "monitor"}), "changed ada@clinic.example to the role monitor in study main"),
         (event("study", None, {"code": "main"}), "made the study main"),
+        (event("study", {"code": "main"}, {"code": "main", "ended_at": "2026"}), "ended the study main"),
+        (event("dose", None, DOSE), "wrote down a dose of levodopa at visit 2 of P1"),
+        (event("dose", DOSE, DOSE | {"removed_at": "2026"}), "took back a dose of levodopa at visit 2 of P1"),
         (event("site", {"code": "south", "study_id": 1}, {"code": "south", "study_id": 1}), "changed the site south of study main"),
         (event("second_factor", None, {"user_id": 2}), "began to set up the second factor of ada@clinic.example"),
         (event("second_factor", {"user_id": 2}, {"user_id": 2, "confirmed_at": "2026"}), "set up the second factor of ada@clinic.example"),
