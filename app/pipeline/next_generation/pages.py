@@ -18,7 +18,7 @@ from app.platform.jobs import repository as jobs
 from app.platform.jobs import service as job_service
 from app.platform.web.forms import FormValues, parse
 from app.platform.web.templates import render
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, ResultsViewed
 from app.study.models import Participant
 
 router = APIRouter()
@@ -27,7 +27,7 @@ REFRESH_S = 4
 _LABELS = {"preset": "Size", "parents": "Policies to go on from", "tuned": "Fine-tuned from each", "count": "Trained from scratch"}
 
 
-@router.get("/participants/{code}/next-generation")
+@router.get("/participants/{code}/next-generation", dependencies=[ResultsViewed])
 def next_generation(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """What the next generation would go on from, and the button that starts it."""
     return _page(request, db, participant, caller, {})

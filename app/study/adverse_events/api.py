@@ -11,12 +11,12 @@ from app.study.adverse_events import repository, service
 from app.study.adverse_events.deps import CurrentEvent
 from app.study.adverse_events.schemas import AdverseEventChange, AdverseEventIn, AdverseEventOut, ClearanceIn
 from app.study.adverse_events.serializers import event_out
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, ResultsViewed
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
 
-@router.get("/participants/{code}/adverse-events")
+@router.get("/participants/{code}/adverse-events", dependencies=[ResultsViewed])
 def list_adverse_events(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> list[AdverseEventOut]:
     """A participant's adverse events in the order in which they were entered."""
     return [event_out(row, caller) for row in repository.events_of_participant(db, participant.id)]

@@ -19,7 +19,7 @@ from app.study import repository as study_repository
 from app.study.adverse_events import repository, service
 from app.study.adverse_events.deps import CurrentEvent
 from app.study.adverse_events.schemas import AdverseEventChange, AdverseEventIn, ClearanceIn
-from app.study.deps import CurrentParticipant
+from app.study.deps import CurrentParticipant, ResultsViewed
 from app.study.models import Participant
 from app.study.service import may
 from app.study.wording import EVENT_KINDS, EVENT_SEVERITIES
@@ -32,7 +32,7 @@ _LABELS = {
 }  # fmt: skip
 
 
-@router.get("/participants/{code}/adverse-events")
+@router.get("/participants/{code}/adverse-events", dependencies=[ResultsViewed])
 def adverse_events(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """All events of a participant, what waits for a clinician first, and a form for a new one."""
     return _page(request, participant, db, caller, {})

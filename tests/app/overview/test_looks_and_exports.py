@@ -33,10 +33,9 @@ SHOWS_NO_RESULTS = {
     "/participants/{code}/settings", "/api/v1/participants/{code}/settings", "/participants/{code}/margins",
     "/api/v1/participants/{code}/margins", "/api/v1/participants/{code}/margins/locks",
     "/participants/{code}/characteristics", "/api/v1/participants/{code}/characteristics",
-    # days, doses, devices, events and questions, which name no controller
+    # days, doses, devices and questions, which name no controller
     "/api/v1/participants/{code}/visits", "/api/v1/visits/{visit_id}", "/api/v1/visits/{visit_id}/locks", "/api/v1/visits/{visit_id}/doses",
     "/participants/{code}/device-history", "/api/v1/participants/{code}/device-history",
-    "/participants/{code}/adverse-events", "/api/v1/participants/{code}/adverse-events",
     "/participants/{code}/data-queries", "/api/v1/participants/{code}/data-queries",
     # outcomes of a session without what ran, and what it ran under without outcomes
     "/api/v1/sessions/{session_id}/qoc", "/api/v1/sessions/{session_id}/outcomes", "/api/v1/sessions/{session_id}/conditions",
@@ -49,7 +48,7 @@ SHOWS_NO_RESULTS = {
     "/participants/{code}/policies", "/api/v1/participants/{code}/policies", "/api/v1/policies/{policy_id}",
     "/api/v1/policies/{policy_id}/release", "/snapshots/{snapshot_id}", "/api/v1/snapshots/{snapshot_id}",
     "/api/v1/participants/{code}/snapshots", "/participants/{code}/jobs", "/jobs", "/jobs/{job_id}", "/api/v1/participants/{code}/jobs",
-    "/api/v1/jobs/{job_id}", "/api/v1/jobs/{job_id}/events", "/participants/{code}/next-generation",
+    "/api/v1/jobs/{job_id}", "/api/v1/jobs/{job_id}/events",
     # what shall run
     "/participants/{code}/plans", "/visits/{visit_id}/bundles", "/api/v1/visits/{visit_id}/day",
     "/visit-day/shell", "/visit-day/worker.js", "/visit-day/key",
