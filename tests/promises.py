@@ -7,6 +7,7 @@ from tests.promised.people import PEOPLE
 from tests.promised.promise import Promise
 from tests.promised.promise import of as _of
 from tests.promised.records import RECORDS
+from tests.promised.trail import TRAIL
 
 CHAIN = "tests/app/platform/test_audit_chain.py"
 ROLE = "tests/app/platform/test_service_role.py"
@@ -25,7 +26,6 @@ PLANS, KEY = "tests/app/planning/plans/test_sign_off.py", "tests/app/planning/pl
 RELEASES, MARGINS = "tests/app/planning/releases/test_releases.py", "tests/app/study/test_margin_signatures.py"
 SIGNATURES = "tests/app/platform/signatures/test_signatures.py"
 QUARANTINE, QUERIES = "tests/app/ingest/quarantine/test_quarantine.py", "tests/app/study/data_queries/test_data_queries.py"
-LOOKS, FOUND = "tests/app/overview/test_looks_and_exports.py", "tests/app/overview/test_audit_search.py"
 SCOPE, HEADERS = "tests/app/overview/test_audit_scope.py", "tests/app/platform/web/test_headers.py"
 MALFORMED, HASHES = "tests/app/platform/test_malformed_bodies.py", "tests/app/accounts/test_few_hashes_at_once.py"
 PASSWORDS, NUMBERS = "tests/app/accounts/test_passwords.py", "tests/app/platform/web/test_schemas.py"
@@ -238,43 +238,6 @@ PROMISES = [
          f"{KEY}::test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened"),
     ),
     *_of(
-        "study/deps",
-        ("tables of results that are taken are exports", 'record(db, "export", "results", path, {"format": form})', "pass",
-         f"{LOOKS}::test_each_table_that_is_taken_is_a_row_and_is_called_an_export"),
-        ("who looked at a session is in the trail", 'record_view(db, "session", session.id)', "False",
-         f"{LOOKS}::test_a_blinded_assessor_is_recorded_once_something_was_unblinded_for_them"),
-        ("who looked at a visit is in the trail", 'record_view(db, "visit", visit.id)', "False",
-         f"{LOOKS}::test_a_blinded_assessor_is_recorded_once_something_was_unblinded_for_them"),
-        ("blinded assessors who look at results after the lock are in the trail",
-         "caller.is_blinded and not repository.tells_some_arm(db, caller, request.path_params.get(\"code\"))", "caller.is_blinded",
-         f"{LOOKS}::test_a_blinded_assessor_is_recorded_once_something_was_unblinded_for_them"),
-    ),
-    *_of(
-        "overview/trail/export",
-        ("who took the trail is in the trail", 'record(db, "export", "audit", "trail", {"filters": stated})', "pass",
-         f"{FOUND}::test_taking_the_table_is_a_row_of_the_trail_that_keeps_no_words"),
-        ("no name that somebody looked for stays in the trail", 'stated["words"] = "stated"', "pass",
-         f"{FOUND}::test_taking_the_table_is_a_row_of_the_trail_that_keeps_no_words"),
-    ),
-    *_of(
-        "overview/trail/repository",
-        ("no search tells what is hidden under a sealed key", "values if hidden is None else and_(not_(hidden), values)", "values",
-         f"{KEY}::test_no_search_and_no_table_of_the_trail_tells_an_arm_of_a_sealed_plan"),
-        ("the trail is found by the participant", "if code := wanted.participant.strip().lower():", "if code := '':",
-         f"{FOUND}::test_a_participants_rows_are_all_of_theirs_and_of_nobody_else"),
-    ),
-    *_of(
-        "study/data_queries/fields",
-        ("a question keeps the value as it stood", "return value if isinstance(value, str) else",
-         "return None if isinstance(value, str) else",
-         f"{QUERIES}::test_every_clinical_value_is_asked_about_and_keeps_its_old_value"),
-    ),
-    *_of(
-        "overview/trail/acts",
-        ("the trail tells no arm of a sealed plan", "    if sealed:\n        hidden", "    if False:\n        hidden",
-         f"{KEY}::test_the_audit_trail_tells_no_arm_of_a_sealed_plan"),
-    ),
-    *_of(
         "study/visits/service",
         ("a locked visit takes no change", "    if visit.locked:\n        last", "    if False:\n        last",
          f"{LOCKS}::test_a_locked_visit_takes_no_change_until_it_is_unlocked_with_a_reason"),
@@ -411,4 +374,5 @@ PROMISES = [
     *FAULTS,
     *RECORDS,
     *PEOPLE,
+    *TRAIL,
 ]  # fmt: skip

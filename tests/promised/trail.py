@@ -1,0 +1,48 @@
+"""Promises of docs/trust.md about looks, exports, the search of the audit trail, and questions about values."""
+
+from __future__ import annotations
+
+from tests.promised.promise import Promise, of
+
+LOOKS, FOUND = "tests/app/overview/test_looks_and_exports.py", "tests/app/overview/test_audit_search.py"
+KEY, QUERIES = "tests/app/planning/plans/test_sealed_key.py", "tests/app/study/data_queries/test_data_queries.py"
+
+TRAIL: list[Promise] = [
+    *of(
+        "study/deps",
+        ("tables of results that are taken are exports", 'record(db, "export", "results", path, {"format": form})', "pass",
+         f"{LOOKS}::test_each_table_that_is_taken_is_a_row_and_is_called_an_export"),
+        ("who looked at a session is in the trail", 'record_view(db, "session", session.id)', "False",
+         f"{LOOKS}::test_a_blinded_assessor_is_recorded_once_something_was_unblinded_for_them"),
+        ("who looked at a visit is in the trail", 'record_view(db, "visit", visit.id)', "False",
+         f"{LOOKS}::test_a_blinded_assessor_is_recorded_once_something_was_unblinded_for_them"),
+        ("blinded assessors who look at results after the lock are in the trail",
+         "caller.is_blinded and not repository.tells_some_arm(db, caller, request.path_params.get(\"code\"))", "caller.is_blinded",
+         f"{LOOKS}::test_a_blinded_assessor_is_recorded_once_something_was_unblinded_for_them"),
+    ),
+    *of(
+        "overview/trail/export",
+        ("who took the trail is in the trail", 'record(db, "export", "audit", "trail", {"filters": stated})', "pass",
+         f"{FOUND}::test_taking_the_table_is_a_row_of_the_trail_that_keeps_no_words"),
+        ("no name that somebody looked for stays in the trail", 'stated["words"] = "stated"', "pass",
+         f"{FOUND}::test_taking_the_table_is_a_row_of_the_trail_that_keeps_no_words"),
+    ),
+    *of(
+        "overview/trail/repository",
+        ("no search tells what is hidden under a sealed key", "values if hidden is None else and_(not_(hidden), values)", "values",
+         f"{KEY}::test_no_search_and_no_table_of_the_trail_tells_an_arm_of_a_sealed_plan"),
+        ("the trail is found by the participant", "if code := wanted.participant.strip().lower():", "if code := '':",
+         f"{FOUND}::test_a_participants_rows_are_all_of_theirs_and_of_nobody_else"),
+    ),
+    *of(
+        "study/data_queries/fields",
+        ("a question keeps the value as it stood", "return value if isinstance(value, str) else",
+         "return None if isinstance(value, str) else",
+         f"{QUERIES}::test_every_clinical_value_is_asked_about_and_keeps_its_old_value"),
+    ),
+    *of(
+        "overview/trail/acts",
+        ("the trail tells no arm of a sealed plan", "    if sealed:\n        hidden", "    if False:\n        hidden",
+         f"{KEY}::test_the_audit_trail_tells_no_arm_of_a_sealed_plan"),
+    ),
+]  # fmt: skip
