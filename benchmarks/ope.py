@@ -37,10 +37,11 @@ from ml.population.virtual import WORLDS_PER_PART
 
 PAGE = "page"
 HEADLINE = POSTERIOR
-CHEAP = (POSTERIOR, "linear", "fqe", "wdr", "dlmm", "wis", "cwpdis")
+CHEAP = (POSTERIOR, "linear", "impulse", "fqe", "wdr", "dlmm", "pdis", "wis", "cwpdis")
+DEAR = ("dlsm", "dual_dice")
 PARTICIPANTS = ("P1", "P2", "P3", "P4")
 DLSM_EVERY = 6
-"""The DLSM runs on every sixth world: it costs more than all others together."""
+"""The DLSM and DualDICE run on every sixth world: they cost more than all others together."""
 QUICK_WORLDS, QUICK_TRUTH, TRUTH = 3, 80, 300
 
 
@@ -123,14 +124,19 @@ def _kept(case: Case, table: Mapping[str, Estimate]) -> dict[str, Any]:
 
 def tasks(chosen: argparse.Namespace, cells: Cells) -> list[Task]:
     """What is to be run, in order."""
-    methods = tuple(m for m in (*CHEAP, PAGE) if m not in chosen.without.split(","))
+    without = chosen.without.split(",")
+    methods = tuple(m for m in (*CHEAP, PAGE) if m not in without)
     if chosen.participants:
         return [Task(code, chosen.truth, methods, ("paper",), _of(cells, code)) for code in PARTICIPANTS[: 1 if chosen.quick else None]]
     result = []
     for index in range(chosen.first, WORLDS_PER_PART, chosen.every)[: chosen.worlds]:
         with_dlsm = chosen.dlsm and index % DLSM_EVERY == 0
         name = f"{chosen.part}{index:02d}"
-        result.append(Task(name, chosen.truth, ("dlsm", *methods) if with_dlsm else methods, DESIGNS, _of(cells, name)))
+        result.append(
+            Task(
+                name, chosen.truth, (*(m for m in DEAR if m not in without), *methods) if with_dlsm else methods, DESIGNS, _of(cells, name)
+            )
+        )
     return result
 
 
@@ -143,11 +149,13 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--part", choices=("A", "B", "C"), default="A", help="A to develop on, B to report on, C once before a release")
     parser.add_argument("--release", help="the release that a run of part C belongs to")
     parser.add_argument("--participants", action="store_true", help="the four detailed participants instead of the population")
-    parser.add_argument("--quick", action="store_true", help="three worlds or one participant, few simulated sessions, no DLSM")
+    parser.add_argument("--quick", action="store_true", help="three worlds or one participant, few simulated sessions, no DLSM or DualDICE")
     parser.add_argument("--worlds", type=int, default=WORLDS_PER_PART)
     parser.add_argument("--first", type=int, default=0, help="index of the first world")
     parser.add_argument("--without", default="", help="methods to leave out, with commas; `page` leaves out the baseline")
-    parser.add_argument("--no-dlsm", dest="dlsm", action="store_false", help=f"else the DLSM runs on every {DLSM_EVERY}th world")
+    parser.add_argument(
+        "--no-dlsm", dest="dlsm", action="store_false", help=f"else the DLSM and DualDICE run on every {DLSM_EVERY}th world"
+    )
     parser.add_argument("--every", type=int, default=1, help="take every so manyth world")
     parser.add_argument("--headline", default=HEADLINE, help="the method that the figures of the last line are of")
     parser.add_argument("--truth", type=int, help=f"simulated sessions behind each true return; {TRUTH}, {QUICK_TRUTH} with --quick")

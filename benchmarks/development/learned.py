@@ -36,7 +36,7 @@ from app.learning.sweeps.comparison import held_near
 from app.learning.training.compute import hold_out, supported_best, with_best_anchor
 from app.learning.training.configs import training_groups
 from benchmarks.support.cells import Cells
-from benchmarks.support.looks import look
+from benchmarks.support.looks import look, said
 from ml import rl
 from ml.ope.posterior.gains import PosteriorGain, gains_over_cdbs
 from ml.ope.posterior.verdict import Levels
@@ -199,6 +199,7 @@ def main() -> None:
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     look(chosen.part, " ".join(["learned", *sys.argv[1:]]), None)
+    sys.stdout.write(f"{said()}\n")
     of = arms(chosen)
     found, figures = trained(chosen, of), {}
     for arm in of:

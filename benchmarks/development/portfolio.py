@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from benchmarks.support.cells import Cells
 from benchmarks.support.figure import Point, draw_curves
-from benchmarks.support.looks import look
+from benchmarks.support.looks import look, said
 from benchmarks.support.ope_cases import CDBS, STEPS, virtual_case
 from ml.designs import near_session
 from ml.mdp import step_reward
@@ -359,6 +359,7 @@ def main() -> None:
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     look(chosen.part, " ".join(["portfolio", *sys.argv[1:]]), None)
+    sys.stdout.write(f"{said()}\n")
     if chosen.named:
         print_named(chosen.part, min(chosen.worlds, QUICK_WORLDS) if chosen.quick else chosen.worlds)
         return

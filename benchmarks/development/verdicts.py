@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from benchmarks.support.cells import Cells
-from benchmarks.support.looks import look
+from benchmarks.support.looks import look, said
 from benchmarks.support.ope_cases import CDBS, DESIGNS, STEPS, Case, virtual_case
 from ml.ope.compare.metrics import spearman
 from ml.ope.posterior.estimator import build
@@ -127,6 +127,7 @@ def main() -> None:
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     look(chosen.part, " ".join(["verdicts", *sys.argv[1:]]), None)
+    sys.stdout.write(f"{said()}\n")
     out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-verdicts-"))
     out.mkdir(parents=True, exist_ok=True)
     cells = Cells(out / f"verdicts{'-quick' if chosen.quick else ''}.jsonl")

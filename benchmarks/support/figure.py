@@ -35,10 +35,13 @@ def draw(found: dict[str, dict[str, dict[str, list[float]]]], metrics: tuple[str
 def _panel(
     found: dict[str, dict[str, dict[str, list[float]]]], metric: str, methods: list[str], top: float, group: int, *, last: bool
 ) -> list[str]:
-    rows = [table[m][metric] for table in found.values() for m in methods if m in table]
+    rows = [table[m][metric] for table in found.values() for m in methods if table.get(m, {}).get(metric)]
     means = [float(np.mean(r)) for r in rows] or [1.0, 1.0]
     # A method that is off by several ranges would flatten all others: its bar is cut, and its number stands on it.
-    high, low = (1.0, -1.0) if "%" not in metric else (min(max([*means, 1e-9]) * 1.1, 120.0), 0.0)
+    if "%" in metric:
+        high, low = min(max([*means, 1e-9]) * 1.1, 120.0), 0.0
+    else:
+        high, low = max(1.0, max(means) * 1.1), min(0.0, *means) if min(means) < 0 or max(means) > 1 else -1.0
 
     def y(value: float) -> float:
         return top + PANEL * (high - min(max(value, low), high)) / (high - low)
@@ -50,7 +53,7 @@ def _panel(
         parts.append(f'<text x="{LEFT - 6}" y="{y(tick) + 4:.1f}" text-anchor="end">{tick:.3g}</text>')
     for g, (world, table) in enumerate(found.items()):
         for k, method in enumerate(methods):
-            if method not in table:
+            if not table.get(method, {}).get(metric):
                 continue
             values = np.asarray(table[method][metric])
             mean, spread = float(values.mean()), float(values.std(ddof=1)) if values.size > 1 else 0.0

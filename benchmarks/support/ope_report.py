@@ -16,9 +16,25 @@ from .worlds_figure import draw_worlds
 
 DESIGNS = ("stratified", "paper")
 ORACLES = ("days alone", "tested")
-SHOWN = ("rank", "rank supported", "regret", "sharpe", "mae", "mae supported", "interval score", "width", "coverage", "supported")
-LOW_IS_WORSE = ("rank", "rank supported", "sharpe", "coverage", "supported")
-DRAWN = {"rank": "rank correlation", "regret": "regret, % of range", "mae": "MAE, % of range", "width": "median width, % of range"}
+METHODS = ("posterior", "page", "linear", "impulse", "fqe", "wdr", "dlmm", "pdis", "wis", "cwpdis", "dual_dice", "dlsm")
+METRICS = ("rank", "regret", "sharpe", "mae", "interval score", "width", "coverage", "worst first")
+SHOWN = (*METRICS, "supported")
+LOW_IS_WORSE = ("rank", "sharpe", "coverage", "supported")
+PAIRED = ("rank", "regret", "mae", "interval score")
+DRAWN = {
+    "rank": "rank correlation",
+    "regret": "regret, % of range",
+    "sharpe": "SharpeRatio@3",
+    "mae": "MAE, % of range",
+    "interval score": "interval score, % of range",
+    "width": "median width, % of range",
+    "coverage": "intervals that hold the truth, %",
+    "dose right": "sign of the answer to sustained dose, right among those told, %",
+    "dose told": "sign of the answer to sustained dose, told, %",
+    "follow right": "sign of the gain of following beta, right among those told, %",
+    "follow told": "sign of the gain of following beta, told, %",
+}
+"""Metric -> title of its panel; signs are shares over worlds, all others means of one number per world."""
 
 
 class Table(Protocol):
@@ -41,11 +57,20 @@ class Row:
 
     def add(self, name: str, scores: dict[str, float | None]) -> None:
         self.worlds.append(name)
-        for metric in (*SHOWN, "worst first"):
+        for metric in (*SHOWN, *(f"{m} supported" for m in METRICS)):
             self.scores.setdefault(metric, []).append(scores.get(metric))
 
     def summary(self, metric: str) -> dict[str, float]:
-        return over_worlds(self.scores.get(metric, []), worst_is_low=metric in LOW_IS_WORSE)
+        return over_worlds(self.scores.get(metric, []), worst_is_low=metric.removesuffix(" supported") in LOW_IS_WORSE)
+
+    def drawn(self, metric: str) -> list[float]:
+        """The numbers of one panel of the figure: one for each world, of signs the share over worlds; empty where there is none."""
+        if metric in self.scores:
+            return [(100 if "%" in DRAWN[metric] else 1) * x for x in self.scores[metric] if x is not None]
+        answers, what = metric.split()
+        right, unknown = signs(self.dose if answers == "dose" else self.follow)
+        share = right if what == "right" else 1 - unknown
+        return [] if math.isnan(share) else [100 * share]
 
 
 Summary = dict[tuple[str, str], Row]
@@ -93,8 +118,7 @@ def report(names: Iterable[str], cells: Table, headline: str, figure: Path, out:
     """Print tables, draw the figure, and return what they were made from."""
     names = list(names)
     truths = [cells.get(f"{n}/truth") for n in names]
-    methods = ["posterior", "page", "linear", "fqe", "wdr", "dlmm", "wis", "cwpdis", "dlsm"]
-    summary = summarise(names, cells, methods)
+    summary = summarise(names, cells, list(METHODS))
     flat = [n for n, t in zip(names, truths, strict=True) if t["flat"]]
     responders, silent = (sum(t[what] for t in truths) for what in ("responder", "silent"))
     out(f"{len(names)} worlds, {responders} responders, {silent} with a beta that hardly answers\n")
@@ -103,9 +127,7 @@ def report(names: Iterable[str], cells: Table, headline: str, figure: Path, out:
         _table(summary, design, headline, out)
     found = {
         design: {
-            method: {
-                title: [(100 if "%" in title else 1) * x for x in row.scores[metric] if x is not None] for metric, title in DRAWN.items()
-            }
+            method: {title: row.drawn(metric) for metric, title in DRAWN.items()}
             for (d, method), row in summary.items()
             if d == design and row.worlds
         }
@@ -124,14 +146,14 @@ def _table(summary: Summary, design: str, headline: str, out: Callable[[str], An
     rows = {m: r for (d, m), r in summary.items() if d == design}
     if not rows:
         return
-    out(f"\n{design} design; mean (median, worst decile) over worlds, shares of the range of true returns\n")
-    out(f"{'':<11}{'worlds':>7}" + "".join(f"{m:>24}" for m in SHOWN) + f"{'worst first':>13}{'CPU s':>8}\n")
-    for method, row in sorted(rows.items(), key=lambda item: -(item[1].summary("rank")["mean"] if item[1].worlds else -2)):
-        texts = [_cell(row.summary(m)) for m in SHOWN]
-        seconds = f"{np.mean(row.seconds):.1f}" if row.seconds else "-"
-        wrong = row.summary("worst first")["mean"]
-        failed = f"   failed in {row.failed}" if row.failed else ""
-        out(f"{method:<11}{len(row.worlds):>7}" + "".join(f"{t:>24}" for t in texts) + f"{wrong:>13.2f}{seconds:>8}{failed}\n")
+    for among, metrics in (("all candidates", SHOWN), ("those that the method supports", tuple(f"{m} supported" for m in METRICS))):
+        out(f"\n{design} design, {among}; mean (median, worst decile) over worlds, shares of the range of true returns\n")
+        out(f"{'':<11}{'worlds':>7}" + "".join(f"{m.removesuffix(' supported'):>24}" for m in metrics) + f"{'CPU s':>8}\n")
+        for method, row in sorted(rows.items(), key=lambda item: -(item[1].summary("rank")["mean"] if item[1].worlds else -2)):
+            texts = [_cell(row.summary(m)) for m in metrics]
+            seconds = f"{np.mean(row.seconds):.1f}" if row.seconds else "-"
+            failed = f"   failed in {row.failed}" if row.failed else ""
+            out(f"{method:<11}{len(row.worlds):>7}" + "".join(f"{t:>24}" for t in texts) + f"{seconds:>8}{failed}\n")
     for method, row in rows.items():
         if method not in ORACLES and row.worlds:
             dose, follow = signs(row.dose), signs(row.follow)
@@ -148,14 +170,14 @@ def _cell(s: dict[str, float]) -> str:
 
 
 def _paired(rows: dict[str, Row], headline: str, out: Callable[[str], Any]) -> None:
-    """Differences of rank correlation and regret from the headline's, on the worlds that both have."""
+    """Differences of `PAIRED` from the headline's, on the worlds that both have, with standard errors."""
     base = rows.get(headline)
     for method, row in rows.items():
         if base is None or method == headline:
             continue
         common = [w for w in base.worlds if w in row.worlds]
         texts = []
-        for metric in ("rank", "regret"):
+        for metric in PAIRED:
             gaps = [_at(base, w, metric) - _at(row, w, metric) for w in common]
             s = over_worlds(gaps, worst_is_low=True)
             texts.append(f"{metric} {s['mean']:+.2f} +- {s['error']:.2f}")

@@ -17,6 +17,7 @@ from ml.ope.compare.metrics import spearman
 LEVEL = 0.90
 TOP = 3
 TEST_DRAWS = 50
+FEWEST_SUPPORTED = 3
 LARGEST_SHARPE = 10.0
 """SharpeRatio@k is cut here: three policies of one return have no spread to divide by."""
 
@@ -56,32 +57,40 @@ def interval_score(low: np.ndarray, high: np.ndarray, truth: np.ndarray) -> np.n
 def world_scores(
     truth: Sequence[float], estimates: Sequence[Mapping[str, Any]], cdbs: float, places: Sequence[int] | None = None
 ) -> dict[str, float | None]:
-    """Metrics over the candidates of one world.
+    """Metrics over all candidates of one world and, with " supported" behind their names, over those that the method supports.
+
+    The latter are None below three of them, and where their true returns do not differ.
 
     Args:
         truth: true returns on new days, [P]. estimates: `value, low, high, supported` of each. cdbs: true return of cDBS.
         places: order that a page gives, 1 is first; the order of the values by default.
     """
-    v = np.asarray(truth, dtype=np.float64)
-    said, low, high = (np.array([e[k] for e in estimates], dtype=np.float64) for k in ("value", "low", "high"))
     supported = np.array([bool(e.get("supported", True)) for e in estimates])
-    order = -np.asarray(places, dtype=np.float64) if places is not None else said
+    v, order = np.asarray(truth, dtype=np.float64), None if places is None else -np.asarray(places, dtype=np.float64)
+    whole = _scores(v, estimates, cdbs, order)
+    few = supported.sum() < FEWEST_SUPPORTED or np.ptp(v[supported]) == 0
+    chosen = [e for e, kept in zip(estimates, supported, strict=True) if kept]
+    part = dict.fromkeys(whole) if few else _scores(v[supported], chosen, cdbs, None if order is None else order[supported])
+    return {**whole, **{f"{metric} supported": value for metric, value in part.items()}, "supported": float(supported.mean())}
+
+
+def _scores(v: np.ndarray, estimates: Sequence[Mapping[str, Any]], cdbs: float, order: np.ndarray | None) -> dict[str, float]:
+    """Metrics over candidates of true returns [P]; their order is that of the estimates unless it is given."""
+    said, low, high = (np.array([e[k] for e in estimates], dtype=np.float64) for k in ("value", "low", "high"))
+    order = said if order is None else order
     spread = float(np.ptp(v))
     top = np.argsort(-order, kind="stable")
     first, best = int(top[0]), v[top[:TOP]]
     missed = not low[first] <= v[first] <= high[first]
     return {
         "rank": spearman(v, order) or 0.0,
-        "rank supported": (spearman(v[supported], order[supported]) or 0.0) if supported.sum() >= 3 else None,
         "regret": float(v.max() - v[first]) / spread,
         "sharpe": min(max(best.max() - cdbs, 0.0) / max(float(best.std()), 1e-9), LARGEST_SHARPE),
         "mae": float(np.abs(said - v).mean()) / spread,
-        "mae supported": float(np.abs(said - v)[supported].mean()) / spread if supported.any() else None,
         "interval score": float(interval_score(low, high, v).mean()) / spread,
         "width": float(np.median(high - low)) / spread,
         "coverage": float(np.mean((low <= v) & (v <= high))),
         "worst first": float(bool(v[first] <= v.min()) and missed),
-        "supported": float(supported.mean()),
     }
 
 

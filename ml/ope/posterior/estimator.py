@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.estimate import LEVEL, Estimate, checked_horizon
-from ml.ope.flags import FEW_END_REWARDS, Flag, distinct
+from ml.ope.flags import FEW_END_REWARDS, Flag, distinct, stopped_sessions
 from ml.ope.lead import dose_before
 from ml.ope.linear.estimator import FittedLinear, LinearConfig, Replayed
 from ml.ope.outcomes.model import EndModel, fit_end_model
@@ -142,11 +142,15 @@ class FittedPosterior:
         replays, supports, draws = self.joint(everyone, horizon, report)
         skill = ordering_skill(self.buffer, self.predictions, self.equal, self.ends, self.levels)
         common = {"skill": skill.to_json(), "return_noise": round(return_noise(self.buffer, horizon), 4)}
-        look = AmplitudeSupport(self.buffer)
-        return {
-            name: self._estimate(i, replays, draws, supports[i], common, list(look.of_policy(chosen[i]).flags()), horizon)
-            for i, name in enumerate(names[:-1])
-        }
+        look, found = AmplitudeSupport(self.buffer), {}
+        moved = self._moved_as_measured(chosen, replays, horizon)
+        for i, name in enumerate(names[:-1]):
+            flags = list(look.of_policy(chosen[i]).flags())
+            if moved is not None:
+                counted = float(draws.values["r_end"][i].mean())
+                flags.append(stopped_sessions(sum(s.stopped for s in self.buffer.sessions), counted, counted + float(moved[i])))
+            found[name] = self._estimate(i, replays, draws, supports[i], common, flags, horizon)
+        return found
 
     def joint(self, policies: Mapping[str, Policy], horizon: int, report: Report = silent) -> tuple[Replays, list[Support], Draws]:
         """Replays, support and joint draws of all policies, cDBS last: what their estimates are made of."""
@@ -154,6 +158,16 @@ class FittedPosterior:
         support = SessionSupport(self.buffer)
         supports = [support.of(s) for s in replays.summaries]
         return replays, supports, self._draws(replays, policies, supports, horizon)
+
+    def _moved_as_measured(self, policies: list[Policy], replays: Replays, horizon: int) -> Floats | None:
+        """What r_end of each policy, [P], would gain if stopped sessions counted as measured; None where none was, or no r_end is."""
+        if not self.ends.seen[0] or not any(s.stopped for s in self.buffer.sessions):
+            return None
+        buffer = replace(self.buffer, sessions=tuple(replace(s, stopped=False) for s in self.buffer.sessions))
+        ends = fit_end_model(buffer, draws=self.ends.draws, seed=self.config.seed, severity=self.levels, wider=1.0)
+        other = replace(self, buffer=buffer, ends=ends)._replays(policies, horizon, silent)
+        measured, counted = (np.einsum("pdn,d->p", r.outcomes[..., 0], r.weights) / len(buffer.sessions) for r in (other, replays))
+        return np.asarray(measured - counted, dtype=np.float64)
 
     @property
     def levels(self) -> Floats:
@@ -218,13 +232,13 @@ class FittedPosterior:
         )
 
     def _estimate(
-        self, i: int, replays: Replays, draws: Draws, support: Support, common: dict[str, Any], amplitudes: list[Flag], horizon: int
+        self, i: int, replays: Replays, draws: Draws, support: Support, common: dict[str, Any], noted: list[Flag], horizon: int
     ) -> Estimate:
         values = {name: rows[i] for name, rows in draws.values.items()}
         own, with_end = values["return"], self.ends.seen[0]
         low, high = (float(q) for q in np.quantile(own, [(1 - LEVEL) / 2, (1 + LEVEL) / 2]))
         shown = {name: np.clip(values[name], *LIMITS[name]) for name in QUANTITIES if name in values and name != "return"}
-        flags = [*support.flags, *(f for f in amplitudes if not f.refuses)]
+        flags = [*support.flags, *(f for f in noted if not f.refuses)]
         flags += [] if with_end else [FEW_END_REWARDS]
         flags += [draws.unknown] if draws.unknown else []
         moved = {"mean_amplitude": replays.amplitude, "mean_beta": replays.beta}

@@ -11,9 +11,9 @@ from ml.ope.compare.aggregate import combine
 from ml.ope.compare.metrics import spearman
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.draws import KEPT, systematic
-from ml.ope.posterior.estimator import Posterior, PosteriorConfig, shared_out
+from ml.ope.posterior.estimator import CDBS, Posterior, PosteriorConfig, shared_out
 from ml.ope.posterior.gaussian import TestedDifference
-from ml.ope.posterior.structures import STRUCTURES
+from ml.ope.posterior.structures import STRUCTURES, Fit
 from ml.ope.registry import POSTERIOR, build
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.qoc import Qoc
@@ -120,3 +120,43 @@ def test_draws_are_dealt_out_by_weight() -> None:
     assert shared_out({"a": 0.9, "b": 0.09, "c": 0.01}, 40) == {"a": 36, "b": 6}
     counts = np.bincount(systematic(np.array([0.5, 0.3, 0.2]), 100, np.random.default_rng(0)))
     assert counts.tolist() == [50, 30, 20]
+
+
+def test_a_stopped_session_lowers_the_estimate_and_the_flag_says_what_it_would_be_as_measured(known_buffer, found) -> None:
+    lowest = min((s for s in known_buffer.sessions if s.controller == "random"), key=lambda s: s.amplitude.mean())
+    sessions = tuple(replace(s, stopped=s is lowest) for s in known_buffer.sessions)
+    after = SMALL.fit(replace(known_buffer, sessions=sessions)).evaluate({"constant 0.4": POLICIES["constant 0.4"]})["constant 0.4"]
+    before = found["constant 0.4"]
+    assert after.end_reward is not None
+    assert before.end_reward is not None
+    assert after.end_reward < before.end_reward - 5
+    flag = next(f for f in after.flags if f.code == "stopped_sessions")
+    assert flag.value == 1
+    assert flag.fact("counted") == pytest.approx(after.end_reward)
+    assert flag.fact("measured") == pytest.approx(before.end_reward, abs=3)
+    assert "stopped_sessions" not in {f.code for f in before.flags}
+
+
+def test_where_structures_disagree_on_a_lasting_dose_the_interval_holds_both(known_buffer) -> None:
+    """The same fit with one structure's answer to the dose turned round: nothing says which is right, so both must be held possible."""
+    fitted = SMALL.fit(known_buffer)
+    linear = next(f for f in fitted.fits if f.key == "linear")
+    turned = replace(linear, key="turned", drawn=replace(linear.drawn, beta=-linear.drawn.beta))
+
+    def steps(*fits: Fit) -> np.ndarray:
+        weights = {f.key: 1 / len(fits) for f in fits}
+        alone = replace(
+            fitted,
+            fits=fits,
+            shares={f.key: 12 for f in fits},
+            predictions=replace(fitted.predictions, weights=weights),
+            config=replace(fitted.config, model_errors={}, common_share=0.0),
+        )
+        _, _, draws = alone.joint({"low": ConstantPolicy(0.4), CDBS: ConstantPolicy(1.0)}, STEPS)
+        return np.asarray(draws.values["steps"][0] - draws.values["steps"][1])
+
+    one, other, both = steps(linear), steps(turned), steps(linear, turned)
+    low, high = np.quantile(both, [0.05, 0.95])
+    assert np.ptp([one.mean(), other.mean()]) > 3 * max(one.std(), other.std()), "they do disagree"
+    assert low < min(one.mean(), other.mean())
+    assert high > max(one.mean(), other.mean())

@@ -75,14 +75,14 @@ def test_levels_of_visits_are_no_skill() -> None:
 
 
 @pytest.mark.slow
-def test_noise_is_taken_for_skill_in_no_more_than_a_third() -> None:
-    """What one standard error for beta costs, by its measured rate (`BETA_MARGIN`); with two it was at most 2 of 20."""
-    assert sum(told(of_visits_alone(seed)) for seed in range(20)) <= 6
+def test_noise_is_taken_for_skill_in_no_more_than_a_fifth() -> None:
+    """Four questions with two standard errors each, by their measured rate (`MARGIN`)."""
+    assert sum(told(of_visits_alone(seed)) for seed in range(20)) <= 4
 
 
 def test_a_reduction_of_errors_by_chance_is_no_skill() -> None:
     """Half of the sessions are predicted a little better than by their mean, the others a little worse."""
-    bare = replace(BUFFER, settings=replace(BUFFER.settings, c2=0.0, c3=0.0, c4=0.0))
+    bare = replace(BUFFER, sessions=tuple(replace(s, qoc=Qoc()) for s in BUFFER.sessions))
     sign = np.where(np.arange(N) % 2, 1.0, -1.02)
     found = skill(OBSERVED - (OBSERVED - EQUAL) * (1 - 0.1 * sign), buffer=bare)
     assert found.reasons == ("no_better_than_equal",)
@@ -90,3 +90,16 @@ def test_a_reduction_of_errors_by_chance_is_no_skill() -> None:
 
 def test_outcomes_that_follow_the_dose_are_skill_where_beta_says_nothing() -> None:
     assert skill(EQUAL).told
+
+
+def test_outcomes_are_asked_whether_or_not_they_count_in_the_reward_at_the_end() -> None:
+    """Verdicts rest on each of them, so that one that follows the dose is skill beside others that are noise."""
+    unweighted = replace(BUFFER, settings=replace(BUFFER.settings, c2=0.0, c3=0.0, c4=0.0))
+    assert skill(EQUAL, buffer=unweighted).told
+    rng = np.random.default_rng(4)
+    noisy = [
+        replace(s, qoc=replace(s.qoc, rating=int(rng.integers(1, 11)), tremor_percent=float(rng.uniform(0, 60)))) for s in BUFFER.sessions
+    ]
+    assert skill(EQUAL, buffer=replace(BUFFER, sessions=tuple(noisy))).told
+    noise = [replace(s, qoc=replace(s.qoc, grasp_hz=float(rng.uniform(1, 3)))) for s in noisy]
+    assert not skill(EQUAL, buffer=replace(BUFFER, sessions=tuple(noise))).told
