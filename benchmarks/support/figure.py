@@ -8,7 +8,10 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-COLORS = ("#1f5a96", "#c8702a", "#3d8b57", "#8a5aa5", "#b5464c", "#6b6f76", "#caa12f", "#3aa0a8", "#94603d")
+COLORS = (
+    *("#1f5a96", "#c8702a", "#3d8b57", "#8a5aa5", "#b5464c", "#6b6f76", "#caa12f", "#3aa0a8", "#94603d"),
+    *("#7fb2e5", "#efb58a", "#8fcfa6", "#c9a6dd"),
+)
 PANEL, LEFT, TOP, GAP, GROUP_GAP, BAR = 170, 70, 40, 46, 26, 13
 
 
@@ -37,18 +40,14 @@ def _panel(
 ) -> list[str]:
     rows = [table[m][metric] for table in found.values() for m in methods if table.get(m, {}).get(metric)]
     means = [float(np.mean(r)) for r in rows] or [1.0, 1.0]
-    # A method that is off by several ranges would flatten all others: its bar is cut, and its number stands on it.
-    if "%" in metric:
-        high, low = min(max([*means, 1e-9]) * 1.1, 120.0), 0.0
-    else:
-        high, low = max(1.0, max(means) * 1.1), min(0.0, *means) if min(means) < 0 or max(means) > 1 else -1.0
+    low, high, step = _axis(metric, means)
 
     def y(value: float) -> float:
         return top + PANEL * (high - min(max(value, low), high)) / (high - low)
 
     right = LEFT + len(found) * group
     parts = [f'<text x="{LEFT}" y="{top - 8}" font-weight="bold">{escape(metric)}</text>']
-    for tick in np.linspace(low, high, 5):
+    for tick in np.arange(low, high + step / 2, step):
         parts.append(f'<line x1="{LEFT}" x2="{right}" y1="{y(tick):.1f}" y2="{y(tick):.1f}" stroke="#dddddd"/>')
         parts.append(f'<text x="{LEFT - 6}" y="{y(tick) + 4:.1f}" text-anchor="end">{tick:.3g}</text>')
     for g, (world, table) in enumerate(found.items()):
@@ -73,6 +72,20 @@ def _panel(
         if last:
             parts.append(f'<text x="{LEFT + (g + 0.5) * group}" y="{top + PANEL + 18}" text-anchor="middle">{escape(world)}</text>')
     return parts
+
+
+def _axis(metric: str, means: Sequence[float]) -> tuple[float, float, float]:
+    """Ends of a panel's axis and the step of its ticks.
+
+    A method that is off by several ranges would flatten all others: the axis ends at twice the median where a mean lies beyond that and
+    120 %, such a bar is cut, and its number stands on it.
+    """
+    top = min(max([*means, 1e-9]), max(120.0, 2 * float(np.median(means)))) if "%" in metric else max([1.0, *means])
+    bottom = min([0.0, *means])
+    rough = (top - bottom) / 4
+    size = 10.0 ** np.floor(np.log10(rough))
+    step = float(next(s * size for s in (1.0, 2.0, 2.5, 5.0, 10.0) if s * size >= rough))
+    return step * float(np.floor(bottom / step)), step * float(np.ceil(top / step)), step
 
 
 CURVES, MARGIN, ABOVE, BELOW, HIGH, LEGEND = 300, 60, 46, 50, 260, 170
