@@ -30,7 +30,7 @@ class Preset:
         random_sessions: of such a visit, after one of cDBS.
         session_minutes: of every session but no-DBS (5 minutes). The paper's lasted 5-20.
         policies_per_kind: full-sized and distilled policies that a visit tests, of each; together the paper's 2-4.
-        pipeline: params of the between-visit pipeline.
+        pipeline: params of the job between visits.
     """
 
     visits: int
@@ -73,7 +73,7 @@ class Design:
         return 4 * self.preset.policies_per_kind  # n policies, n - 1 cDBS sessions between them, one without stimulation
 
     def fine_tunes(self, visit: int) -> bool:
-        """Whether the pipeline before a visit goes on from the best tested policies: every second one; the first trains from scratch."""
+        """Whether the job before a visit goes on from the best tested policies: every second one; the first trains from scratch."""
         return (visit - self.preset.random_visits) % 2 == 0
 
 

@@ -14,7 +14,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.evaluation.ranking.service import current
-from app.learning import repository as learning
+from app.pipeline.next_generation import service as next_generation
+from app.pipeline.next_generation.parents import tested_policies
+from app.pipeline.params import NEXT_GENERATION, NextGenerationParams
 from app.pipeline.service import start_job
 from app.planning.plans import repository as plans
 from app.planning.plans import service as planning
@@ -26,14 +28,14 @@ from app.planning.slots import service as slots
 from app.platform.database import new_session, set_actor
 from app.platform.errors import BetaloopError, Conflict, NotFound
 from app.platform.jobs import repository as jobs
-from app.platform.jobs.models import JobStatus
+from app.platform.jobs.models import Job, JobStatus
 from app.platform.jobs.watch import POLL_S, look
 from app.simulation.demo_study import participant_body
 from app.simulation.design import BETWEEN_VISITS, MORNING, Design, Remembered
-from app.simulation.sessions import VisitDay, actual_return
+from app.simulation.sessions import VisitDay
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.blinding import CONTROLLER_NAMES, arm
+from app.study.blinding import CONTROLLER_NAMES
 from app.study.enrolment import service as enrolment
 from app.study.enrolment.schemas import ParticipantIn
 from app.study.models import Controller, Participant, Visit
@@ -161,15 +163,13 @@ class ParticipantLoop:
                 db.commit()
 
     def _learn(self, db: Session, person: Participant, number: int) -> None:
-        """The pipeline before a visit: the one that was begun for it, or a new one; waits for its end."""
+        """The job before a visit: the one that was begun for it, or a new one; waits for its end."""
         wanted = number - self.design.preset.random_visits
-        begun = [job for job in jobs.of_kind(db, person.id, "pipeline") if job.status not in (JobStatus.FAILED, JobStatus.CANCELLED)]
-        if len(begun) >= wanted:
-            job_id = begun[wanted - 1].id
-        else:
-            parents = self._parents(db, person) if self.design.fine_tunes(number) else []
-            params = self.design.preset.pipeline | {"policies": parents, "seed": (self.design.seed + 100 * number) % 10**6}
-            job_id = start_job(db, person, "pipeline", params, self.caller).job.id
+        rows = [job for kind in ("pipeline", NEXT_GENERATION) for job in jobs.of_kind(db, person.id, kind)]
+        begun = sorted(
+            (job for job in rows if job.status not in (JobStatus.FAILED, JobStatus.CANCELLED)), key=lambda job: (job.created_at, job.id)
+        )
+        job_id = begun[wanted - 1].id if len(begun) >= wanted else self._start(db, person, number).id
         db.commit()
         while not (view := look(job_id)).status.ended:
             self.check_worker()
@@ -179,21 +179,21 @@ class ParticipantLoop:
             time.sleep(POLL_S)
         if view.status != JobStatus.SUCCEEDED:
             raise BetaloopError(
-                f"The pipeline before visit {number} of {self.code} {view.status}: {view.error or 'no reason given'}",
+                f"The job before visit {number} of {self.code} {view.status}: {view.error or 'no reason given'}",
                 "Look at its page under Jobs, then start the simulation again: it goes on from here.",
             )
 
-    def _parents(self, db: Session, person: Participant) -> list[int]:
-        """The full-sized policies that did best in the clinic, by the mean actual return of their sessions."""
-        returns: dict[int, list[float]] = {}
-        for session in study_repository.sessions_of_participant(db, person.id):
-            assigned = arm(session, self.caller)
-            value = actual_return(db, session) if assigned.controller is Controller.RL else None
-            if assigned.policy_id is not None and value is not None:
-                returns.setdefault(assigned.policy_id, []).append(value)
-        usable = {p.id for p in learning.candidates(db, person.id) if p.kind == "trained"}
-        ordered = sorted(usable & returns.keys(), key=lambda i: (-sum(returns[i]) / len(returns[i]), i))
-        return ordered[: self.design.preset.policies_per_kind]
+    def _start(self, db: Session, person: Participant, number: int) -> Job:
+        """Start the job before a visit: the next generation from what did best by the posterior, or a pipeline from scratch.
+
+        The next generation judges the tested policies with the last visit's sessions, as for any participant; there is no second rule here.
+        """
+        size = self.design.preset
+        params = size.pipeline | {"seed": (self.design.seed + 100 * number) % 10**6}
+        if self.design.fine_tunes(number) and tested_policies(db, person):
+            wanted = NextGenerationParams.model_validate(params | {"parents": size.policies_per_kind})
+            return next_generation.start(db, person, wanted, self.caller)
+        return start_job(db, person, "pipeline", params, self.caller).job
 
     def _draft(self, db: Session, person: Participant, visit: Visit, collects: bool) -> None:
         """Draft the visit: random sessions alone at first, then policies. A session without stimulation ends each day."""

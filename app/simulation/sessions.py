@@ -25,12 +25,9 @@ from app.simulation.tablet import Moment, run_slot_of
 from app.study import service as study
 from app.study.models import Controller, Participant, StudySession, Visit
 from app.study.schemas import QocIn
-from app.study.sessions.data import qoc_of, session_data
 from app.study.threshold import mdp_settings
-from ml.mdp import end_reward, step_reward
 from ml.population import SimulatedSession, run_session
 from ml.population.outcomes import GRASP_TEST_S, Outcomes
-from ml.returns import ActualReturn, step_return
 
 RESOLUTION_MA = 0.1
 """What an RC+S delivers."""
@@ -149,15 +146,6 @@ def without_stimulation(participant: Participant, at: Moment, steps: int) -> Sim
         study_seed=at.study_seed,
         name="no_dbs",
     )
-
-
-def actual_return(db: Session, session: StudySession) -> float | None:
-    """What a session brought over all its steps, by the rule of `ml.returns` for gaps; None without its QoCs or with too many gaps."""
-    settings = mdp_settings(session.visit.participant.current_settings)
-    table = session_data(db, session).table
-    during = table.t_s > 0
-    rewards = step_reward(settings, table.beta[during], table.fraction[during])
-    return ActualReturn(step_return(rewards, settings.gamma, rewards.size), end_reward(settings, qoc_of(session))).value
 
 
 def _stem(visit: Visit, item: PlanItem) -> str:
