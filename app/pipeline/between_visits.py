@@ -8,8 +8,8 @@ from app.learning.training.configs import training_groups
 from app.pipeline.distillation import declare_distillation, distil_all
 from app.pipeline.evaluation import declare_evaluation, declare_fit, evaluate_all, fit_calls, store_members
 from app.pipeline.params import PipelineParams
-from app.pipeline.stages import PLAN, STORE_WEIGHT, plan_on_snapshot
-from app.pipeline.training import declare_training, store_trained, training_calls, training_starts
+from app.pipeline.stages import PLAN, STORE_WEIGHT, acting, plan_on_snapshot
+from app.pipeline.training import declare_training, store_trained, training_calls, training_plan
 from app.platform.jobs import JobContext
 
 
@@ -22,10 +22,10 @@ def run_pipeline(job: JobContext) -> dict[str, Any]:
     declare_fit(job, evaluation)
     declare_distillation(job, len(params.policies) or params.count)
     declare_evaluation(job, evaluation, fit=False)
-    planned = plan_on_snapshot(job, lambda db, snapshot: {"starts": training_starts(db, snapshot.participant_id, training)})
+    planned = plan_on_snapshot(job, lambda db, snapshot: training_plan(db, snapshot, training, acting(job)))
     snapshot = planned["snapshot"]
     groups = training_groups(training, planned["starts"])
-    trainings = training_calls(training, snapshot, groups)
+    trainings = training_calls(training, planned, groups)
     results = job.compute_all([*trainings, *fit_calls(evaluation, snapshot["sha256"])])
     policies = store_trained(job, training, snapshot["id"], groups, results[: len(trainings)])
     models = store_members(job, results[len(trainings) :])

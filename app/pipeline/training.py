@@ -7,14 +7,17 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
+from app.accounts.permissions import Caller
+from app.evaluation.ranking.results import driven_sessions, tests_of
 from app.learning import repository
 from app.learning.models import BufferSnapshot
 from app.learning.policies import service
 from app.learning.schemas import ALGORITHM_NAMES, TrainParams
+from app.learning.snapshots.buffers import read_buffer
 from app.learning.sweeps import service as sweeps
 from app.learning.sweeps.service import Group
 from app.learning.training.configs import training_groups
-from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, plan_on_snapshot, policy_facts
+from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, acting, plan_on_snapshot, policy_facts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
 from app.study.models import Participant
@@ -28,11 +31,30 @@ def run_train(job: JobContext) -> dict[str, Any]:
     params = TrainParams.model_validate(job.params)
     job.step(PLAN, "Pin the sessions to learn from", weight=STORE_WEIGHT)
     declare_training(job, params)
-    planned = plan_on_snapshot(job, lambda db, snapshot: {"starts": training_starts(db, snapshot.participant_id, params)})
+    planned = plan_on_snapshot(job, lambda db, snapshot: training_plan(db, snapshot, params, acting(job)))
     groups = training_groups(params, planned["starts"])
-    results = job.compute_all(training_calls(params, planned["snapshot"], groups))
+    results = job.compute_all(training_calls(params, planned, groups))
     policies = store_trained(job, params, planned["snapshot"]["id"], groups, results)
     return {"snapshot_id": planned["snapshot"]["id"], "policy_ids": [p["id"] for p in policies]}
+
+
+def training_plan(db: Session, snapshot: BufferSnapshot, params: TrainParams, caller: Caller) -> dict[str, Any]:
+    """What the training stage reads before it begins: `starts` and `tested_so_far`, as the functions give them."""
+    return {"starts": training_starts(db, snapshot.participant_id, params), "tested_so_far": tested_so_far(db, snapshot, caller)}
+
+
+def tested_so_far(db: Session, snapshot: BufferSnapshot, caller: Caller) -> dict[str, Any]:
+    """What sessions of policies showed, as the evaluation of the same snapshot would know it; sweeps go by it too.
+
+    Returns:
+        `tests`, as `tests_of` makes them, and `policies` that they are of as [{`id`, `sha256`}].
+    """
+    ran, settings = driven_sessions(db, snapshot, caller), read_buffer(snapshot.file_sha256).settings
+    driven = {s.policy_id for s in ran}
+    usable = [p for p in repository.candidates(db, snapshot.participant_id) if p.id in driven and service.window_of(p) == settings.window]
+    tests = tests_of(ran, settings, snapshot.median_steps, {p.id for p in usable})
+    named = {test["policy_name"] for test in tests}
+    return {"tests": tests, "policies": [{"id": p.id, "sha256": p.onnx_sha256} for p in usable if str(p.id) in named]}
 
 
 def training_starts(db: Session, participant_id: int, params: TrainParams) -> list[dict[str, Any] | None]:
@@ -58,10 +80,19 @@ def training_starts(db: Session, participant_id: int, params: TrainParams) -> li
     return starts
 
 
-def training_calls(params: TrainParams, snapshot: Mapping[str, Any], groups: Sequence[Group]) -> list[ComputeStep]:
-    """Compute steps of the training stage: the groups of policies, then the baselines; `snapshot` as `stages.snapshot_facts` has it."""
-    # a job that an earlier version began knows no margins
-    common = {"snapshot_sha256": snapshot["sha256"], "held_out": params.held_out, "margins": snapshot.get("margins")}
+def training_calls(params: TrainParams, planned: Mapping[str, Any], groups: Sequence[Group]) -> list[ComputeStep]:
+    """Compute steps of the training stage: the groups of policies, then the baselines.
+
+    `planned` has `snapshot` as `stages.snapshot_facts` makes it, and `tested_so_far` as the function gives it.
+    """
+    snapshot = planned["snapshot"]
+    common = {
+        "snapshot_sha256": snapshot["sha256"],
+        "held_out": params.held_out,
+        # a job that an earlier version began knows neither
+        "margins": snapshot.get("margins"),
+        "tested": planned.get("tested_so_far"),
+    }
     calls: list[ComputeStep] = []
     for group in groups:
         call = {**common, "algorithm": group["algorithm"], "configs": group["configs"]}

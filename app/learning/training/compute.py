@@ -20,7 +20,8 @@ from app.platform.jobs import JobError, StepReport, write_atomically
 from ml import rl
 from ml.loading import load_libraries
 from ml.ope.fqe.score import fqe_value
-from ml.ope.posterior.gains import PosteriorGain, gains_over_cdbs
+from ml.ope.posterior.gains import PosteriorGain, Tests, gains_over_cdbs
+from ml.ope.posterior.gaussian import TestedDifference
 from ml.ope.posterior.verdict import Levels
 from ml.policies.from_buffer import behaviour_mean, proportional_from_buffer
 from ml.policies.logged_range import random_bound, share_below_bound, stays_in_range
@@ -47,7 +48,8 @@ def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
 
     Args:
         params: `snapshot_sha256`; `algorithm`; `configs`, members of its configuration; `held_out`, whether sessions are left out;
-            `margins` as `_judged_by` takes them; optionally `initial` with `checkpoint_sha256` or `onnx_sha256`.
+            `margins` as `_judged_by` takes them; `tested` as `known_tests` does; optionally `initial` with `checkpoint_sha256` or
+            `onnx_sha256`.
         workdir: gets each policy as `policy-K.onnx` and its whole training as `training-K.pt`.
         report: learning curves over updates.
 
@@ -58,14 +60,15 @@ def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
     try:
         method = rl.algorithm(params["algorithm"])
         initial = _initial(params.get("initial"))
-        given = with_best_anchor(params["configs"], buffer, params["margins"])
+        tests = known_tests(params.get("tested"), buffer)
+        given = with_best_anchor(params["configs"], buffer, params["margins"], tests)
         configs = [method.config.from_json(_with_start(one, initial)) for one in given]
         updates = configs[0].updates
         learnt, held_out = hold_out(buffer, params["held_out"], every=max(1, updates // 10))
         results = rl.train_many(learnt, configs, report.curves(updates), workdir / "checkpoint.pt", initial, held_out)
     except (rl.TrainingDiverged, rl.CheckpointError, ValueError) as error:
         raise JobError(f"The policies cannot be trained: {error}.") from error
-    gains = stored_gains(buffer, {str(k): result.policy for k, result in enumerate(results)}, params["margins"])
+    gains = stored_gains(buffer, {str(k): result.policy for k, result in enumerate(results)}, params["margins"], tests)
     members = []
     for k, result in enumerate(results):
         write_atomically(workdir / policy_file(k), result.policy.to_onnx())
@@ -79,7 +82,8 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
     """Score controllers that learn nothing, or no more than to imitate, as the policies of the sweep are scored.
 
     Args:
-        params: `snapshot_sha256`; `held_out`, whether sessions are left out; `margins` as `_judged_by` takes them; `seed`.
+        params: `snapshot_sha256`; `held_out`, whether sessions are left out; `margins` as `_judged_by` takes them; `tested` as
+            `known_tests` does; `seed`.
         workdir: gets the clone of the logged behaviour as `clone.onnx`.
         report: progress.
 
@@ -97,7 +101,8 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
         raise JobError(f"The logged behaviour cannot be cloned: {error}.") from error
     write_atomically(workdir / CLONE, clone.to_onnx())
     report.progress(0.3, "scoring constant amplitudes")
-    best = supported_best(buffer, params["margins"])
+    tests = known_tests(params.get("tested"), buffer)
+    best = supported_best(buffer, params["margins"], tests)
     named: dict[str, Policy] = {
         "cDBS": ConstantPolicy(1.0),
         **({} if best is None else {f"best constant, {best:.2f}": ConstantPolicy(best)}),
@@ -109,7 +114,7 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
         named["proportional to beta"] = proportional_from_buffer(learnt)
     states = buffer.transitions().states
     report.progress(0.6, "estimating gains over cDBS")
-    gains = stored_gains(buffer, named, params["margins"])
+    gains = stored_gains(buffer, named, params["margins"], tests)
     rows = [
         {
             "controller": name,
@@ -135,10 +140,18 @@ def best_supported(constants: Mapping[str, PosteriorGain], level: float) -> floa
     return float(max(of, key=of.__getitem__)) if of else None
 
 
-def supported_best(buffer: ReplayBuffer, margins: Mapping[str, float] | None) -> float | None:
+def known_tests(tested: Mapping[str, Any] | None, buffer: ReplayBuffer) -> Tests:
+    """Tested policies as `app.pipeline.training.tested_so_far` has them; none where None, as in a job that an earlier version began."""
+    if tested is None:
+        return Tests()
+    policies = {str(p["id"]): OnnxPolicy(files.read(p["sha256"]), buffer.settings.window) for p in tested["policies"]}
+    return Tests(tuple(TestedDifference(**test) for test in tested["tests"]), policies)
+
+
+def supported_best(buffer: ReplayBuffer, margins: Mapping[str, float] | None, tests: Tests | None = None) -> float | None:
     """`best_supported` of tenths that are probably within the margins; `margins` as `_judged_by` takes them."""
     limits, levels = _judged_by(margins)
-    constants = _gains(buffer, {f"{a:.2f}": ConstantPolicy(a) for a in CONSTANT_GRID}, limits)
+    constants = _gains(buffer, {f"{a:.2f}": ConstantPolicy(a) for a in CONSTANT_GRID}, limits, tests)
     return best_supported(constants, 1 - levels.unsafe_beyond)
 
 
@@ -149,11 +162,13 @@ def _judged_by(margins: Mapping[str, float] | None) -> tuple[Margins, Levels]:
     return Margins(**given), Levels(**levels)
 
 
-def with_best_anchor(configs: Sequence[dict[str, Any]], buffer: ReplayBuffer, margins: Mapping[str, float] | None) -> list[dict[str, Any]]:
+def with_best_anchor(
+    configs: Sequence[dict[str, Any]], buffer: ReplayBuffer, margins: Mapping[str, float] | None, tests: Tests | None = None
+) -> list[dict[str, Any]]:
     """Configurations in which the anchor `best` is the amplitude that it means; cDBS where no constant has a claim to be better."""
     if not any(one.get("anchor") == BEST for one in configs):
         return list(configs)
-    best = supported_best(buffer, margins)
+    best = supported_best(buffer, margins, tests)
     found = {"anchor": "constant", "anchor_amplitude": 1.0 if best is None else best}
     return [one | found if one.get("anchor") == BEST else one for one in configs]
 
@@ -186,14 +201,15 @@ def _share_of_end(learnt: ReplayBuffer, config: rl.TrainConfig) -> dict[str, Any
 
 
 def stored_gains(
-    buffer: ReplayBuffer, policies: Mapping[str, Policy], margins: Mapping[str, float] | None = None
+    buffer: ReplayBuffer, policies: Mapping[str, Policy], margins: Mapping[str, float] | None = None, tests: Tests | None = None
 ) -> dict[str, dict[str, Any] | None]:
     """Gain of each policy over cDBS by the posterior over the whole buffer, as it is stored; None where it cannot be estimated.
 
-    The policies have seen most of these sessions, which flatters them. `margins` as `_judged_by` takes them.
+    The policies have seen most of these sessions, which flatters them. `margins` as `_judged_by` takes them. `tests`: what tested sessions
+    showed of other policies; it moves those that act alike.
     """
     limits, levels = _judged_by(margins)
-    gains = _gains(buffer, policies, limits)
+    gains = _gains(buffer, policies, limits, tests)
     return {name: _stored(gains[name], levels) if name in gains else None for name in policies}
 
 
@@ -203,10 +219,10 @@ def _stored(one: PosteriorGain, levels: Levels) -> dict[str, Any]:
     return asdict(one.gain) | told | {"within": one.within, "saves": one.saves, "expected_saving": one.expected_saving}
 
 
-def _gains(buffer: ReplayBuffer, policies: Mapping[str, Policy], margins: Margins) -> dict[str, PosteriorGain]:
+def _gains(buffer: ReplayBuffer, policies: Mapping[str, Policy], margins: Margins, tests: Tests | None) -> dict[str, PosteriorGain]:
     """Gains over cDBS; none where the sessions are too few for the posterior."""
     try:
-        return gains_over_cdbs(buffer, policies, margins=margins)
+        return gains_over_cdbs(buffer, policies, margins=margins, tests=tests)
     except ValueError:  # what the method says of sessions that it cannot fit
         return {}
 

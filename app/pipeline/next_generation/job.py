@@ -15,7 +15,7 @@ from app.pipeline.evaluation import declare_evaluation, declare_fit, evaluate_al
 from app.pipeline.next_generation.parents import best, posterior_on, tested_policies
 from app.pipeline.params import NextGenerationParams
 from app.pipeline.stages import PLAN, STORE_WEIGHT, acting, participant_of, plan_on_snapshot, policy_facts
-from app.pipeline.training import declare_training, store_trained, training_calls, training_starts
+from app.pipeline.training import declare_training, store_trained, tested_so_far, training_calls, training_starts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext, JobError
 from ml.ope.registry import POSTERIOR, shown
@@ -38,7 +38,7 @@ def run_next_generation(job: JobContext) -> dict[str, Any]:
     declare_fit(job, evaluation)
     declare_distillation(job, sum(len(group["configs"]) for group in groups))
     declare_evaluation(job, evaluation, fit=False)
-    trainings = training_calls(training, snapshot, groups)
+    trainings = training_calls(training, planned, groups)
     results = job.compute_all([*trainings, *fit_calls(evaluation, snapshot["sha256"])])
     policies = store_trained(job, training, snapshot["id"], groups, results[: len(trainings)])
     models = store_members(job, results[len(trainings) :])
@@ -51,12 +51,13 @@ def run_next_generation(job: JobContext) -> dict[str, Any]:
 def _plan(db: Session, job: JobContext, snapshot: BufferSnapshot) -> dict[str, Any]:
     """The tested policies, and their posterior returns where a ranking knows all sessions; what judging them anew needs where none does."""
     tested = [t.policy for t in tested_policies(db, participant_of(db, job))]
+    plan = {"tested": policy_facts(tested), "tested_so_far": tested_so_far(db, snapshot, acting(job))}
     known = posterior_on(db, snapshot.participant_id, snapshot.id)
     if all(p.id in known for p in tested):
-        return {"tested": policy_facts(tested), "posterior": {str(p.id): known[p.id] for p in tested}}
+        return plan | {"posterior": {str(p.id): known[p.id] for p in tested}}
     settings = read_buffer(snapshot.file_sha256).settings
     tests = tests_of(driven_sessions(db, snapshot, acting(job)), settings, snapshot.median_steps, {p.id for p in tested})
-    return {"tested": policy_facts(tested), "posterior": None, "tests": tests, "horizon_steps": snapshot.median_steps}
+    return plan | {"posterior": None, "tests": tests, "horizon_steps": snapshot.median_steps}
 
 
 def _starts(job: JobContext, params: NextGenerationParams, planned: dict[str, Any]) -> list[dict[str, Any]]:

@@ -1,18 +1,20 @@
 """Gains of policies over cDBS by the posterior: what sweeps go by, before an evaluation with all its methods.
 
 The structures and weights are those of the ranking, at the size of a first look. Draws are aligned, so that what policies share cancels.
+Sessions that tested other policies move the gains of those that act alike, as they do in the ranking.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.estimator import build
+from ml.ope.posterior.gaussian import TestedDifference
 from ml.ope.posterior.verdict import outcome_draws, slacks
 from ml.policies.policy import ConstantPolicy, Policy
 from ml.progress import Report, silent
@@ -21,7 +23,7 @@ from ml.returns import Gain
 from ml.trajectories import ReplayBuffer
 
 AT_A_TIME = 8
-"""Policies that are replayed side by side: every session of every draw is in memory."""
+"""Policies that are replayed side by side, with those that were tested: every session of every draw is in memory."""
 
 
 @dataclass(frozen=True)
@@ -46,20 +48,55 @@ class PosteriorGain:
         return None if self.within is None or self.saves is None else self.within * self.saves
 
 
+@dataclass(frozen=True)
+class Tests:
+    """What tested sessions showed.
+
+    Attributes:
+        differences: to the same visit's cDBS, over the buffer's median session length. policies: that were tested, by the names in these.
+
+    Raises:
+        ValueError: a difference of a policy that is not among them.
+    """
+
+    __test__ = False  # no test class of pytest
+
+    differences: tuple[TestedDifference, ...] = ()
+    policies: Mapping[str, Policy] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if unknown := sorted({test.policy_name for test in self.differences} - set(self.policies)):
+            raise ValueError(f"sessions tested {unknown[0]!r}, which is not among the tested policies")
+
+
 def gains_over_cdbs(
-    buffer: ReplayBuffer, policies: Mapping[str, Policy], seed: int = 0, report: Report = silent, margins: Margins | None = None
+    buffer: ReplayBuffer,
+    policies: Mapping[str, Policy],
+    seed: int = 0,
+    report: Report = silent,
+    margins: Margins | None = None,
+    tests: Tests | None = None,
 ) -> dict[str, PosteriorGain]:
-    """Gain of every policy, by name; a policy that acts as cDBS has one of about 0. `margins` are the default ones where None.
+    """Gain of every policy, by name; a policy that acts as cDBS has one of about 0.
+
+    Args:
+        buffer: the sessions. policies: whose gains are asked for. seed: of all draws. report: progress.
+        margins: the default ones where None. tests: of any policies; each is replayed beside those asked for, so that it informs them.
 
     Raises:
         ValueError: fewer than two sessions with usable steps.
     """
-    fitted, names = build("posterior", seed, "demo").fit(buffer), list(policies)
+    tests, names = tests or Tests(), list(policies)
+    # names of their own: a policy that is asked for may be called as a tested one is, and be another
+    tested = {f"tested {name}": policy for name, policy in tests.policies.items()}
+    differences = [replace(test, policy_name=f"tested {test.policy_name}") for test in tests.differences]
+    fitted = build("posterior", seed, "demo").with_tests(differences).fit(buffer)
     found: dict[str, PosteriorGain] = {}
     for first in range(0, len(names), AT_A_TIME):
         part = names[first : first + AT_A_TIME]
         numbered = {str(k): policy for k, policy in enumerate([*(policies[n] for n in part), ConstantPolicy(1.0)])}
-        *estimates, cdbs = fitted.evaluate(numbered).values()
+        found_here = fitted.evaluate({**numbered, **tested})
+        *estimates, cdbs = (found_here[k] for k in numbered)
         for name, one in zip(part, estimates, strict=True):
             within = _within(one, cdbs, margins or Margins())
             found[name] = PosteriorGain(gain_over(one, cdbs), one.supported, bool(one.details["skill"]["told"]), within, _saves(one, cdbs))
