@@ -99,6 +99,12 @@ class Assessment:
         return self._posterior_detail("weights")
 
     @property
+    def standard_errors(self) -> Mapping[int, Mapping[str, float]]:
+        """By policy, those of its posterior return by their cause (`statistical`, `model_error`); without those of earlier versions."""
+        known = {a.policy.id: a.posterior.details.get("standard_errors") for a in self.assessed if a.posterior is not None}
+        return {policy_id: errors for policy_id, errors in known.items() if errors}
+
+    @property
     def held_out_correlation(self) -> float | None:
         """Of predicted with observed rewards of left-out sessions; None where it is not known."""
         return self._posterior_detail("skill").get("held_out_correlation")

@@ -102,6 +102,7 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             chance=wording.chance,
             weights=assessment.weights,
             correlation=assessment.held_out_correlation,
+            errors=assessment.standard_errors,
             unfolded=unfolded,
             levels=participant.current_margins,
             forest=charts.forest(found),

@@ -22,6 +22,10 @@ KEPT = 400
 """Draws that are kept, aligned over policies and quantities."""
 
 
+STATISTICAL = "return without model errors"
+"""Among the quantities of `Draws`: the return as structures, coefficients and days alone spread it."""
+
+
 @dataclass(frozen=True)
 class Replays:
     """Sessions under policies in all structures: P policies, D draws, n sessions.
@@ -44,6 +48,9 @@ class Replays:
 @dataclass(frozen=True)
 class Draws:
     """Draws [P, KEPT] by quantity: `steps`, `r_end`, `return`, `energy` and the QoCs that sessions have.
+
+    `STATISTICAL` is the return without what structures get wrong: tested sessions move it with the others, so that what is left of either
+    error can be told.
 
     Attributes:
         between_visits: standard deviation of a policy's true difference to cDBS between visits, by quantity.
@@ -82,25 +89,32 @@ def joint_draws(
     rng = np.random.default_rng([seed, 0x9057])
     picked = systematic(replays.weights, KEPT, rng)
     reach = float(np.sum(settings.gamma ** np.arange(horizon))) * abs(settings.r_a - settings.r_b)
-    drawn, between = {}, {}
+    drawn, between, exact = {}, {}, {}
     for name, values in parts.items():
         base, over_draws = values @ days.weights, np.einsum("pdn,d->pn", values, replays.weights)
         own = mean_over_days(over_draws, visits, KEPT, seed)
         rows = base[:, picked] + common_share * own.common + own.own
         # what was picked has a mean of its own: the draws keep that of all
         rows += (base @ replays.weights - rows.mean(1))[:, None]
+        exact[name] = rows
         if name in model_errors:
             sd = error_unit(name, rows.mean(1), reach) * np.array([model_errors[name].sd(v) for v in leverage])
-            rows += correlated(alike, sd, KEPT, rng)
+            rows = rows + correlated(alike, sd, KEPT, rng)
         drawn[name] = rows
         between[name] = _between_visits(over_draws - over_draws[-1], visits)
-    if constants is not None:
-        qoc = [drawn.get(name, np.zeros_like(drawn["steps"])) for name in OUTCOMES[1:]]
-        drawn["r_end"] = np.einsum("k,kpd->pd", constants, np.stack(qoc))
-    drawn.setdefault("r_end", np.zeros_like(drawn["steps"]))
+    drawn["r_end"] = _end_rewards(drawn, constants)
     drawn["return"] = drawn["steps"] + drawn["r_end"]
+    drawn[STATISTICAL] = exact["steps"] + _end_rewards(exact, constants)
     between["return"] = _between_visits(np.einsum("pdn,d->pn", total - total[-1], replays.weights), visits)
     return Draws(drawn, between, days.unknown)
+
+
+def _end_rewards(drawn: Mapping[str, Floats], constants: Floats | None) -> Floats:
+    """r_end of every draw, [P, KEPT], from its QoCs; 0 without constants."""
+    none = np.zeros_like(drawn["steps"])
+    if constants is None:
+        return none
+    return np.asarray(np.einsum("k,kpd->pd", constants, np.stack([drawn.get(name, none) for name in OUTCOMES[1:]])), dtype=np.float64)
 
 
 def systematic(weights: Floats, number: int, rng: np.random.Generator) -> NDArray[np.int64]:

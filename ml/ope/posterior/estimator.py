@@ -21,7 +21,7 @@ from ml.ope.lead import dose_before
 from ml.ope.linear.estimator import FittedLinear, LinearConfig, Replayed
 from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.posterior.constants import COMMON_SHARE, MODEL_ERRORS, VERSION, ModelError
-from ml.ope.posterior.draws import Draws, Replays, joint_draws
+from ml.ope.posterior.draws import STATISTICAL, Draws, Replays, joint_draws
 from ml.ope.posterior.further_sessions import return_noise
 from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference, similarity, updated
 from ml.ope.posterior.held_out import HeldOut, held_out
@@ -261,6 +261,7 @@ class FittedPosterior:
                 "horizon_steps": horizon,
                 "draws": [round(float(v), 4) for v in own],
                 "outcome_draws": {name: [round(float(v), 4) for v in drawn] for name, drawn in shown.items()},
+                "standard_errors": _apart(own, values[STATISTICAL]),
                 "support": support.to_json(),
                 "behaviour": replays.behaviour[i],
                 "weights": {key: round(w, 4) for key, w in self.predictions.weights.items()},
@@ -268,6 +269,15 @@ class FittedPosterior:
                 "constants_version": VERSION,
             },
         )
+
+
+def _apart(own: Floats, without_model_errors: Floats) -> dict[str, float]:
+    """Standard errors of a return by their cause: `statistical`, too few sessions; `model_error`, what structures get wrong that far away.
+
+    Before any test their squares add up to that of the whole but for chance; a test ties the two together, and the whole is less.
+    """
+    said = {"statistical": without_model_errors, "model_error": own - without_model_errors}
+    return {name: round(float(drawn.std(ddof=1)), 4) for name, drawn in said.items()}
 
 
 def _behaviour(actions: Floats) -> dict[str, float]:

@@ -338,6 +338,17 @@ def test_another_method_can_order_the_fold_and_the_verdicts_stay(client: TestCli
     assert "Weights of the structures" in client.get(PAGE).text
 
 
+def test_the_fold_tells_statistical_error_from_what_structures_get_wrong(client: TestClient, policies: list[int], judge: Judge) -> None:
+    told = judged(50.0)
+    told["details"]["standard_errors"] = {"statistical": 1.23, "model_error": 4.56}
+    judge({policies[0]: told, policies[1]: judged(60.0)})
+    page = client.get(PAGE).text
+    (table,) = [part for part in page.split("<table")[1:] if "<caption>Standard errors of the posterior" in part]
+    numbers = re.findall(r'<td class="num">([^<]*)</td>', table.split("</table>")[0])
+    assert numbers == ["1.23", "4.56"], "the other estimate is of an earlier version"
+    assert "4.56" not in above_fold(page)
+
+
 def test_a_serious_event_is_unsafe_without_a_posterior_and_of_a_retired_policy_too() -> None:
     given = Circumstances(1, datetime(2026, 1, 1, tzinfo=UTC), MarginsVersion(), MarginsVersion(), None, {}, Place(0.3), None)
     found = decide({}, {}, "dlsm", given, 7, adverse_event=True)

@@ -10,6 +10,7 @@ import pytest
 from ml.ope.compare.aggregate import combine
 from ml.ope.compare.metrics import spearman
 from ml.ope.estimate import Estimate
+from ml.ope.posterior.constants import MODEL_ERRORS
 from ml.ope.posterior.draws import KEPT, systematic
 from ml.ope.posterior.estimator import CDBS, Posterior, PosteriorConfig, shared_out
 from ml.ope.posterior.gaussian import TestedDifference
@@ -51,6 +52,23 @@ def test_an_estimate_holds_what_verdicts_and_pages_are_made_from(found) -> None:
     assert ratings.min() >= 1
 
 
+def test_statistical_and_model_error_stand_apart(known_buffer, found) -> None:
+    """Their squares add up to that of the whole; the second is what constants say at the leverage, the first of draws without them."""
+    exact = replace(SMALL, config=replace(SMALL.config, model_errors={})).fit(known_buffer).evaluate(POLICIES)
+    settings = known_buffer.settings
+    reach = float(np.sum(settings.gamma ** np.arange(STEPS))) * abs(settings.r_a - settings.r_b)
+    for name, estimate in found.items():
+        errors = estimate.details["standard_errors"]
+        assert set(errors) == {"statistical", "model_error"}
+        assert errors["statistical"] == pytest.approx(exact[name].standard_error, abs=1e-3), "the draws without model errors"
+        assert exact[name].details["standard_errors"]["model_error"] == 0
+        assert estimate.standard_error**2 == pytest.approx(errors["statistical"] ** 2 + errors["model_error"] ** 2, rel=0.25)
+        leverage = estimate.details["support"]["leverage"]
+        of_qocs = [MODEL_ERRORS["grasp_hz"].sd(leverage) * settings.c2, MODEL_ERRORS["rating"].sd(leverage) * settings.c3]
+        wanted = np.hypot(reach * MODEL_ERRORS["steps"].sd(leverage), np.hypot(*of_qocs))
+        assert errors["model_error"] == pytest.approx(wanted, rel=0.15)
+
+
 def test_the_same_seed_gives_the_same_numbers(known_buffer, found) -> None:
     assert SMALL.fit(known_buffer).evaluate(POLICIES) == found
 
@@ -79,6 +97,8 @@ def test_tested_sessions_move_what_was_tested_and_its_neighbours(known_buffer, f
     assert moved["constant 0.55"] < moved["off"] + 1
     assert abs(moved["constant 0.55"]) < abs(moved["constant 0.7"])
     assert after["constant 0.7"].standard_error < found["constant 0.7"].standard_error
+    before, left = found["constant 0.7"].details["standard_errors"], after["constant 0.7"].details["standard_errors"]
+    assert left["model_error"] < before["model_error"], "what sessions showed is not left to the structures"
     assert after["constant 0.7"].value == pytest.approx(after["constant 0.7"].step_return + after["constant 0.7"].end_reward)
     with pytest.raises(ValueError, match="not evaluated"):
         SMALL.with_tests([replace(tests[0], policy_name="gone")]).fit(known_buffer).evaluate(POLICIES)
