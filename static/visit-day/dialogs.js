@@ -120,7 +120,9 @@ export function adverseEvent(app, where, kinds, rules) {
     const rows = kinds.map(([kind, name]) => el("div", { class: "day-event", role: "group", "aria-label": name }, el("span", { text: name }),
       [["mild", false, "Mild"], ["severe", false, "Severe"], ["severe", true, "Serious"]].map(([severity, serious, text]) =>
         button(text, severity === "severe" ? "danger" : "", pick(kind, severity, serious), { "data-act": `event-${kind}-${text.toLowerCase()}` }))));
-    return [el("p", { class: "muted", text: "Serious: danger to life, hospital, lasting harm, or what a clinician holds equal. More can be said later, on the page of the event." }),
+    return [el("p", {}, el("b", { text: "First stop the controller on its tablet (Ctrl-C): it returns to clinical settings at once." }),
+      " Nothing that is entered on this page, Stop included, reaches the controller."),
+      el("p", { class: "muted", text: "Serious: danger to life, hospital, lasting harm, or what a clinician holds equal. More can be said later, on the page of the event." }),
       el("div", { class: "day-events" }, rows), el("menu", {}, button("Cancel", "quiet big", close))];
   });
 }

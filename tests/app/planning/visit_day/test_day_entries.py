@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 
 from app.planning.visit_day.record import SlotOutcome, outcomes_of
 from app.planning.visit_day.repository import entries, slot_times
+from app.platform.web.templates import STATIC
 from tests.conftest import PASSWORD
 
 TAPS = {
@@ -229,6 +230,19 @@ def test_adverse_events_stand_among_the_adverse_events_at_once(clinic_day: Any) 
     events = clinic_day.client.get("/api/v1/participants/P1/adverse-events").json()
     found = {(e["kind"], e["severity"], e["serious"], e["visit_id"]) for e in events}
     assert found == {("fall", "mild", True, clinic_day.visit), ("gait", "severe", False, clinic_day.visit)}
+
+
+@pytest.mark.hazard("H24")
+def test_the_form_of_an_adverse_event_says_to_stop_the_controller_first(clinic_day: Any) -> None:
+    clinic_day.outcomes(clinic_day.entry("start"))
+    page = clinic_day.client.get(f"/visit-day/{clinic_day.visit}", headers={"Accept": "text/html"}).text
+    (form,) = [part for part in page.split("<form ") if 'name="kind_of_event"' in part]
+    first = "First stop the controller on its tablet (Ctrl-C): it returns to clinical settings at once."
+    then = "Nothing that is entered on this page, Stop included, reaches the controller."
+    assert form.index(first) < form.index(then) < form.index("Adverse event</label>")
+    twin = (STATIC / "visit-day" / "dialogs.js").read_text("utf-8").split("export function adverseEvent")[1].split("export function")[0]
+    assert first in twin, "the dialog of the page's own program says the same"
+    assert then in twin
 
 
 def test_a_locked_visit_still_takes_adverse_events(clinic_day: Any) -> None:

@@ -254,7 +254,7 @@ def test_a_session_whose_beta_never_comes_ends_too() -> None:
     assert 318.0 <= one.decisions[-1].t_s <= 322.0
 
 
-@pytest.mark.hazard("H15")
+@pytest.mark.hazard("H15", "H24")
 @pytest.mark.parametrize(("event", "text"), [(Event.STOP, ""), (Event.LINE, "stop")])
 def test_a_stop_from_the_tablet_or_the_device_ends_it_at_once(event: Event, text: str) -> None:
     link, one, end = ran([*betas(range(8)), (16.9, event, text), *betas(range(8, 20))], 50.0)
