@@ -45,8 +45,7 @@ class CutShort(BetaloopError):
 
     Args:
         upload_id: the upload. kept, of: how many of its files are kept.
-        beneath: the fault, where it is one that passes (a full disk, a database that is away): its status is this error's.
-    """
+        beneath: the fault, where it is one that passes (a full disk, a database that is away): its status is this error's."""
 
     status = 500
     title = "Something went wrong on our side"
