@@ -63,7 +63,11 @@ def test_today_leaves_an_ended_study_out_until_it_is_asked_for(client: TestClien
     link = f'href="/participants/{enrolled}"'
     assert link in client.get("/").text
     assert client.post(f"{STUDY}/end", json=WHY).status_code == 200
-    assert link not in client.get("/").text
+    # also where nobody is left to show, the page says where they are
+    alone = client.get("/").text
+    assert link not in alone
+    assert "There is no participant that you may see" in alone
+    assert '<a href="/?withdrawn=yes">Show also who has withdrawn' in alone
     assert link in client.get("/?withdrawn=yes").text
     assert "the study has ended" in client.get(f"/participants/{enrolled}").text
 
