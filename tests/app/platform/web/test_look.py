@@ -20,6 +20,10 @@ def test_what_rounds_to_nothing_has_no_sign() -> None:
     assert [fixed(v, 1) for v in (-0.02, 0.0, -0.06)] == ["0.0", "0.0", "\u22120.1"]
 
 
+def test_a_negative_number_has_a_minus_sign_whatever_its_size() -> None:
+    assert [number(v) for v in (-1234, -12.3, -0.05)] == ["\u22121\u202f234", "\u221212.3", "\u22120.0500"]
+
+
 def test_numbers_are_formatted_in_one_place() -> None:
     found = {
         f"{path.relative_to(ROOT)}:{n}": hit
