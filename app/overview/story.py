@@ -27,7 +27,7 @@ _APART = dt.timedelta(minutes=20)
 
 def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsVersion], today: dt.date) -> Chart | None:
     """Every session that counts and that the reader may know of, as a dot in a panel per quantity, and every dated visit, also one without
-    such a session; None without any session on a known day.
+    such a session; None with neither on a known day.
 
     Args:
         held: sessions as the caller may know them. visits: with their dates. versions: of the settings, by number.
@@ -35,7 +35,7 @@ def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[Sett
     """
     days = {v.id: v.date for v in visits}
     dated = [(moment, s) for s in held.sessions if (moment := _moment(s, days)) is not None]
-    if not dated:
+    if not dated and not any(v.date is not None for v in visits):
         return None
     panels = [(name, unit, values) for name, unit, values in _quantities(held, [s for _, s in dated]) if any(v is not None for v in values)]
     places = _places(dated)
@@ -59,7 +59,9 @@ def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[Sett
     visits_seen = len({s.visit_id for _, s in dated})
     n = f"{counted(len(dated), 'session')} in {counted(visits_seen, 'visit')}"
     subtitle = f"n = {n}, those of a day side by side \u00b7 press a dot for its session, or take it from the table"
-    return Chart("story", "All months", subtitle, figure(data, **layout), columns, rows, height=82 + 82 * len(panels))
+    if not dated:
+        subtitle = f"n = 0 sessions \u00b7 {counted(len(stands), 'visit')} with a date"
+    return Chart("story", "All months", subtitle, figure(data, **layout), columns, rows, height=82 + 82 * max(1, len(panels)))
 
 
 def _moment(session: Facts, days: Mapping[int, dt.date | None]) -> dt.datetime | None:
@@ -78,7 +80,7 @@ def _places(dated: Sequence[tuple[dt.datetime, Facts]]) -> list[dt.datetime]:
     days = {visit: min(dated[i][0] for i in members) for visit, members in by_visit.items()}
     ordered = sorted(days.values())
     least = min((b - a for a, b in pairwise(ordered) if b > a), default=dt.timedelta(days=1))
-    step = _SHARE * least / max(len(members) for members in by_visit.values())
+    step = _SHARE * least / max((len(members) for members in by_visit.values()), default=1)
     found = [moment for moment, _ in dated]
     for visit, members in by_visit.items():
         for k, i in enumerate(members):
@@ -106,11 +108,11 @@ def _quantities(held: Evidence, sessions: Sequence[Facts]) -> list[tuple[str, st
 def _panels(
     dated: Sequence[tuple[dt.datetime, Facts]], places: Sequence[dt.datetime], panels: Sequence[tuple[str, str, list[float | None]]]
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """A trace and an axis per quantity, the first one on top."""
+    """A trace and an axis per quantity, the first one on top; one empty axis without any quantity."""
     x, began = [place.isoformat() for place in places], [f"{moment:%Y-%m-%d %H:%M}" for moment, _ in dated]
     colours, shapes = [colour(s.controller.value) for _, s in dated], [SYMBOLS[s.controller.value] for _, s in dated]
     pages = [f"/sessions/{s.session_id}" for _, s in dated]
-    height = 1 / len(panels)
+    height = 1 / max(1, len(panels))
     data: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
         "xaxis": {"type": "date", "anchor": "free", "position": 0, "zeroline": False},
@@ -118,6 +120,8 @@ def _panels(
         "legend": {"orientation": "h", "y": 1.01, "yanchor": "bottom", "x": 0},
         "showlegend": True,
     }
+    if not panels:  # days alone: an empty panel without a scale
+        layout["yaxis"] = {"visible": False, "range": [0, 1]}
     for i, (name, unit, values) in enumerate(panels):
         suffix = "" if i == 0 else str(i + 1)
         top = 1 - i * height

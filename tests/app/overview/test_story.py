@@ -78,6 +78,29 @@ def test_every_dated_visit_is_marked_also_without_a_session_and_the_next_one_tol
     assert not any("next visit" in a["text"] for a in drawn(db, enrolled, dt.date(2026, 12, 1)).figure["layout"]["annotations"])
 
 
+def test_dated_visits_are_shown_before_any_session_counts(client: TestClient, db: Session, enrolled: str) -> None:
+    participant = participant_by_code(db, enrolled, SYSTEM)
+    assert story_chart(evidence(db, participant, SYSTEM), [Visit(participant_id=1, number=1)], participant.settings, LATER) is None
+    db.add_all([Visit(participant_id=1, number=k, date=dt.date(2026, 6 + k, 3)) for k in (2, 3)])
+    db.commit()
+    db.expire_all()
+    adder(db, enrolled)("cdbs", visit=2, excluded="fell asleep")
+    chart = drawn(db, enrolled)
+    layout = chart.figure["layout"]
+    assert [text.split("<br>")[0] for text in layout["xaxis"]["ticktext"]] == ["visit 1", "visit 2", "visit 3"]
+    assert [a["text"] for a in layout["annotations"]] == ["next visit: 2"]
+    assert [row[1].text for row in chart.rows if isinstance(row[1], Link)] == [1, 2, 3]
+    assert chart.subtitle == "n = 0 sessions \u00b7 3 visits with a date"
+    assert 'id="story"' in client.get("/participants/P1").text
+
+
+def test_sessions_without_any_value_keep_their_visits_on_the_axis(db: Session, enrolled: str) -> None:
+    adder(db, enrolled)("cdbs", visit=2, beta=None, fraction=None)
+    chart = drawn(db, enrolled)
+    assert not any("customdata" in trace for trace in chart.figure["data"])
+    assert [text.split("<br>")[0] for text in chart.figure["layout"]["xaxis"]["ticktext"]] == ["visit 1", "visit 2"]
+
+
 def test_the_table_of_the_months_leads_to_sessions_without_a_mouse(client: TestClient, db: Session, enrolled: str) -> None:
     session = adder(db, enrolled)("cdbs", grasp=2.0)
     story = client.get("/participants/P1").text.split('id="story"')[1].split("</figure>")[0]
