@@ -23,7 +23,7 @@ from app.platform.jobs import registry
 from app.platform.jobs import repository as jobs
 from app.platform.jobs import service as job_service
 from app.platform.jobs.models import JobStatus
-from app.platform.jobs.titles import numbered
+from app.platform.jobs.titles import failure, numbered
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
@@ -118,6 +118,7 @@ def all_jobs_page(request: Request, db: Db, caller: CurrentCaller, paging: Pagin
 def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """One job: progress, learning curves, log."""
     events = jobs.events_after(db, found.job.id, 0, SHOWN_EVENTS)
+    steps = list(zip(found.job.steps, numbered([s.title for s in found.job.steps]), strict=True))
     page = render(
         request,
         "pipeline/job.html",
@@ -125,7 +126,8 @@ def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller)
         job=found.job,
         title=_titles().get(found.job.kind, found.job.kind),
         live=not JobStatus(found.job.status).ended,
-        steps=list(zip(found.job.steps, numbered([s.title for s in found.job.steps]), strict=True)),
+        steps=steps,
+        failed=failure(found.job.error, {s.key: title for s, title in steps}) if found.job.error else "",
         curves=charts.job_curves(found.job, [e for e in events if e.kind == "points"]),
         log=[e for e in events if e.kind == "log"][-LOG_LINES:],
         params=_in_words(found.job.params),

@@ -67,7 +67,7 @@ def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
         learnt, held_out = hold_out(buffer, params["held_out"], every=max(1, updates // 10))
         results = rl.train_many(learnt, configs, report.curves(updates), workdir / "checkpoint.pt", initial, held_out)
     except (rl.TrainingDiverged, rl.CheckpointError, ValueError) as error:
-        raise JobError(f"The policies cannot be trained: {error}.") from error
+        raise JobError(f"The policies cannot be trained: {_why(error, report)}.") from error
     gains = stored_gains(buffer, {str(k): result.policy for k, result in enumerate(results)}, params["margins"], tests)
     members = []
     for k, result in enumerate(results):
@@ -76,6 +76,14 @@ def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
         metrics = _metrics(result, buffer) | _share_of_end(learnt, result.config) | {"gain_over_cdbs": gains[str(k)]}
         members.append({"config": result.config.to_json(), "metrics": metrics})
     return {"members": members, "held_out_sessions": [s.session_id for s in held_out.sessions.sessions] if held_out else []}
+
+
+def _why(error: Exception, report: StepReport) -> str:
+    """Why a training ended, for who reads results; which network's loss it was goes to the log."""
+    if not isinstance(error, rl.TrainingDiverged):
+        return str(error)
+    report.log(str(error))
+    return "the training diverged; lower the learning rates"
 
 
 def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
@@ -98,7 +106,7 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
     try:
         clone = rl.train(learnt, cloning.config.from_json({"updates": CLONE_UPDATES, "seed": params["seed"]})).policy
     except (rl.TrainingDiverged, ValueError) as error:
-        raise JobError(f"The logged behaviour cannot be cloned: {error}.") from error
+        raise JobError(f"What the recorded sessions did cannot be imitated: {_why(error, report)}.") from error
     write_atomically(workdir / CLONE, clone.to_onnx())
     report.progress(0.3, "scoring constant amplitudes")
     tests = known_tests(params.get("tested"), buffer)
@@ -268,7 +276,7 @@ def distil(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[st
         teacher = OnnxPolicy(files.read(params["teacher_sha256"]), buffer.settings.window)
         result = rl.distil(teacher, buffer, config, report.curves(config.updates), partial(_returns_beside, buffer))
     except (rl.TrainingDiverged, ValueError) as error:
-        raise JobError(f"The policy cannot be distilled: {error}.") from error
+        raise JobError(f"The policy cannot be distilled: {_why(error, report)}.") from error
     write_atomically(workdir / POLICY, result.policy.to_onnx())
     return {
         "config": config.to_json(),

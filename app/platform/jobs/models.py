@@ -10,7 +10,7 @@ from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, Index, String, T
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
-from app.platform.jobs.titles import plain_words
+from app.platform.jobs.titles import failure, plain_words, reason
 
 
 class JobStatus(StrEnum):
@@ -68,8 +68,8 @@ class Job(Base):
 
     @property
     def doing(self) -> str:
-        """What it does now, in words without methods."""
-        return plain_words(self.message)
+        """What it does now, or why it failed, in words without methods."""
+        return failure(self.message) if self.message and self.status == JobStatus.FAILED else plain_words(self.message)
 
 
 class JobStep(Base):
@@ -100,8 +100,8 @@ class JobStep(Base):
 
     @property
     def doing(self) -> str:
-        """What it does now, in words without methods."""
-        return plain_words(self.message)
+        """What it does now, or why it failed, in words without methods; nothing where only engineers could read it."""
+        return reason(self.message) if self.status == JobStatus.FAILED else plain_words(self.message)
 
 
 class JobEvent(Base):

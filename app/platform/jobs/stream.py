@@ -15,7 +15,7 @@ from app.platform.database import new_session, now
 from app.platform.jobs import repository
 from app.platform.jobs.models import Job, JobEvent, JobStatus
 from app.platform.jobs.service import describe_event
-from app.platform.jobs.titles import plain_words
+from app.platform.jobs.titles import plain_words, reason
 from app.platform.web.templates import time_left
 
 POLL_S = 0.5
@@ -100,7 +100,7 @@ def shown(event: JobEvent) -> dict[str, Any]:
     described = describe_event(event)
     data = dict(described["data"])
     if "message" in data:
-        data["message"] = plain_words(data["message"])
+        data["message"] = (reason if data.get("status") == JobStatus.FAILED else plain_words)(data["message"])
     if "seconds_left" in data:
         data["time_left"] = time_left(data["seconds_left"])
     return described | {"data": data}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 _PLAIN: tuple[tuple[re.Pattern[str], str], ...] = tuple(
     (re.compile(stored), plain)
@@ -23,6 +23,11 @@ _PLAIN: tuple[tuple[re.Pattern[str], str], ...] = tuple(
         (r"(?:evaluating|correcting) value functions|choosing the penalty of the value function", "estimating policies"),
     )
 )
+
+_OF_A_STEP = re.compile(r"Step (?P<key>\S+) failed: (?P<message>.*)", re.S)
+"""As `StepFailed` words what ended a job."""
+_UNFORESEEN = re.compile(r"\A[A-Za-z_]\w*(?:: |\Z)|\b\w+(?:Error|Exception)\b")
+"""Of an error that is none of our own (`app.platform.jobs.steps.worded`): the name of its class comes first, or stands in what holds it."""
 
 
 def plain_words(text: str) -> str:
@@ -41,3 +46,23 @@ def numbered(titles: Sequence[str]) -> list[str]:
         seen[title] += 1
         shown.append(f"{title}, method {seen[title]} of {of[title]}" if of[title] > 1 else title)
     return shown
+
+
+def reason(message: str) -> str:
+    """What an error of our own says, without names of methods; nothing of any other, which engineers alone can read."""
+    return "" if _UNFORESEEN.search(message) else plain_words(message)
+
+
+def failure(error: str, titles: Mapping[str, str] | None = None) -> str:
+    """Why a job or a step failed, for who reads results: our own errors in their words, of any other which step it was.
+
+    The stored text names classes and methods, for engineers: their fold and the interface give it as it is.
+
+    Args:
+        error: as it is stored. titles: plain titles of the job's steps by key; without them no step is named.
+    """
+    step = _OF_A_STEP.fullmatch(error)
+    if said := reason(step["message"] if step else error):
+        return said
+    title = (titles or {}).get(step["key"]) if step else None
+    return f"A step failed: {title}." if title else "A step failed." if step else "It failed for a reason that is told to engineers."

@@ -57,7 +57,10 @@ PARTS = {
 
 
 def ended_jobs(world: World) -> dict[str, str]:
-    """By kind: the page of a succeeded job with steps, learning curves and a log: a pipeline that a release ran, and what it is made of."""
+    """By kind: the page of a succeeded job with steps, learning curves and a log: a pipeline that a release ran, and what it is made of.
+
+    `failed` is one whose step raised what only engineers can read.
+    """
     found = next(j for j in world.read("/participants/P1/jobs")["items"] if j["kind"] == "pipeline" and j["status"] == "succeeded")
     pages = {"pipeline": f"/jobs/{found['id']}"}
     with transaction("test") as db:
@@ -77,6 +80,14 @@ def ended_jobs(world: World) -> dict[str, str]:
             db.add_all([_copy(e, ("id", "job_id"), job_id=job.id) for e in of_it])
             db.add(JobEvent(job_id=job.id, step_key=steps[1].key, kind="log", data={"text": "member 1 of the DLSM ran to its last update"}))
             pages[kind] = f"/jobs/{job.id}"
+        first = db.get_one(Job, pages["evaluate"].removeprefix("/jobs/"))
+        raised = "ValueError: the DLSM needs at least 4 sessions in the buffer"
+        failed = _copy(first, ("id",), id="4f00aaaa-0000-4000-8000-000000000009", status="failed", result=None)
+        failed.steps = [_copy(s, ("id", "job_id")) for s in first.steps]
+        failed.steps[0].status, failed.steps[0].message = "failed", raised
+        failed.error = failed.message = f"Step {failed.steps[0].key} failed: {raised}"
+        db.add(failed)
+        pages["failed"] = f"/jobs/{failed.id}"
     return pages
 
 

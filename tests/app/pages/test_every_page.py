@@ -56,7 +56,7 @@ def test_no_page_meets_its_reader_with_words_of_the_methods_and_energy_has_one_u
     found: dict[str, list[str]] = {}
     shares, counts, figures, linked = [], {}, 0, set()
     jobs = {f"a job of the kind {kind}": path for kind, path in ended_jobs(world).items()}
-    assert len(jobs) == 3
+    assert len(jobs) == 4
     for route, path in (addresses(world) | jobs).items():
         with reader.stream("get", path) as answer:
             if answer.status_code != 200 or not answer.headers["content-type"].startswith("text/html"):
@@ -70,6 +70,9 @@ def test_no_page_meets_its_reader_with_words_of_the_methods_and_energy_has_one_u
         counts[route] = miscounted(" ".join(re.sub("<[^>]+>", " | ", page).split()))
         # the REST interface keeps shares of the energy under cDBS, and its reference says so
         shares += [route] if "cDBS = 1" in page and route != "/api-reference" else []
+    failed = reader.get(jobs["a job of the kind failed"]).text
+    assert re.search(r"The job failed.*A step failed: \w[^<]+\.", above_fold(failed))
+    assert "ValueError: the DLSM needs at least 4 sessions in the buffer" in failed, "engineers read it in their fold"
     assert len(found) >= 50
     assert figures >= 9
     assert set(found) - linked <= WITHOUT_A_READER, "the words are explained one click away"
@@ -95,7 +98,7 @@ def test_no_script_says_a_word_of_the_methods() -> None:
     scripts = sorted(p for p in STATIC.rglob("*.js"))
     assert len(scripts) >= 10
     said = {p.name: said_by_script(p.read_text()) for p in scripts}
-    assert any("Drop files or whole folders here" in text for text in said["upload.js"])
+    assert any("The connection broke off" in text for text in said["upload.js"])
     assert any("could not be drawn" in text for text in said["charts.js"])
     # `[` after an e is a selector or a spread here, no expectation
     found = {name: {text: hit for text in texts if (hit := [w for w in methods_named(text) if w != "E["])} for name, texts in said.items()}

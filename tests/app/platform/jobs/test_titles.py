@@ -10,7 +10,7 @@ import pytest
 
 from app.platform.jobs.models import Job, JobEvent, JobStatus, JobStep
 from app.platform.jobs.stream import describe, shown
-from app.platform.jobs.titles import numbered, plain_words
+from app.platform.jobs.titles import failure, numbered, plain_words, reason
 from ml.ope.registry import methods
 from tests.app.words import methods_named
 
@@ -60,3 +60,17 @@ def test_the_state_of_a_job_tells_the_time_left_in_words() -> None:
     state = describe(job)
     assert (state["time_left"], state["message"]) == ("about 2 min left", "Pin the sessions to learn from")
     assert state["steps"][0]["message"] == "fitting the model"
+
+
+def test_a_failure_is_told_in_our_own_words_or_by_its_step() -> None:
+    titles = {"fit/0": "Fit model 1 of the sessions"}
+    raw = "ValueError: the DLSM needs at least 4 sessions"
+    assert failure(f"Step fit/0 failed: {raw}", titles) == "A step failed: Fit model 1 of the sessions."
+    assert failure(f"Step fit/0 failed: {raw}") == failure("Step fit/9 failed: KeyError", titles) == "A step failed."
+    assert failure(raw) == "It failed for a reason that is told to engineers."
+    own = "The policies cannot be trained: the training diverged; lower the learning rates."
+    assert failure(f"Step train/0 failed: {own}", titles) == reason(own) == own
+    nested = f"Which tested policy did best cannot be told: Step fit/0 failed: {raw}. Start a 'pipeline' that names the policies."
+    assert failure(nested, titles) == "It failed for a reason that is told to engineers."
+    assert [reason(text) for text in (raw, "AssertionError", nested, "")] == ["", "", "", ""]
+    assert failure("The worker died 4 times while it ran this job, so the job was given up.").startswith("The worker died")
