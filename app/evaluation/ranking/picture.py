@@ -17,7 +17,7 @@ from ml.ope.posterior.verdict import interval, outcome_draws
 from ml.ope.support.behaviour_map import DOSES, BehaviourMap
 
 MOST = 8
-"""Behaviours that have a line; more would hide each other. Every candidate has its dot."""
+"""Behaviours that have a line in their colour, with their name; more would hide each other, and are thin. Every candidate has its dot."""
 
 TONES = {"test": "good", "test_with_care": "warn", "unsafe": "bad", "not_advised": "bad", "cannot_tell": "accent", "same_as_cdbs": "muted"}
 LIGHTEST, DARKEST = 0.10, 0.40
@@ -84,7 +84,7 @@ class Picture:
         behaviour: amplitude against beta; None where the evaluation is of before it was stored.
         doses: what each dose is expected to do; None without any.
         behaviour_columns, behaviour_rows, dose_columns, dose_rows: tables.
-        lines, without_line: behaviours that have a line, and that have none. greyed: whether some act like cDBS, and are grey.
+        lines, thin_lines: behaviours whose line has a name and a colour, and those whose has none. greyed: whether some act like cDBS, and are grey.
     """
 
     behaviour: Markup | None
@@ -94,7 +94,7 @@ class Picture:
     dose_columns: tuple[str, ...]
     dose_rows: tuple[tuple[Cell, ...], ...]
     lines: int
-    without_line: int
+    thin_lines: int
     greyed: bool
 
 
@@ -114,14 +114,14 @@ def picture(found: Assessment, rows: Sequence[Row], unit: str, lower_bound: floa
         key=lambda a: _dose(a.posterior) or 0.0,
     )
     return Picture(
-        behaviour=_behaviour(known, behaviours[:MOST], scale, unit, lower_bound) if known else None,
+        behaviour=_behaviour(known, behaviours, scale, unit, lower_bound) if known else None,
         doses=_doses(everyone, references, scale),
         behaviour_columns=(f"Beta from ({unit})", f"to ({unit})", "Recorded steps", *(f"{n} ({scale.unit})" for n in named.values())),
         behaviour_rows=_behaviour_rows(known, list(named), scale) if known else (),
         dose_columns=("Policy", f"Mean amplitude ({scale.unit})", *(t for t, _ in _PANELS.values())),
         dose_rows=tuple(_dose_row(name, e, scale) for name, e in _listed(everyone, references)),
         lines=min(MOST, len(behaviours)),
-        without_line=max(0, len(behaviours) - MOST),
+        thin_lines=max(0, len(behaviours) - MOST),
         greyed=any(d.tone == _GREY for d in everyone),
     )
 
@@ -139,7 +139,8 @@ def _drawn(rows: Sequence[Row]) -> list[Drawn]:
     return found
 
 
-def _behaviour(known: BehaviourMap, shown: Sequence[Drawn], scale: Scale, unit: str, lower_bound: float) -> Markup:
+def _behaviour(known: BehaviourMap, behaviours: Sequence[Drawn], scale: Scale, unit: str, lower_bound: float) -> Markup:
+    shown, more = behaviours[:MOST], behaviours[MOST:]
     plane = Plane(56, 34, W - 56 - 108, H - 34 - 46, (known.edges[0], known.edges[-1]), (0.0, 1.08 * scale.factor))
     most = max((n for column in known.tried for n in column), default=0)
     for k, column in enumerate(known.tried):
@@ -153,12 +154,16 @@ def _behaviour(known: BehaviourMap, shown: Sequence[Drawn], scale: Scale, unit: 
     plane.level(lower_bound * scale.factor, f"lowest of random sessions {scale.words(lower_bound)}", "muted", "2 3")
     centres = [(a + b) / 2 for a, b in zip(known.edges[:-1], known.edges[1:], strict=True)]
     ends: list[tuple[Drawn, float]] = []
-    for d in reversed(shown):  # what matters first lies on top
+    for d in reversed(behaviours):  # what matters first lies on top
         curve = known.policies.get(str(d.policy_id))
         if curve is None:
             continue
         values = [None if v is None else v * scale.factor for v in curve.middle]
-        plane.line(list(zip(centres, values, strict=True)), d.tone, 1.5 if d.tone == _GREY else 2.5, d.dash)
+        points = list(zip(centres, values, strict=True))
+        if d in more:
+            plane.line(points, "muted", 0.75, words=d.name)
+            continue
+        plane.line(points, d.tone, 1.5 if d.tone == _GREY else 2.5, d.dash)
         last = next((v for v in reversed(values) if v is not None), None)
         if last is not None:
             ends.append((d, plane.at_y(last)))
@@ -173,6 +178,8 @@ def _behaviour(known: BehaviourMap, shown: Sequence[Drawn], scale: Scale, unit: 
         plane.mark(right + 16, at, d.tone, d.shape)
         plane.text(right + 25, at + 4, d.name, colour=d.tone, weight=600)
     told = "; ".join(d.name for d in shown)
+    if more:
+        told += f". Thin lines: {'; '.join(d.name for d in more)}"
     return drawing(W, H, "Amplitude against beta", f"Lines: {told}. Grey: where recorded sessions have been.", [plane])
 
 

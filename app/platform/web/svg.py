@@ -86,9 +86,15 @@ class Plane:
         )
 
     def line(
-        self, points: Sequence[tuple[float, float | None]], colour: str, width: float = 2.0, dash: str = "", step: bool = False
+        self,
+        points: Sequence[tuple[float, float | None]],
+        colour: str,
+        width: float = 2.0,
+        dash: str = "",
+        step: bool = False,
+        words: str = "",
     ) -> None:
-        """A line through (x, y); it breaks where y is None. `step` holds each value until the next x."""
+        """A line through (x, y); it breaks where y is None. `step` holds each value until the next x; `words` are shown at a pointer."""
         drawn: list[str] = []
         down, last = False, 0.0
         for x, y in points:
@@ -103,7 +109,8 @@ class Plane:
         if drawn:
             dashed = f' stroke-dasharray="{dash}"' if dash else ""
             look = f'fill="none" stroke="{token(colour)}" stroke-width="{width:g}" stroke-linejoin="round"{dashed}'
-            self.parts.append(f'<path d="{"".join(drawn)}" {look}/>')
+            end = f"><title>{escape(words)}</title></path>" if words else "/>"
+            self.parts.append(f'<path d="{"".join(drawn)}" {look}{end}')
 
     def level(self, value: float, words: str, colour: str, dash: str = "5 4") -> None:
         """A horizontal line over the whole width, with its words above its left end."""

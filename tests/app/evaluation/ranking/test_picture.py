@@ -82,7 +82,11 @@ def test_every_candidate_has_its_dot_and_interval_and_those_like_cdbs_are_grey(
     assert "grey marks: candidates that act like cDBS" in page
     lines = re.findall(r'<path [^>]*stroke-width="(?:2.5|1.5)" stroke-linejoin', behaviour)
     assert len(lines) == MOST
-    assert "lines of the first 8 behaviours, 2 more in the table and as dots" in page, "11 candidates, two of which do the same"
+    assert "the first 8 behaviours with their names, 2 more as thin grey lines" in page, "11 candidates, two of which do the same"
+    thin = re.findall(r'<path [^>]*stroke="var\(--c-muted\)" stroke-width="0.75"[^>]*><title>([pq]\d)</title></path>', behaviour)
+    assert len(set(thin)) == 2
+    assert not any(f">{name}</text>" in behaviour for name in thin), "no names that would hide those of the first"
+    assert behaviour.index("0.75") < behaviour.index('stroke-width="2.5"'), "and they lie below"
 
 
 def test_candidates_like_cdbs_are_drawn_where_there_are_no_others(
