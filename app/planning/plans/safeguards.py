@@ -40,7 +40,7 @@ def safeguards(
 
     Raises:
         Invalid: an unsafe policy without a reason, two tests with care, a limit below that of the verdict, or a reason or limit for a
-            policy that is not in the plan. Forbidden: a reason of somebody who may not approve plans.
+            policy that is not in the plan; `field` is what the form calls it. Forbidden: a reason of somebody who may not approve plans.
     """
     _all_planned(policies, overrides, limits)
     made, careful = {}, []
@@ -56,7 +56,8 @@ def safeguards(
         # a reason that nothing asks for is not kept: it would look as if something had been overridden
         made[policy.id] = Safeguard(decided.decision if decided else None, limit, reason if unsafe else None)
     if len(careful) > 1:
-        raise Invalid(f"{_names(careful)} are each to be tested with care; a visit takes one of them.", "Leave all but one out.")
+        words = f"{_names(careful)} are each to be tested with care; a visit takes one of them."
+        raise Invalid(words, "Leave all but one out.", field="policy_ids")
     return made
 
 
@@ -93,7 +94,8 @@ def _require_override(policy: Policy, decided: Decided, reason: str | None, may_
     if reason is None:
         raise Invalid(
             f"Policy '{policy.name}' is not to be run without a clinician's word: {_why(decided)}.",
-            "Leave it out, or have a clinician who may approve plans state why it is tested all the same (`overrides`).",
+            "Leave it out, or have a clinician who may approve plans state why it is tested all the same.",
+            field=f"override_{policy.id}",
         )
     if not may_override:
         raise Forbidden(f"Policy '{policy.name}' is unsafe; only those who may approve plans can plan it.", "Ask a clinician of the study.")
@@ -108,6 +110,7 @@ def _checked_limit(policy: Policy, decided: Decided, stated: float | None) -> fl
             f"Policy '{policy.name}' may be tested down to {decided.limit:.2f} of the cDBS amplitude, not to {stated:.2f}: no two sessions "
             "held less.",
             "Leave the limit out, or raise it.",
+            field=f"limit_{policy.id}",
         )
     return stated
 
@@ -117,7 +120,8 @@ def _all_planned(policies: Sequence[Policy], *stated: Mapping[int, object]) -> N
     for found in stated:
         stray = sorted(set(found) - ids)
         if stray:
-            raise Invalid(f"Policy {stray[0]} has a reason or a limit, but is not among the policies to test.", "Name it there too.")
+            words = f"Policy {stray[0]} has a reason or a limit, but is not among the policies to test."
+            raise Invalid(words, "Name it there too.", field="policy_ids")
 
 
 def _decided(found: Assessment | None, policy_id: int) -> Decided | None:

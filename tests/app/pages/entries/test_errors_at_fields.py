@@ -13,6 +13,9 @@ from fastapi.testclient import TestClient
 
 from app.study.wording import EVENT_KINDS
 from ml.rl import MlpPolicy
+from tests.app.evaluations import judge as judge
+from tests.app.evaluations import judged
+from tests.app.evaluations import policies as policies
 from tests.app.ingest.conftest import steady
 from tests.app.pages.test_stale_forms import fields_of
 
@@ -183,6 +186,28 @@ def test_forms_of_jobs_plans_and_bundles_say_errors_at_their_fields(browser: Tes
     few = browser.post(jobs, data={"kind": "pipeline", "count": "99"}).text
     assert "default factory" not in few
     assert few.count('class="field-note"') == 1
+
+
+@pytest.mark.hazard("H04")
+def test_a_plan_that_a_verdict_refuses_says_so_at_the_policy(
+    policies: list[int], judge: Callable[..., int], sign_in: Callable[[str], TestClient]
+) -> None:
+    browser, (unsafe, careful, other) = sign_in("admin"), policies  # the policies come first: their fixture is a copy made once
+    care: dict[str, Any] = {"supported": False, "support": {"lowest_supported": 0.5, "dose": 0.4}}
+    off = judged(50.0, behaviour={"below_cdbs_20_percent": 0.42})
+    judge({unsafe: off, careful: judged(60.0, **care), other: judged(60.0, **care)})
+    visit = browser.post("/api/v1/participants/P1/visits", json={"number": 2}).json()["id"]
+    draft = f"/visits/{visit}/plan"
+    day = fields_of(browser.get(draft).text, draft) | {"random_sessions": "2", f"override_{unsafe}": "", "note": "quiet"}
+    needs, reason = "not to be run without a clinician", ">quiet</textarea>"
+    forms = [
+        Sent(draft, day | {"policy_ids": [str(unsafe)]}, f"f-override_{unsafe}", needs, reason),
+        Sent(draft, day | {"policy_ids": [str(careful)], f"limit_{careful}": "0.2"}, f"f-limit_{careful}", "not to 0.20", 'value="0.2"'),
+        Sent(draft, day | {"policy_ids": [str(careful), str(other)]}, "f-policy_ids", "a visit takes one of them", reason),
+    ]
+    assert refused(browser, forms) == {}
+    assert "overrides" not in browser.post(draft, data=forms[0].typed).text, "a clinician is not told what the API calls a field"
+    assert refused(sign_in("engineer"), forms[:1]) == {}, "who cannot give the reason is told where it is missing"
 
 
 def test_the_box_leads_to_the_fields_of_the_older_forms_too(
