@@ -39,6 +39,7 @@ async function filesOf(entry) {
 let busy = Promise.resolve();
 function start(files) {
   if (!files.length) return;
+  unmark();
   const fields = new FormData(form);
   input.value = "";
   input.required = false; // emptied by us: an empty field is no mistake until somebody sends it again
@@ -46,7 +47,7 @@ function start(files) {
   const limit = Number(form.dataset.limitMb);
   const total = files.reduce((sum, { file }) => sum + file.size, 0) / 1048576;
   if (total > limit) {
-    report(shown, 413, { detail: `These files have ${Math.round(total)} MiB together; one upload may have ${limit} MiB.`, hint: "Send them in several uploads." });
+    report(shown, 413, { detail: `These files have ${Math.round(total)} MiB together; one upload may have ${limit} MiB.`, hint: "Send them in several uploads." }, files);
     return;
   }
   busy = busy.then(() => send(files, fields, shown)); // one upload after the other: a clinic's line is narrow
@@ -83,8 +84,8 @@ function send(files, fields, shown) {
       shown.words.textContent = event.loaded < event.total ? `sending, ${Math.round((100 * event.loaded) / event.total)} %` : "decoding …";
     });
     request.upload.addEventListener("load", () => follow(shown, request));
-    request.addEventListener("load", () => { report(shown, request.status, request.response ?? {}); taken(request.status); renew(); done(); });
-    request.addEventListener("error", () => { report(shown, 0, { detail: "The connection broke off.", hint: "Send the files again; what has arrived is not counted twice." }); done(); });
+    request.addEventListener("load", () => { report(shown, request.status, request.response ?? {}, files); taken(request.status); renew(); done(); });
+    request.addEventListener("error", () => { report(shown, 0, { detail: "The connection broke off.", hint: "Send the files again; what has arrived is not counted twice." }, files); done(); });
     request.send(body);
   });
 }
@@ -126,7 +127,47 @@ function mappingLink(id, which = "") { return element("a", { className: "button 
 
 function badge(text, tone) { return element("span", { className: `badge ${tone}`, textContent: text }); }
 
-function report({ item, head, words }, status, answer) {
+// what a refusal says of a field stands at it, as where the service makes the page (macros.html, at_field); ids of the fields so marked
+function mark(answer) {
+  const own = (error) => error.name ?? error.where?.split(" > ").at(-1); // of a value of the wrong type the service names its place alone
+  const told = (answer.errors ?? []).map((error) => [own(error), error.what]);
+  if (answer.field) told.push([answer.field, [answer.detail, answer.hint].filter(Boolean).join(" ")]);
+  const marked = [];
+  for (const [name, text] of told) {
+    const field = name && form.elements.namedItem(name);
+    if (!(field instanceof HTMLElement) || field.type === "hidden" || field.getAttribute("aria-invalid")) continue;
+    const note = element("div", { className: "field-note", id: `n-${name}`, textContent: text });
+    (field.closest(".with-unit") ?? field).after(note);
+    field.setAttribute("aria-invalid", "true");
+    field.setAttribute("aria-describedby", [field.getAttribute("aria-describedby"), note.id].filter(Boolean).join(" "));
+    field.closest(".field")?.classList.add("wrong");
+    const fold = field.closest("details");
+    if (fold) fold.open = true;
+    marked.push(field.id);
+  }
+  return marked;
+}
+
+function unmark() {
+  for (const note of form.querySelectorAll(".field-note")) note.remove();
+  for (const field of form.querySelectorAll("[aria-invalid]")) {
+    field.removeAttribute("aria-invalid");
+    const left = (field.getAttribute("aria-describedby") ?? "").split(" ").filter((id) => id && !id.startsWith("n-"));
+    if (left.length) field.setAttribute("aria-describedby", left.join(" ")); else field.removeAttribute("aria-describedby");
+    field.closest(".field")?.classList.remove("wrong");
+  }
+}
+
+// files that were refused before they were read are chosen again, unless others were meanwhile; a folder's cannot be, their paths would go
+function chosenAgain(files) {
+  if (input.files.length || files.some(({ file, path }) => path !== file.name)) return false;
+  const again = new DataTransfer();
+  for (const { file } of files) again.items.add(file);
+  input.files = again.files;
+  return true;
+}
+
+function report({ item, head, words }, status, answer, files) {
   item.querySelector(".progress").remove();
   const good = status >= 200 && status < 300;
   const waiting = answer.waits_for_mapping ?? []; // where nothing was usable; else each file says so itself
@@ -138,6 +179,8 @@ function report({ item, head, words }, status, answer) {
     const note = element("div", { className: "note bad" }, element("b", { textContent: answer.detail ?? `The service answered ${status}.` }));
     note.setAttribute("role", "alert");
     if (answer.hint) note.append(element("div", { textContent: answer.hint }));
+    for (const id of mark(answer)) note.append(element("div", {}, element("a", { href: `#${id}`, textContent: "To the field" })));
+    if (!answer.report && chosenAgain(files)) note.append(element("div", { textContent: "The files are still chosen." }));
     note.append(...waiting.map((id, i) => mappingLink(id, waiting.length > 1 ? ` (${i + 1} of ${waiting.length})` : "")));
     item.append(note);
   }

@@ -189,6 +189,40 @@ def test_files_dropped_on_the_upload_page_become_sessions(window: Callable, enro
     assert watched.charts_drawn() == 2
 
 
+def test_a_refused_upload_says_so_at_the_field_and_keeps_the_files(
+    window: Callable, enrolled: str, client: TestClient, table: bytes
+) -> None:  # type: ignore[type-arg]
+    watched = window()
+    watched.sign_in()
+    watched.open(f"/participants/{enrolled}/upload?visit=1")
+    page = watched.page
+    page.select_option("[name=controller]", "rl")
+    page.fill("[name=policy]", "nobody")
+    page.evaluate("() => { document.querySelector('form details').open = true; }")
+    page.fill("[name=beta_unit]", "au")
+    page.evaluate("() => document.querySelector('[name=beta_source]').add(new Option('x', 'hearsay', true, true))")
+    page.set_input_files("input[type=file]", {"name": "t.csv", "mimeType": "text/csv", "buffer": table})
+    chosen = "() => [...document.querySelector('input[type=file]').files].map((f) => `${f.name} ${f.size}`)"
+    page.click("button.primary")
+    expect(page.locator("#n-beta_source")).to_contain_text("Input should be", timeout=60_000)
+    expect(page.locator("#f-beta_source")).to_have_attribute("aria-describedby", "h-beta_source n-beta_source")
+    assert page.evaluate(chosen) == [f"t.csv {len(table)}"]
+    page.select_option("[name=beta_source]", "")
+    page.click("button.primary")
+    expect(page.locator("#n-policy")).to_contain_text("has no policy 'nobody'", timeout=60_000)
+    expect(page.locator(".field-note")).to_have_count(1)
+    expect(page.locator("[aria-invalid]")).to_have_attribute("name", "policy")
+    page.click("[data-upload-list] li:first-child a[href='#f-policy']")
+    assert page.evaluate(chosen) == [f"t.csv {len(table)}"]
+    page.fill("[name=policy]", "")
+    page.select_option("[name=controller]", "cdbs")
+    page.click("button.primary")
+    expect(page.locator("[data-upload-list] li").first).to_contain_text("received", timeout=60_000)
+    expect(page.locator(".field-note, [aria-invalid]")).to_have_count(0)
+    assert page.evaluate(chosen) == []
+    assert client.get("/api/v1/visits/1/sessions").json()["total"] == 1
+
+
 def test_a_table_alone_whose_columns_nobody_knows_leads_to_its_mapping(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
     watched = window(768, 1024)
     watched.sign_in()
