@@ -23,7 +23,7 @@ from app.ingest.models import ColumnMapping
 from app.ingest.quarantine.serializers import problem_of
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from ml.formats.tables.mapping.model import UNITS
@@ -78,7 +78,7 @@ def read_by_mapping(request: Request, file_id: RowId, db: Db, caller: CurrentCal
     except BetaloopError as error:
         db.rollback()
         table = service.waiting_table(db, file_id, caller)
-        return _form_page(request, table, typed, error)
+        return _form_page(request, table, typed, _at_fields(error))
     upload_id = uploads.upload_file(db, file_id, caller)[0].upload_id
     return RedirectResponse(f"/uploads/{upload_id}?done=mapped", 303)
 
@@ -116,6 +116,15 @@ def _wanted(values: FormData) -> MappingIn:
     except Invalid as error:
         told = [e | {"where": _column_where(e["where"], columns)} for e in error.extra.get("errors", [])]
         raise Invalid("The table cannot be read as stated.", "Correct the fields; nothing was changed.", errors=told) from error
+
+
+def _at_fields(error: BetaloopError) -> BetaloopError:
+    """The same error, each of its `errors` with the form's field as its `name`; a column's is that of its row."""
+    names = {label: name for name, label in LABELS.items()}
+    told = [dict(e) | {"name": names.get(e["where"], e["where"].lower().replace(" ", "_"))} for e in error.extra.get("errors", ())]
+    if told:
+        error.extra["errors"] = told
+    return error
 
 
 def _column_where(where: str, columns: list[dict[str, Any]]) -> str:
@@ -172,6 +181,7 @@ def _form_page(request: Request, table: WaitingTable, typed: dict[str, str], err
         holds=[("", "Choose"), *HOLDS_NAMES.items()],
         formats=[("", "Choose"), *TIME_FORMATS],
         units=UNIT_CHOICES,
+        remarks=field_notes(error, dict.fromkeys(LABELS, "")),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

@@ -21,7 +21,7 @@ from app.ingest.proposals.thumbnail import thumbnail
 from app.ingest.proposals.visit_of_recording import add_visit_of_recording, visit_to_add
 from app.ingest.uploads import service
 from app.platform.database import Db
-from app.platform.errors import BetaloopError, Invalid
+from app.platform.errors import BetaloopError, Invalid, about
 from app.platform.web.forms import FormValues, field_notes, renamed
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
@@ -94,14 +94,15 @@ def attach(request: Request, file_id: RowId, db: Db, caller: CurrentCaller, valu
     """Attach a grasp file to its session."""
     file, participant = repository.upload_file(db, file_id, caller, lock=True)
     study_service.require(caller, can.WRITE_STUDY, participant)
+    chosen = str(values.get("session_id", ""))
     try:
-        chosen = str(values.get("session_id", ""))
-        if not chosen.isdecimal() or len(chosen) > 9:
-            raise Invalid("No session was chosen.", "Choose the session that the test belongs to.")
-        service.attach_grasps(db, file, study.session(db, int(chosen), caller))
+        with about("session_id"):
+            if not chosen.isdecimal() or len(chosen) > 9:
+                raise Invalid("No session was chosen.", "Choose the session that the test belongs to.")
+            service.attach_grasps(db, file, study.session(db, int(chosen), caller))
     except BetaloopError as error:
         db.rollback()
-        return _page(request, db, participant, caller, error=error)
+        return _page(request, db, participant, caller, error=error, attached=(file_id, chosen))
     db.commit()
     return RedirectResponse(f"/participants/{participant.code}/proposals?done=attached", 303)
 
@@ -167,6 +168,7 @@ def _page(
     refused: Mapping[int, BetaloopError] | None = None,
     sent: Mapping[str, str] | None = None,
     confirmed: list[int] | None = None,
+    attached: tuple[int, str] | None = None,
 ) -> HTMLResponse:
     refused, sent = refused or {}, sent or {}
     waiting = [only] if only else list(study.proposals_of_participant(db, participant.id))
@@ -186,6 +188,8 @@ def _page(
         beyond=max(len(waiting) - SHOWN, 0),
         chart=_chart(db, only) if only and may_know(only.visit, caller) else None,
         confirmed=fresh,
+        attached=attached,
+        remarks=field_notes(error, {"session_id": ""}) if attached else {},
         grasp_files=[] if only else repository.waiting_grasp_files(db, participant.id),
         sessions=everyone,
         visits=visits,

@@ -15,7 +15,7 @@ from app.ingest.quarantine.serializers import original, problem_of
 from app.ingest.wording import KIND_NAMES
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.web.forms import FormValues
+from app.platform.web.forms import FormValues, field_notes
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
@@ -70,6 +70,7 @@ def _page(
         decided=[f for f in rows if f.quarantine_sha256 is None],
         may_decide=caller.may(can.DECIDE_QUARANTINE, participant.site.study_id, participant.site_id),
         typed=typed or {},
+        remarks=field_notes(error, {"reason": ""}),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

@@ -150,7 +150,7 @@ def _held(db: Session, file_id: int, caller: Caller) -> tuple[UploadFile, Partic
 def _decide(db: Session, file: UploadFile, reason: str, caller: Caller) -> None:
     reason = reason.strip()
     if not reason:
-        raise Invalid("A decision on a quarantined file needs a reason.", "Say why.")
+        raise Invalid("A decision on a quarantined file needs a reason.", "Say why.", field="reason")
     set_reason(db, reason)
     file.decided_by, file.decided_at, file.decision_reason = caller.label, now(), reason
     db.flush()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
@@ -13,7 +14,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.study.data_queries import repository, service
 from app.study.data_queries.deps import CurrentDataQuery
@@ -26,6 +27,16 @@ from app.study.service import may
 from app.study.wording import ASKED_ABOUT, QUERIED_FIELDS
 
 router = APIRouter()
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A refused answer, closing or question asked again: of which query, and what was typed."""
+
+    query: int
+    state: str
+    text: str
+
 
 _LABELS = {
     "session_id": "Session", "upload_id": "Upload", "visit_id": "Visit", "dose_id": "Dose", "event_id": "Adverse event", "record": "Record",
@@ -52,7 +63,7 @@ def ask_data_query(request: Request, participant: CurrentParticipant, db: Db, ca
     """Ask about a value."""
     typed = {name: str(values[name]) for name in DataQueryIn.model_fields if name in values}
     try:
-        service.ask(db, participant, parse(DataQueryIn, typed, _LABELS), caller)
+        service.ask(db, participant, parse(DataQueryIn, typed, _LABELS | {"": "Session"}, {"": "session_id"}), caller)
     except BetaloopError as error:
         db.rollback()
         return _page(request, participant, db, caller, typed, error)
@@ -69,13 +80,19 @@ def follow_data_query(request: Request, query: CurrentDataQuery, db: Db, caller:
         service.follow(db, query, given, caller)
     except BetaloopError as error:
         db.rollback()
-        return _page(request, query.participant, db, caller, {}, error)
+        return _page(request, query.participant, db, caller, {}, error, Followed(query.id, typed.get("state", ""), typed.get("text", "")))
     db.commit()
     return RedirectResponse(f"/participants/{query.participant.code}/data-queries?done={given.state.value}", 303)
 
 
 def _page(
-    request: Request, participant: Participant, db: Session, caller: Caller, typed: dict[str, str], error: BetaloopError | None = None
+    request: Request,
+    participant: Participant,
+    db: Session,
+    caller: Caller,
+    typed: dict[str, str],
+    error: BetaloopError | None = None,
+    followed: Followed | None = None,
 ) -> HTMLResponse:
     found = repository.queries_of_participant(db, participant.id)
     subject = _subject(typed)
@@ -91,6 +108,8 @@ def _page(
         fields=QUERIED_FIELDS,
         asked=ASKED_ABOUT,
         typed=typed,
+        followed=followed,
+        remarks=field_notes(error, typed | {"text": ""}),
         may_ask=may(caller, can.ASK_QUERIES, participant),
         may_answer=may(caller, can.WRITE_STUDY, participant),
         problem=error.problem(request.url.path) if error else None,

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.platform.errors import Conflict, Invalid, NotFound
+from app.platform.errors import Conflict, Invalid, NotFound, about
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.adverse_events import repository as events
@@ -36,9 +36,10 @@ def ask(db: Session, participant: Participant, draft: DataQueryIn, caller: Calle
     study.require(caller, can.ASK_QUERIES, participant)
     named = {f"{s.value}_id": getattr(draft, f"{s.value}_id") for s in Subject if s not in OF_PARTICIPANT}
     row = DataQuery(participant_id=participant.id, participant=participant, record=draft.record, field=draft.field, **named)
-    found = _found(db, row, caller)
-    if found is None and not (row.upload_id is not None and repository.upload_of(db, participant.id, row.upload_id)):
-        raise NotFound(f"Participant {participant.code} has no {draft.subject.value} {row.subject_id}.")
+    with about("record" if draft.record else f"{draft.subject.value}_id"):
+        found = _found(db, row, caller)
+        if found is None and not (row.upload_id is not None and repository.upload_of(db, participant.id, row.upload_id)):
+            raise NotFound(f"Participant {participant.code} has no {draft.subject.value} {row.subject_id}.")
     row.entries.append(_entry(QueryState.OPEN, draft.text, row, found, caller))
     db.add(row)
     db.flush()
@@ -65,7 +66,7 @@ def follow(db: Session, query: DataQuery, given: DataQueryEntryIn, caller: Calle
 
 def _entry(state: QueryState, said: str, query: DataQuery, found: Found, caller: Caller) -> DataQueryEntry:
     if not said.strip():
-        raise Invalid("Nothing is said.", "Write what you ask, answer, or why the query is closed.")
+        raise Invalid("Nothing is said.", "Write what you ask, answer, or why the query is closed.", field="text")
     value = value_of(query.subject, query.field, found)
     return DataQueryEntry(state=state, text=said.strip(), value=value, entered_by=caller.label)
 

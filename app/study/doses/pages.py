@@ -28,7 +28,7 @@ def add_dose(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCalle
         service.add_dose(db, visit, parse(DoseIn, typed, _LABELS), caller)
     except BetaloopError as error:
         db.rollback()
-        return shown_visit(request, db, visit, caller, error=error, dose=typed)
+        return shown_visit(request, db, visit, caller, error=error, dose=typed, refused="dose")
     db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done=dose#doses", 303)
 
@@ -37,11 +37,12 @@ def add_dose(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCalle
 def remove_dose(request: Request, found: CurrentDose, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Take back a dose."""
     visit = found[1]
+    typed = {"reason": str(values.get("reason", ""))}
     try:
-        given = parse(DoseRemoval, {"reason": str(values.get("reason", ""))}, _LABELS)
+        given = parse(DoseRemoval, typed, _LABELS)
         service.remove_dose(db, *found, given.reason, caller)
     except BetaloopError as error:
         db.rollback()
-        return shown_visit(request, db, visit, caller, error=error)
+        return shown_visit(request, db, visit, caller, typed, error, refused=f"removal-{found[0].id}")
     db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done=dose_removed#doses", 303)

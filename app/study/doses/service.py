@@ -44,6 +44,7 @@ def add_dose(db: Session, visit: Visit, draft: DoseIn, caller: Caller) -> Dose:
         raise Conflict(
             f"{DRUGS[draft.drug].name} at {draft.taken_at:%Y-%m-%d %H:%M} UTC is written down at this visit already.",
             "Two tablets at one time are one dose: remove the one that is there, and enter both together.",
+            field="taken_at",
         ) from error
     db.refresh(visit, ["doses"])
     return row
@@ -58,7 +59,7 @@ def remove_dose(db: Session, dose: Dose, visit: Visit, reason: str, caller: Call
     study.require(caller, can.WRITE_STUDY, visit.participant)
     require_unlocked(visit)
     if not reason.strip():
-        raise Invalid("A reason is missing.", "Say why the dose is taken back; the audit trail keeps it.")
+        raise Invalid("A reason is missing.", "Say why the dose is taken back; the audit trail keeps it.", field="reason")
     set_reason(db, reason.strip())
     dose.removed_at = now()
     db.flush()
@@ -67,7 +68,8 @@ def remove_dose(db: Session, dose: Dose, visit: Visit, reason: str, caller: Call
 
 def _check_time(visit: Visit, taken_at: datetime) -> None:
     if taken_at > now() + _AHEAD:
-        raise Invalid(f"{taken_at:%Y-%m-%d %H:%M} UTC has not come yet.", "Doses are written down when they were taken. Times are UTC.")
+        words = f"{taken_at:%Y-%m-%d %H:%M} UTC has not come yet."
+        raise Invalid(words, "Doses are written down when they were taken. Times are UTC.", field="taken_at")
     if visit.date is None:
         return
     day = datetime.combine(visit.date, time(), UTC)
@@ -75,4 +77,5 @@ def _check_time(visit: Visit, taken_at: datetime) -> None:
         raise Invalid(
             f"{taken_at:%Y-%m-%d %H:%M} UTC is not near visit {visit.number} of {visit.date}.",
             "Give a time on its day or in the three days before, in UTC.",
+            field="taken_at",
         )

@@ -99,7 +99,7 @@ def lock_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCal
             visit_locks.lock(db, visit, reason, caller, str(values.get("password", "")), str(values.get("code", "")))
     except BetaloopError as error:
         db.rollback()
-        return shown_visit(request, db, visit, caller, None, error, lock_reason=reason)
+        return shown_visit(request, db, visit, caller, None, error, lock_reason=reason, refused="lock")
     db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done={'unlocked' if unlock else 'locked'}#lock", 303)
 
@@ -132,8 +132,13 @@ def shown_visit(
     error: BetaloopError | None = None,
     dose: dict[str, str] | None = None,
     lock_reason: str = "",
+    refused: str = "",
 ) -> HTMLResponse:
-    """The page of a visit; `typed`, `dose` and `lock_reason` are what a refused form of a correction, a dose or a lock said."""
+    """The page of a visit; `typed`, `dose` and `lock_reason` are what a refused form of a correction, a dose or a lock said.
+
+    `refused` says which form `error` is about: `dose`, `removal-` with a dose's number (what was typed is in `typed`), `lock`; empty: the
+    correction's.
+    """
     sessions, _ = repository.sessions_of_visit(db, visit.id)
     told = may_know(visit, caller)  # else its plan is sealed: letters and outcomes, and what else tells nothing of what ran
     ran = [(arm(s, caller).controller, tablet.of_recording(control_recording(s))) for s in sessions if s.segments and told]
@@ -152,7 +157,7 @@ def shown_visit(
         proposals=[s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id],
         seen=seen,
         shorthand_ma=cdbs_amplitude.held_settings(visit, visit.participant.current_settings).cdbs_amplitude_ma,
-        draft=seen | {"reason": ""} | (typed or {}),
+        draft=seen | {"reason": ""} | ({} if refused else typed or {}),
         labels=form.labels(seen),
         may_write=may(caller, can.WRITE_STUDY, visit.participant),
         may_run=may(caller, can.RUN_JOBS, visit.participant),
@@ -165,7 +170,9 @@ def shown_visit(
         lock_meaning=sign_off.MEANING,
         lock_signatures=sign_off.signatures_of_locks(db, visit),
         problem=error.problem(request.url.path) if error else None,
-        remarks=field_notes(error, seen | (typed or {}), form.asked_about),
+        refused=refused,
+        removal_reason=(typed or {}).get("reason", "") if refused else "",
+        remarks=field_notes(error, seen | (typed or {}) | (dose or {}), form.asked_about),
     )
     return HTMLResponse(page, error.status if error else 200)
 

@@ -255,7 +255,7 @@ def test_the_form_works_without_javascript(client: TestClient, client_as: Callab
     wrong = client.post(f"/uploaded-files/{waiting}/mapping", headers=PAGE, data=typed | {"unit_2": "mA", "time_at": ""})
     assert wrong.status_code == 422
     said = unescape(wrong.text)
-    assert {"Column 2", "A step's time"} <= set(re.findall(r"<code>(.*?)</code>", said))
+    assert {"Column 2", "A step's time"} <= set(re.findall(r'<a href="#f-[a-z_0-9]*">(.*?)</a>', said))
     assert 'value="0-2"' in said, "what was typed stays"
     right = client.post(f"/uploaded-files/{waiting}/mapping", headers=PAGE, data=typed, follow_redirects=False)
     assert (right.status_code, right.headers["location"]) == (303, f"/uploads/{upload}?done=mapped")
