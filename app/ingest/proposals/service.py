@@ -22,6 +22,7 @@ from app.platform.errors import Conflict, Invalid
 from app.study import blinding
 from app.study import repository as study
 from app.study import service as study_service
+from app.study.data_queries import repository as data_queries
 from app.study.models import Controller, StudySession
 from app.study.service import POLICY_CONTROLLERS
 from app.study.sessions import conditions, logged
@@ -137,9 +138,10 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
     """Several proposals in the place of one: a part of the same recordings each.
 
     Raises:
-        Conflict: as `change`. Invalid: parts outside the recording or over each other.
+        Conflict: as `change`, or a data query is about it. Invalid: parts outside the recording or over each other.
     """
     proposal = locked(db, session, version, caller)
+    _refuse_asked_about(db, session, "cut")
     spans = sorted((p.start_s, p.stop_s) for p in parts)
     for (_, stop), (start, _) in pairwise(spans):
         if start < stop - 1e-6:
@@ -174,10 +176,23 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
 
 
 def discard(db: Session, session: StudySession, version: int, reason: str, caller: Caller) -> None:
-    """Drop a proposal that is no session; its recordings stay. Raises Conflict as `change`."""
+    """Drop a proposal that is no session; its recordings stay. Raises Conflict as `change`, or where a data query is about it."""
     locked(db, session, version, caller)
+    _refuse_asked_about(db, session, "dropped")
     set_reason(db, reason)
     _delete(db, session)
+
+
+def _refuse_asked_about(db: Session, session: StudySession, done: str) -> None:
+    """Raises Conflict where a data query, closed or not, is about the proposal: it would be about nothing."""
+    asked = data_queries.numbers_of_session(db, session.id)
+    if asked:
+        one = len(asked) == 1
+        which = f"data {'query' if one else 'queries'} {', '.join(map(str, asked))}"
+        raise Conflict(
+            f"Session {session.id} cannot be {done}: {which} {'is' if one else 'are'} about it and would be about nothing.",
+            "Correct it and confirm it; a confirmed session that is not to count is excluded with a reason.",
+        )
 
 
 def _delete(db: Session, session: StudySession) -> None:

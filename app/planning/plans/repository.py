@@ -12,6 +12,7 @@ from app.evaluation.models import Evaluation
 from app.planning.plans.models import Plan, PlanItem
 from app.platform.database import now
 from app.study.adverse_events.models import AdverseEvent
+from app.study.data_queries.models import DataQuery
 from app.study.doses.models import Dose
 from app.study.models import Hemisphere, Recording, StudySession, Visit, VisitLock
 from app.study.repository import CONFIRMED, count
@@ -102,6 +103,7 @@ def what_holds(db: Session, visit_id: int) -> list[str]:
     doses = db.scalar(select(func.count()).select_from(Dose).where(Dose.visit_id == visit_id)) or 0
     counted = {"sessions or proposals": sessions, "a plan that was signed": signed, "adverse events": events, "locks": locks}
     counted["doses of medication"] = doses  # those that were taken back too: they stay, and tell that something was done
+    counted["data queries"] = db.scalar(select(func.count()).select_from(DataQuery).where(DataQuery.visit_id == visit_id)) or 0
     return [what for what, count in counted.items() if count]
 
 

@@ -54,7 +54,7 @@ def remove_visit(db: Session, visit: Visit, reason: str, caller: Caller) -> None
     """Remove a visit in which nothing was done, with its drafts; the audit trail keeps what it was, and why it went.
 
     Raises:
-        Conflict: it is locked, has sessions (proposed ones too), doses or adverse events, or a plan of it was once signed.
+        Conflict: it is locked, has sessions (proposed ones too), doses, adverse events or data queries, or a plan of it was once signed.
         Invalid: no reason.
     """
     study.require(caller, can.WRITE_STUDY, visit.participant)

@@ -29,6 +29,11 @@ def queries_of_participant(db: Session, participant_id: int) -> Sequence[DataQue
     return db.scalars(_queries().where(DataQuery.participant_id == participant_id).order_by(DataQuery.id)).all()
 
 
+def numbers_of_session(db: Session, session_id: int) -> list[int]:
+    """The numbers of all queries about a session, closed ones too."""
+    return list(db.scalars(select(DataQuery.id).where(DataQuery.session_id == session_id).order_by(DataQuery.id)))
+
+
 def not_closed_of_session(db: Session, session_id: int) -> int:
     """How many queries about a session are not closed."""
     newest = select(func.max(DataQueryEntry.id)).join(DataQuery).where(DataQuery.session_id == session_id).group_by(DataQuery.id)

@@ -240,6 +240,17 @@ def test_what_is_no_session_is_dropped_with_a_reason_and_the_same_file_proposes_
     assert [p["session"]["id"] for p in proposals()] == [again["proposals"][0]["session"]["id"]]
 
 
+def test_a_proposal_that_a_data_query_is_about_is_neither_dropped_nor_cut(send: Any, client: TestClient, proposals: Any) -> None:
+    (proposal,) = send(("s.csv", steady(1))).json()["proposals"]
+    query = {"session_id": proposal["session"]["id"], "field": "other", "text": "Is this a session?"}
+    numbers = [client.post("/api/v1/participants/P1/data-queries", json=query).json()["id"] for _ in range(2)]
+    for what, done, fields in (("discard", "dropped", {"reason": "no"}), ("split", "cut", {"parts": [{"start_s": 0, "stop_s": 10}]})):
+        answer = post(client, proposal, what, **fields)
+        said = f"cannot be {done}: data queries {numbers[0]}, {numbers[1]} are about it"
+        assert (answer.status_code, said in answer.json()["detail"]) == (409, True), answer.text
+    assert [p["session"]["id"] for p in proposals()] == [proposal["session"]["id"]]
+
+
 def test_the_same_bytes_again_give_the_same_proposal(send: Any, proposals: Any) -> None:
     first = send(("t.csv", steady(1)), visit=1).json()
     again = send(("copy.csv", steady(1)), visit=1).json()

@@ -35,6 +35,13 @@ def test_a_visit_with_sessions_or_a_signed_plan_stays(client: TestClient, studie
     assert (signed.status_code, "a plan that was signed" in signed.json()["detail"]) == (409, True)
 
 
+def test_a_visit_that_a_data_query_is_about_stays_and_the_refusal_says_why(client: TestClient, studied: Any) -> None:
+    query = {"visit_id": studied.visit, "field": "date", "text": "Is this the day?"}
+    assert client.post("/api/v1/participants/P1/data-queries", json=query).status_code == 201
+    held = client.post(f"/api/v1/visits/{studied.visit}/removal", json={"reason": "x"})
+    assert (held.status_code, held.json()["detail"]) == (409, "Visit 2 is not empty: it has data queries.")
+
+
 def test_tested_sessions_change_places_and_cdbs_stays_between(
     client: TestClient, client_as: Callable[..., TestClient], studied: Any, sign_plan: Callable[..., Any]
 ) -> None:
