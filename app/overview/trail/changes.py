@@ -25,6 +25,23 @@ def with_article(words: str) -> str:
     return f"{'an' if sounds_open else 'a'} {words}"
 
 
+def _taken_back(before: Row, after: Row) -> bool:
+    """Whether a change marks a row as one that counts no more."""
+    return bool(after.get("removed_at")) and not before.get("removed_at")
+
+
+def _key(before: Row, after: Row, name: str) -> int | None:
+    """A foreign key of a row; the one that it had before where what it named was deleted."""
+    now: int | None = after.get(name)
+    was: int | None = before.get(name)
+    return was if now is None else now
+
+
+def _left(before: Row, after: Row, name: str) -> bool:
+    """Whether what a row belonged to was deleted, and the row stays."""
+    return bool(after) and after.get(name) is None and before.get(name) is not None
+
+
 def _participant(before: Row, after: Row, _: Names) -> str:
     row = after or before
     if not before:
@@ -189,9 +206,28 @@ def _place(kind: str) -> Callable[[Row, Row, Names], str]:
 def _amplitude(before: Row, after: Row, names: Names) -> str:
     row = after or before
     side = f"{row['hemisphere']}, program {row['program']}" if row.get("program") else row["hemisphere"]
+    of = f"the cDBS amplitude of {names.visit(_key(before, after, 'visit_id'))}"
     if not after:
-        return f"removed the cDBS amplitude of {names.visit(row['visit_id'])} ({side})"
-    return f"{'changed' if before else 'set'} the cDBS amplitude of {names.visit(row['visit_id'])} to {row['amplitude_ma']:g} mA ({side})"
+        return f"removed {of} ({side})"
+    if _taken_back(before, after):
+        return f"took back {of}, {row['amplitude_ma']:g} mA ({side})"
+    if _left(before, after, "visit_id"):
+        return f"kept {of}, {row['amplitude_ma']:g} mA ({side}), which was taken back, without the visit"
+    return f"{'changed' if before else 'set'} {of} to {row['amplitude_ma']:g} mA ({side})"
+
+
+def _grasp_test(before: Row, after: Row, names: Names) -> str:
+    of = f"a grasp test of {names.session(_key(before, after, 'session_id'))}"
+    if _taken_back(before, after):
+        return f"took back {of}"
+    if _left(before, after, "session_id"):
+        return f"kept {of}, which was taken back, without the session"
+    return f"{'changed' if before else 'took in'} {of}"
+
+
+def _tremor(before: Row, after: Row, names: Names) -> str:
+    verb = "took back" if _taken_back(before, after) else "changed" if before else "took in"
+    return f"{verb} tremor readings of {names.participant((after or before)['participant_id'])}"
 
 
 def _adverse_event(before: Row, after: Row, names: Names) -> str:
@@ -317,8 +353,8 @@ SAID: dict[str, Callable[[Row, Row, Names], str]] = {
     "upload": _upload,
     "upload_file": _file,
     "session_proposal": _proposal,
-    "grasp_test": lambda b, a, n: f"took in a grasp test of {n.session((a or b)['session_id'])}",
-    "tremor_series": lambda b, a, n: f"took in tremor readings of {n.participant((a or b)['participant_id'])}",
+    "grasp_test": _grasp_test,
+    "tremor_series": _tremor,
     "plan_item": _plan_item,
     "device": lambda b, a, n: f"took in a device of {n.participant((a or b)['participant_id'])}",
     "recording": _recording,

@@ -53,6 +53,8 @@ REVISION = {"event_id": 2, "revision": 1, "kind": "fall", "cleared_reason": None
 MEMBER = {"user_id": 2, "study_id": 1, "site_id": None, "role": "viewer"}
 FILE = {"id": 1, "upload_id": 2, "reviewed_at": None}
 JOB = {"participant_id": 1, "status": "queued"}
+AMPLITUDE = {"visit_id": 4, "hemisphere": "left", "program": 0, "amplitude_ma": 2.5, "removed_at": None}
+GONE = {"removed_at": "2026-03-02"}
 SESSION = {"id": 7, "visit_id": 4, "ordinal": 3, "status": "confirmed", "excluded_reason": None}
 
 
@@ -152,12 +154,30 @@ SESSION = {"id": 7, "visit_id": 4, "ordinal": 3, "status": "confirmed", "exclude
             "signed policy rl-01 of P1: released",
         ),
         (
-            event("cdbs_amplitude", None, {"visit_id": 4, "hemisphere": "left", "program": 0, "amplitude_ma": 2.5}),
+            event("cdbs_amplitude", None, AMPLITUDE),
             "set the cDBS amplitude of visit 2 of P1 to 2.5 mA (left)",
+        ),
+        (
+            event("cdbs_amplitude", AMPLITUDE, AMPLITUDE | GONE),
+            "took back the cDBS amplitude of visit 2 of P1, 2.5 mA (left)",
+        ),
+        (
+            event("cdbs_amplitude", AMPLITUDE | GONE, AMPLITUDE | GONE | {"visit_id": None}),
+            "kept the cDBS amplitude of visit 2 of P1, 2.5 mA (left), which was taken back, without the visit",
+        ),
+        (
+            event("cdbs_amplitude", AMPLITUDE | {"visit_id": 5} | GONE, AMPLITUDE | GONE | {"visit_id": None}),
+            "kept the cDBS amplitude of a visit that is gone (5), 2.5 mA (left), which was taken back, without the visit",
         ),
         (event("device", None, {"participant_id": 1}), "took in a device of P1"),
         (event("grasp_test", None, {"session_id": 7}), "took in a grasp test of session 3 of visit 2 of P1"),
+        (event("grasp_test", {"session_id": 7}, {"session_id": 7} | GONE), "took back a grasp test of session 3 of visit 2 of P1"),
+        (
+            event("grasp_test", {"session_id": 8} | GONE, {"session_id": None} | GONE),
+            "kept a grasp test of session 8, which was taken back, without the session",
+        ),
         (event("tremor_series", None, {"participant_id": 1}), "took in tremor readings of P1"),
+        (event("tremor_series", {"participant_id": 1}, {"participant_id": 1} | GONE), "took back tremor readings of P1"),
         (event("session_proposal", None, {"session_id": 7}), "made the proposal of session 3 of visit 2 of P1"),
         (event("plan_item", None, {"plan_id": 9, "position": 2}), "planned session 2 of plan 9 for visit 2 of P1"),
         (event("upload_file", FILE, FILE | {"reviewed_at": "2026"}), "looked at the original of file 1 of upload 2"),

@@ -75,7 +75,9 @@ class _Scope:
             return self._inside(name, row["id"].as_integer())
         key = _key(Base.metadata.tables[name])
         assert key is not None
-        return self._inside(_parent(key), row[key.name].as_integer())
+        # a row outlasts what its key named where that was deleted: the key is empty from then on, and what it was tells whose row it is
+        named = (cast(side, JSONB)[key.name].as_integer() for side in (first, second))
+        return self._inside(_parent(key), func.coalesce(*named))
 
     def recorded(self) -> ColumnElement[bool]:
         """Whether something that changed no row is in scope: exports, downloads, looks at one participant's results."""
