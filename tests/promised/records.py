@@ -17,6 +17,8 @@ RECORDS = [
          f"{PAST}::test_what_would_keep_later_writes_from_the_trail_is_named"),
         ("a trigger that leaves a column out is found", ' and (name != "audit" or given == arguments.get(table))', "",
          f"{PAST}::test_what_would_keep_later_writes_from_the_trail_is_named"),
+        ("a default that writes other times is found", "*_triggers(db), *_defaults(db)]", "*_triggers(db)]",
+         f"{PAST}::test_a_default_that_would_write_other_times_or_words_is_named"),
         ("a trigger of others is found", "if not (own and (name, function, moment) in KNOWN):", "if False:",
          f"{PAST}::test_what_would_keep_later_writes_from_the_trail_is_named"),
     ),
@@ -40,6 +42,8 @@ RECORDS = [
     ),
     *_of(
         "platform/audit/chain",
+        ("a time that goes back is found", "if moment < latest - _A_DAY_US:", "if False:",
+         f"{PAST}::test_what_was_written_at_a_false_time_stays_named_once_the_clock_is_right_again"),
         ("rows are held against the trail", "breaks += islice(past_the_trail(db), MOST_BREAKS)", "pass",
          f"{PAST}::test_what_was_written_past_the_trail_is_named"),
         ("a signature whose content was rewritten is named", "for i in changed_records(db)]", "for i in ()]",

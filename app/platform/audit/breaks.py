@@ -22,6 +22,8 @@ class BreakKind(StrEnum):
     TRIGGER_OFF = "trigger_off"
     TRIGGER_UNKNOWN = "trigger_unknown"
     FUNCTION_CHANGED = "function_changed"
+    DEFAULT_CHANGED = "default_changed"
+    BACKDATED = "backdated"
     SIGNATURE_CHANGED = "signature_changed"
     ROW_ALTERED = "row_altered"
     ROW_REMOVED = "row_removed"
@@ -60,6 +62,9 @@ def sentence(b: Break) -> str:
         BreakKind.TRIGGER_OFF: f"table {b.table}: its trigger {b.name} is missing, switched off, or not the one that betaloop made",
         BreakKind.TRIGGER_UNKNOWN: f"table {b.table}: betaloop made no trigger or rule {b.name}, which may keep changes from the trail",
         BreakKind.FUNCTION_CHANGED: f"function {b.name}, on which the trail rests, is missing or not the one that betaloop made",
+        BreakKind.DEFAULT_CHANGED: f"table {b.table}: what stands in column {', '.join(b.columns)} by default is not what betaloop made",
+        BreakKind.BACKDATED: f"link {b.position}: the time of row {b.event_id} lies more than a day before that of an earlier one: "
+        "it was changed, or the clock of the database was set back",
         BreakKind.SIGNATURE_CHANGED: f"signature {b.row}: its content is not what was signed",
         BreakKind.ROW_ALTERED: f"{where}: {', '.join(b.columns)} changed past the trail, whose row {b.event_id} tells otherwise",
         BreakKind.ROW_REMOVED: f"{where} is gone, and the trail tells of no deletion: its row {b.event_id} is the last that tells of it",

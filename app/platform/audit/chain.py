@@ -35,6 +35,8 @@ from app.settings import get_settings, private_folder
 GENESIS = hashlib.sha256(b"betaloop audit trail").digest()
 SECRET = "audit-seals"  # noqa: S105 - the name of a key
 SEAL_EVERY_S = 60.0
+_A_DAY_US = 86_400_000_000
+"""How far the times of links may go back, microseconds: a link is made when its transaction ends, and a transaction may last."""
 
 
 class AuditLink(Base):
@@ -124,7 +126,7 @@ def verify(db: Session) -> Verified:
     digests: dict[int, bytes] = {}
     wanted = [*_seals_of_database(db), *_seals_of_file()]
     places = {place for place, _, _ in wanted}
-    breaks, links, before = [], 0, GENESIS
+    breaks, links, before, latest = [], 0, GENESIS, 0
     for position, event_id, stored, fields in _links(db):
         links += 1
         if position != links:
@@ -134,6 +136,11 @@ def verify(db: Session) -> Verified:
             breaks.append(Break(BreakKind.REMOVED, position, event_id))
         elif digest_of(before, fields) != stored:
             breaks.append(Break(BreakKind.EDITED, position, event_id))
+        moment = latest if fields is None else int(fields[1] or 0)
+        if moment < latest - _A_DAY_US:
+            breaks.append(Break(BreakKind.BACKDATED, position, event_id))
+            latest = moment  # those that follow at the same time are not named again: the rest of the chain is looked at
+        latest = max(latest, moment)
         before = stored
         if position in places:
             digests[position] = stored

@@ -1,4 +1,5 @@
-"""Whether what writes the trail is what betaloop made: the functions by their source, the triggers by all that they do, and no others.
+"""Whether what writes the trail is what betaloop made: the functions by their source, the triggers by all that they do, and no others; and
+what stands in a column of the trail and of signatures that no statement names, their times among it.
 
 The owner of the tables could put a function that writes nothing in the place of one that does, or a trigger before it that lets nothing
 through. Migrations define both; what they define stands here, and a test holds the two against each other.
@@ -55,6 +56,20 @@ union all
 select c.relname, r.rulename, '', 0, false, '', '', '', '' from pg_rewrite r join pg_class c on c.oid = r.ev_class
 where c.relnamespace = 'public'::regnamespace and c.relkind = 'r'
 """
+DEFAULTS = {
+    ("audit_event", "id"): "nextval('audit_event_id_seq'::regclass)",
+    ("audit_event", "at"): "clock_timestamp()",
+    ("audit_seal", "made_at"): "clock_timestamp()",
+    ("signature", "id"): "nextval('signature_id_seq'::regclass)",
+    ("signature", "signed_at"): "clock_timestamp()",
+}
+"""By table and column; the other columns of these tables and of the chain have none."""
+_DEFAULTS = """
+select c.relname, a.attname, pg_get_expr(d.adbin, d.adrelid),
+    exists (select from pg_depend p where p.classid = 'pg_attrdef'::regclass and p.objid = d.oid and p.refclassid = 'pg_proc'::regclass)
+from pg_attrdef d join pg_class c on c.oid = d.adrelid join pg_attribute a on a.attrelid = c.oid and a.attnum = d.adnum
+where c.relnamespace = 'public'::regnamespace and c.relname = any(:tables)
+"""  # functions of PostgreSQL itself leave no dependency: one that is found is somebody's, whatever its name
 _KEYS = """
 select c.relname, string_agg(a.attname, ',' order by k.place)
 from pg_index i join pg_class c on c.oid = i.indrelid cross join lateral unnest(i.indkey::int2[]) with ordinality k(number, place)
@@ -69,8 +84,8 @@ def keys(db: Session) -> dict[str, tuple[str, ...]]:
 
 
 def what_writes(db: Session) -> list[Break]:
-    """Functions, triggers and rules that are missing, off, changed or not betaloop's."""
-    return [*_functions(db), *_triggers(db)]
+    """Functions, triggers, rules and defaults that are missing, off, changed or not betaloop's."""
+    return [*_functions(db), *_triggers(db), *_defaults(db)]
 
 
 def _functions(db: Session) -> Iterator[Break]:
@@ -80,6 +95,15 @@ def _functions(db: Session) -> Iterator[Break]:
         same = hashlib.sha256(source.encode()).hexdigest() == sha256
         if not same or as_owner != (wanted is not None) or settings != (list(wanted) if wanted else None):
             yield Break(BreakKind.FUNCTION_CHANGED, name=name)
+
+
+def _defaults(db: Session) -> Iterator[Break]:
+    """Columns of the trail and of signatures in which another value stands by default: a time that is none, or somebody else's name."""
+    rows = db.execute(text(_DEFAULTS), {"tables": [*NEVER_CHANGED, "signature"]})
+    there = {(table, column): None if of_others else expression for table, column, expression, of_others in rows}
+    for table, column in sorted(there.keys() | DEFAULTS.keys()):
+        if there.get((table, column)) != DEFAULTS.get((table, column), ""):
+            yield Break(BreakKind.DEFAULT_CHANGED, table=table, columns=(column,))
 
 
 def _triggers(db: Session) -> Iterator[Break]:

@@ -132,6 +132,39 @@ def test_what_would_keep_later_writes_from_the_trail_is_named(
     assert named in {(kind, table, name) for kind, table, _, _, name in found()}
 
 
+@pytest.mark.parametrize(
+    ("default", "column"),
+    [("audit_event alter column at set default '2020-01-01'", "at"), ("audit_event alter column reason set default 'as agreed'", "reason"),
+     ("audit_event alter column at set default public.clock_timestamp()", "at"), ("signature alter column signed_at drop default", "signed_at")],
+)  # fmt: skip
+def test_a_default_that_would_write_other_times_or_words_is_named(
+    fresh_database: str, owner_db: Session, default: str, column: str
+) -> None:
+    owner_db.execute(text("create function clock_timestamp() returns timestamptz language sql as $$ select '2020-01-01'::timestamptz $$"))
+    owner_db.execute(text("set local search_path = public, pg_catalog"))
+    owner_db.execute(text(f"alter table {default}"))
+    owner_db.commit()
+    table = default.partition(" ")[0]
+    assert found() == {("default_changed", table, None, (column,), None)}
+    owner_db.execute(text("drop function public.clock_timestamp() cascade"))
+    owner_db.commit()
+
+
+def test_what_was_written_at_a_false_time_stays_named_once_the_clock_is_right_again(
+    client: TestClient, enrolled: str, owner_db: Session
+) -> None:
+    last = owner_db.scalar(text("select max(id) from audit_event"))
+    owner_db.execute(text("alter table audit_event alter column at set default '2020-01-01'"))
+    owner_db.commit()
+    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 7}).status_code == 201
+    owner_db.execute(text("alter table audit_event alter column at set default clock_timestamp()"))
+    owner_db.commit()
+    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 8}).status_code == 201
+    with new_session() as db:
+        (named,) = verify(db).breaks
+    assert (named.kind.value, (named.event_id or 0) > (last or 0)) == ("backdated", True)
+
+
 def test_what_a_function_that_writes_nothing_let_through_stays_named_when_it_is_put_back(
     client: TestClient, enrolled: str, owner_db: Session
 ) -> None:
