@@ -89,7 +89,7 @@ def resume_() -> None:
         typer.echo(f"Upload {one.upload_id}: {one.message}")
     if not taken:
         typer.echo("No upload was cut short.")
-    if any(not one.done for one in taken):
+    if any(not (one.done or one.left) for one in taken):
         raise typer.Exit(1)
 
 

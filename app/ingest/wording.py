@@ -40,6 +40,7 @@ KIND_NAMES = {
 }
 """Kinds of files (`ml.formats.FileKind`, and `unknown` before a file is read) as people call them."""
 WAITS = "cut short: read again by itself"
+LEFT = "cut short: left as it is"
 COMING = "being received"
 """By another web service, which alone knows how far it is."""
 AFTER_READER_ENDED = (
@@ -75,6 +76,11 @@ def cut_short(upload_id: int, kept: int, of: int, beneath: BetaloopError | None 
         away = isinstance(beneath, DatabaseAway) and not isinstance(beneath, GivenUp)
         when = f"What is kept is read by itself within some minutes{' of its coming back' if away else ''}"
     return what, f"{when}: its report will be on /uploads/{upload_id}.{rest}"
+
+
+def left(why: str) -> str:
+    """That an upload which was cut short is not read, and why."""
+    return f"This upload was cut short, and what is kept of it is left as it is. {why} It is read by itself if that is taken back."
 
 
 MADE_ANEW = "What was kept of it was missing or damaged; these bytes took its place."

@@ -9,6 +9,7 @@ from threading import Event
 import structlog
 from sqlalchemy.orm import Session
 
+from app.ingest import wording
 from app.ingest.models import Upload
 from app.ingest.sessions import StatedSession
 from app.ingest.stated_beta import BetaStated
@@ -28,17 +29,18 @@ RESUME_EVERY_S = 60.0
 
 @dataclass(frozen=True)
 class ResumedUpload:
-    """An upload that was interrupted; what became of it; whether that worked."""
+    """An upload that was interrupted; what became of it; whether that worked, or was left for its participant, site or study."""
 
     upload_id: int
     message: str
     done: bool
+    left: bool = False
 
 
 def resume(actor: str) -> Iterator[ResumedUpload]:
     """Read the kept files of interrupted uploads and make or propose their sessions, each upload by itself; yields as it goes.
 
-    A file of which not all bytes had come is not there: its sender saw the upload fail, and sends it again.
+    Those of participants who have withdrawn, and of sites and studies that have ended, are left as they are. A file of which not all bytes had come is not there: its sender saw the upload fail, and sends it again.
 
     Args:
         actor: who stands in the audit trail.
@@ -48,7 +50,7 @@ def resume(actor: str) -> Iterator[ResumedUpload]:
     for upload_id in found:
         try:
             with in_progress(upload_id), transaction(actor) as db:
-                resumed = ResumedUpload(upload_id, _resume(db, upload_id), True)
+                resumed = _resume(db, upload_id)
         except Exception as fault:
             # one upload that cannot be read must not keep the others from being resumed; it stays as it is
             log.error("interrupted upload could not be resumed", upload=upload_id, places=places(fault))
@@ -61,7 +63,8 @@ def keep_resuming(actor: str, stop: Event, every_s: float = RESUME_EVERY_S) -> N
     while True:
         try:
             for taken in resume(actor):
-                log.info("interrupted upload", upload=taken.upload_id, done=taken.done, message=taken.message)
+                if not taken.left:  # each minute, for as long as the study has ended
+                    log.info("interrupted upload", upload=taken.upload_id, done=taken.done, message=taken.message)
         except Exception as fault:
             # the database may be away; uploads wait until it is back
             log.error("interrupted uploads could not be looked for", places=places(fault))
@@ -69,11 +72,13 @@ def keep_resuming(actor: str, stop: Event, every_s: float = RESUME_EVERY_S) -> N
             return
 
 
-def _resume(db: Session, upload_id: int) -> str:
+def _resume(db: Session, upload_id: int) -> ResumedUpload:
     upload = db.get_one(Upload, upload_id)
     if upload.status != "received":
-        return "it was finished meanwhile"
+        return ResumedUpload(upload_id, "it was finished meanwhile", True)
     participant, said = db.get_one(Participant, upload.participant_id), upload.stated
+    if why := service.why_left(participant):
+        return ResumedUpload(upload_id, wording.left(why), False, left=True)
     beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
     receiver = Receiver(db, participant, upload, service.decode_options(participant, beta), beta)
     outcome = UploadOutcome(upload, participant, [receiver.resume(row) for row in list(upload.files)])
@@ -83,4 +88,4 @@ def _resume(db: Session, upload_id: int) -> str:
         stated = StatedSession()  # the visit or policy that was stated is gone: a person says which
     service.finish(db, outcome, stated)
     listed = ", ".join(map(str, outcome.session_ids)) or "none"
-    return f"files: {len(outcome.files)}, sessions: {listed}"
+    return ResumedUpload(upload_id, f"files: {len(outcome.files)}, sessions: {listed}", True)

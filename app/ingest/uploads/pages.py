@@ -112,13 +112,17 @@ def report(request: Request, upload_id: RowId, db: Db, caller: CurrentCaller) ->
     row, participant = repository.upload(db, upload_id, caller)
     outcome = UploadOutcome(row, participant, service.stored_outcomes(db, row))
     waiting = {s.id for s in study.proposals_of_participant(db, participant.id)} & set(outcome.session_ids)
-    return HTMLResponse(
-        render(request, "ingest/report.html", participant=participant, outcome=outcome, waiting=len(waiting), kind_names=wording.KIND_NAMES)
-    )
+    why = service.why_left(participant) if row.status == "received" and row.id not in coming(db) else None
+    said = {"waiting": len(waiting), "left": wording.left(why) if why else None, "kind_names": wording.KIND_NAMES}
+    return HTMLResponse(render(request, "ingest/report.html", participant=participant, outcome=outcome, **said))
 
 
-def _state(upload: Upload, coming_in: set[int]) -> tuple[str, str]:
-    """What became of an upload, in a few words, and their tone; `coming_in` are those that some web service is receiving."""
+def _state(upload: Upload, coming_in: set[int], left: bool) -> tuple[str, str]:
+    """What became of an upload, in a few words, and their tone; `coming_in` are those that some web service is receiving.
+
+    Args:
+        left: whether what was cut short is not read, for the participant has withdrawn, or the site or study has ended.
+    """
     if upload.status == "decoded":
         return "read", "good"
     if any(f.preview is not None for f in upload.files):
@@ -128,7 +132,9 @@ def _state(upload: Upload, coming_in: set[int]) -> tuple[str, str]:
     found = told(upload.id)
     if found is None and upload.id in coming_in:
         return wording.COMING, "info"
-    return (wording.progress(found.file, found.files, found.share, found.doing), "info") if found else (wording.WAITS, "warn")
+    if found is None:
+        return (wording.LEFT if left else wording.WAITS), "warn"
+    return wording.progress(found.file, found.files, found.share, found.doing), "info"
 
 
 def _page(
@@ -142,6 +148,7 @@ def _page(
     visits, _ = study.visits(db, participant.id, 1000, 0)
     uploads = repository.uploads_of_participant(db, participant.id)
     coming_in = coming(db) if any(u.status == "received" for u in uploads) else set()
+    left = service.why_left(participant) is not None
     known = dict.fromkeys(_LABELS, "") | typed
     page = render(
         request,
@@ -157,7 +164,7 @@ def _page(
         sessions=study.sessions_of_participant(db, participant.id, with_proposals=True),
         proposed=len(study.proposals_of_participant(db, participant.id)),
         held=sum(f.quarantine_sha256 is not None for f in repository.quarantined_files(db, participant.id)),
-        uploads=[(u, _state(u, coming_in)) for u in uploads],
+        uploads=[(u, _state(u, coming_in, left)) for u in uploads],
         limit_mb=get_settings().upload_limit_mb,
         remarks=field_notes(error, known),
         problem=error.problem(request.url.path) if error else None,

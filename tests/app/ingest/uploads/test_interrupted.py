@@ -91,6 +91,36 @@ def test_what_the_sender_had_stated_holds_when_it_is_taken_up(
     assert (session["controller"], session["status"]) == ("random", "confirmed")
 
 
+@pytest.mark.parametrize(
+    ("ending", "undoing", "why"),
+    [
+        ("update participant set status = 'withdrawn'", "update participant set status = 'active'", "P1 has withdrawn"),
+        ("update site set ended_at = now()", "update site set ended_at = null", "Site &#39;main&#39; has ended"),
+        ("update study set ended_at = now()", "update study set ended_at = null", "Study &#39;main&#39; has ended"),
+    ],
+)
+def test_what_was_cut_short_waits_while_nothing_new_is_taken(
+    client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch, ending: str, undoing: str, why: str
+) -> None:
+    number = cut_short(db, monkeypatch, service, "make_sessions")
+    db.execute(text(ending))
+    db.commit()
+    (taken,) = resume("test")
+    assert (taken.done, taken.left) == (False, True)
+    assert client.get(f"/api/v1/uploads/{number}").json()["status"] == "received"
+    assert client.get("/api/v1/participants/P1/proposals").json() == []
+    page = client.get(f"/uploads/{number}", headers={"Accept": "text/html"}).text
+    assert "is left as it is" in page
+    assert why in page
+    listed = client.get("/participants/P1/upload", headers={"Accept": "text/html"})
+    assert wording.LEFT in listed.text or listed.status_code != 200
+    assert (listed.status_code == 200) == ("site" in ending), "who may upload no more has no such page"
+    assert CliRunner().invoke(command_line, ["ingest", "resume"]).exit_code == 0, "it is no fault"
+    db.execute(text(undoing))
+    db.commit()
+    assert [t.done for t in resume("test")] == [True]
+
+
 def test_an_upload_that_is_still_coming_is_left_alone(
     client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
