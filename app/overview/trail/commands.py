@@ -19,7 +19,7 @@ def export(
     end: Annotated[str, typer.Option(help="Last day.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Write the audit trail as a table, newest first. The export becomes a row of the trail."""
+    """Write the audit trail as a table, newest first. The export becomes a row of the trail, even one that fails halfway."""
     from sqlalchemy import true
 
     from app.overview.trail.export import as_csv
@@ -34,7 +34,9 @@ def export(
     with transaction(ACTOR) as db:
         try:
             with to.open("w", encoding="utf-8") as out:
-                for piece in as_csv(db, true(), wanted, SYSTEM):
+                pieces = as_csv(db, true(), wanted, SYSTEM)
+                db.commit()  # rows that were written stand in the trail as taken, whatever becomes of the rest
+                for piece in pieces:
                     written += out.write(piece)
         except OSError as error:
             say(f"betaloop: {to} cannot be written: {reason(error)}.")

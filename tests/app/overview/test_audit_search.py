@@ -190,3 +190,11 @@ def test_the_command_writes_the_same_table(client: TestClient, used: int, tmp_pa
         assert db.scalar(text("select count(*) from audit_event where entity = 'audit' and actor = 'command line'")) == 1
     assert CliRunner().invoke(cli.app, ["audit", "export", str(tmp_path)]).exit_code == 2
     assert CliRunner().invoke(cli.app, ["audit", "export", str(to), "--begin", "soon"]).exit_code != 0
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a file that takes no byte is known to Linux alone")
+def test_an_export_that_fails_halfway_is_a_row_of_the_trail(client: TestClient, used: int) -> None:
+    said = CliRunner().invoke(cli.app, ["audit", "export", "/dev/full"])
+    assert (said.exit_code, "/dev/full cannot be written" in said.output) == (1, True), said.output
+    with new_session() as db:
+        assert db.scalar(text("select count(*) from audit_event where entity = 'audit' and actor = 'command line'")) == 1
