@@ -114,7 +114,8 @@ PEOPLE: list[Promise] = [
     ),
     *of(
         "study/repository",
-        ("lists name nobody of another study", "    query = select(Participant).join(Participant.site).where(in_scope(caller))\n    if withdrawn",
+        ("lists name nobody of another study",
+         "    query = select(Participant).join(Participant.site).where(in_scope(caller))\n    if withdrawn",
          "    query = select(Participant).join(Participant.site)\n    if withdrawn",
          f"{PAGES}::test_an_administrator_of_another_study_or_site_sees_and_changes_nothing"),
     ),

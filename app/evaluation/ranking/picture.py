@@ -84,7 +84,8 @@ class Picture:
         behaviour: amplitude against beta; None where the evaluation is of before it was stored.
         doses: what each dose is expected to do; None without any.
         behaviour_columns, behaviour_rows, dose_columns, dose_rows: tables.
-        lines, thin_lines: behaviours whose line has a name and a colour, and those whose has none. greyed: whether some act like cDBS, and are grey.
+        lines, thin_lines: behaviours whose line has a name and a colour, and those whose has none.
+        greyed: whether some act like cDBS, and are grey.
     """
 
     behaviour: Markup | None

@@ -18,8 +18,9 @@ from app.ingest.uploads.in_progress import in_progress, interrupted
 from app.ingest.uploads.receiving import Receiver
 from app.ingest.uploads.service import UploadOutcome
 from app.platform.database import transaction
-from app.platform.errors import Invalid
+from app.platform.errors import Conflict, Invalid
 from app.platform.jobs.children.child import places
+from app.study import service as study_service
 from app.study.models import Participant
 
 log = structlog.get_logger()
@@ -37,10 +38,24 @@ class ResumedUpload:
     left: bool = False
 
 
+def why_left(participant: Participant) -> str | None:
+    """Why an upload of the participant that was cut short is not read, in a sentence; None where it is.
+
+    Participants who have withdrawn, sites and studies that have ended get no new data, not those either whose bytes came before.
+    """
+    try:
+        study_service.refuse_withdrawn(participant)
+        study_service.refuse_ended(participant.site)
+    except Conflict as refused:
+        return refused.detail
+    return None
+
+
 def resume(actor: str) -> Iterator[ResumedUpload]:
     """Read the kept files of interrupted uploads and make or propose their sessions, each upload by itself; yields as it goes.
 
-    Those of participants who have withdrawn, and of sites and studies that have ended, are left as they are. A file of which not all bytes had come is not there: its sender saw the upload fail, and sends it again.
+    Those of participants who have withdrawn, and of sites and studies that have ended, are left as they are. A file of which not all
+    bytes had come is not there: its sender saw the upload fail, and sends it again.
 
     Args:
         actor: who stands in the audit trail.
@@ -77,7 +92,7 @@ def _resume(db: Session, upload_id: int) -> ResumedUpload:
     if upload.status != "received":
         return ResumedUpload(upload_id, "it was finished meanwhile", True)
     participant, said = db.get_one(Participant, upload.participant_id), upload.stated
-    if why := service.why_left(participant):
+    if why := why_left(participant):
         return ResumedUpload(upload_id, wording.left(why), False, left=True)
     beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
     receiver = Receiver(db, participant, upload, service.decode_options(participant, beta), beta)

@@ -17,6 +17,7 @@ from app.ingest.schemas import UploadForm
 from app.ingest.uploads import service
 from app.ingest.uploads.early_refusal import UploadRoute
 from app.ingest.uploads.in_progress import coming, told
+from app.ingest.uploads.interrupted import why_left
 from app.ingest.uploads.service import BetaStated, Incoming, UploadOutcome
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, passing
@@ -112,7 +113,7 @@ def report(request: Request, upload_id: RowId, db: Db, caller: CurrentCaller) ->
     row, participant = repository.upload(db, upload_id, caller)
     outcome = UploadOutcome(row, participant, service.stored_outcomes(db, row))
     waiting = {s.id for s in study.proposals_of_participant(db, participant.id)} & set(outcome.session_ids)
-    why = service.why_left(participant) if row.status == "received" and row.id not in coming(db) else None
+    why = why_left(participant) if row.status == "received" and row.id not in coming(db) else None
     said = {"waiting": len(waiting), "left": wording.left(why) if why else None, "kind_names": wording.KIND_NAMES}
     return HTMLResponse(render(request, "ingest/report.html", participant=participant, outcome=outcome, **said))
 
@@ -148,7 +149,7 @@ def _page(
     visits, _ = study.visits(db, participant.id, 1000, 0)
     uploads = repository.uploads_of_participant(db, participant.id)
     coming_in = coming(db) if any(u.status == "received" for u in uploads) else set()
-    left = service.why_left(participant) is not None
+    left = why_left(participant) is not None
     known = dict.fromkeys(_LABELS, "") | typed
     page = render(
         request,

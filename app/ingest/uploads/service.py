@@ -194,19 +194,6 @@ def receive(
     return outcome
 
 
-def why_left(participant: Participant) -> str | None:
-    """Why an upload of the participant that was cut short is not read, in a sentence; None where it is.
-
-    Participants who have withdrawn, sites and studies that have ended get no new data, not those either whose bytes came before.
-    """
-    try:
-        study_service.refuse_withdrawn(participant)
-        study_service.refuse_ended(participant.site)
-    except Conflict as refused:
-        return refused.detail
-    return None
-
-
 def _take(receiver: Receiver, outcome: UploadOutcome, incoming: Sequence[Incoming]) -> None:
     """Keep and decode each file; those that are too large are told. Raises TooLarge where all are."""
     refused: list[TooLarge] = []

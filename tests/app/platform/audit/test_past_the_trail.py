@@ -135,7 +135,8 @@ def test_what_would_keep_later_writes_from_the_trail_is_named(
 @pytest.mark.parametrize(
     ("default", "column"),
     [("audit_event alter column at set default '2020-01-01'", "at"), ("audit_event alter column reason set default 'as agreed'", "reason"),
-     ("audit_event alter column at set default public.clock_timestamp()", "at"), ("signature alter column signed_at drop default", "signed_at")],
+     ("audit_event alter column at set default public.clock_timestamp()", "at"),
+     ("signature alter column signed_at drop default", "signed_at")],
 )  # fmt: skip
 def test_a_default_that_would_write_other_times_or_words_is_named(
     fresh_database: str, owner_db: Session, default: str, column: str
