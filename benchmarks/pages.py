@@ -8,8 +8,8 @@
 The study is made once and kept in --data (var/benchmarks/pages); a worker trains on one of its participants meanwhile. Each request of a
 page is of another participant, so that the first round finds nothing in the service's memory. Times are from the request to its last byte,
 in this machine's clock, beside the processor time of service and client; bytes are those sent, compressed. The charts' library and styles,
-which the browser keeps, are not counted. The first drawing of a session's samples, which decodes their file, is told by itself
-(`first_signal_median_ms`): it is kept from then on.
+which the browser keeps, are not counted. The first drawing of a session's samples, which decodes their file in a child and is kept from
+then on, is told by itself (`first_signal_median_ms`, `first_signal_p95_ms`), with whether it meets a page's aim (`first_signal_meets_aim`).
 """
 
 from __future__ import annotations
@@ -51,6 +51,8 @@ from app.study.repository import participant_by_code
 
 ROOT = Path(__file__).resolve().parents[1]
 KEPT = ROOT / "var" / "benchmarks" / "pages"
+AIM_MEDIAN_MS, AIM_P95_MS = 150.0, 400.0
+"""Of every page, on two cores that do nothing else."""
 
 PAGES = {
     "sign-in": "/sign-in",
@@ -290,8 +292,8 @@ def first_looks(client: httpx.Client, places: list[dict[str, Any]]) -> list[floa
     return found
 
 
-def report(found: dict[str, Measured]) -> dict[str, float]:
-    """The table, and the figures of the worst pages."""
+def report(found: dict[str, Measured]) -> dict[str, float | bool]:
+    """The table, and the figures of the worst pages; of the first drawing of samples its own, and whether they meet the aim of a page."""
     first = found.pop("signal, first", None)
     print(f"{'page':<18}{'median ms':>10}{'p95 ms':>9}{'cpu ms':>9}{'kB':>8}{'queries':>9}")
     rows = []
@@ -300,8 +302,16 @@ def report(found: dict[str, Measured]) -> dict[str, float]:
         rows.append((median, p95, max(m.size) / 1000))
         print(f"{name:<18}{median:>10.0f}{p95:>9.0f}{np.median(m.cpu_ms):>9.0f}{max(m.size) / 1000:>8.1f}{max(m.queries):>9}")
     medians, p95s, sizes = zip(*rows, strict=True)
-    figures = {"worst_median_ms": round(max(medians), 1), "worst_p95_ms": round(max(p95s), 1), "largest_kb": round(max(sizes), 1)}
-    return figures if first is None else figures | {"first_signal_median_ms": round(float(np.median(first.wall_ms)), 1)}
+    figures: dict[str, float | bool] = {
+        "worst_median_ms": round(max(medians), 1), "worst_p95_ms": round(max(p95s), 1), "largest_kb": round(max(sizes), 1),
+    }  # fmt: skip
+    if first is None:
+        return figures
+    median, p95 = float(np.median(first.wall_ms)), float(np.percentile(first.wall_ms, 95))
+    meets = median <= AIM_MEDIAN_MS and p95 <= AIM_P95_MS
+    aim = f"the aim of {AIM_MEDIAN_MS:.0f} and {AIM_P95_MS:.0f} ms"
+    print(f"{'signal, first':<18}{median:>10.0f}{p95:>9.0f}  {'meets' if meets else 'misses'} {aim}; not among the worst below")
+    return figures | {"first_signal_median_ms": round(median, 1), "first_signal_p95_ms": round(p95, 1), "first_signal_meets_aim": meets}
 
 
 def main() -> None:
