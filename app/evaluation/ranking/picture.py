@@ -12,6 +12,7 @@ from app.evaluation.ranking.answer import QUANTITIES, Row, map_of
 from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.platform.web.charts import Cell, written
 from app.platform.web.svg import Plane, apart, drawing
+from app.platform.web.templates import number
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.verdict import interval, outcome_draws
 from ml.ope.support.behaviour_map import DOSES, BehaviourMap
@@ -198,13 +199,15 @@ def _doses(shown: Sequence[Drawn], references: Sequence[Assessed], scale: Scale)
         held = [(d * scale.factor, p) for a in references for d, p in [(_dose(a.posterior), _predicted(a.posterior, name))] if d and p]
         plane.line([(x, p[0] * factor) for x, p in held], "cdbs", 1.5, "4 3")
         for x, p in held:
-            plane.dot(x, p[0] * factor, "cdbs", "ring", f"held at {x:.3g} {scale.unit}: {p[0] * factor:.3g}")
+            plane.dot(x, p[0] * factor, "cdbs", "ring", f"held at {number(x)} {scale.unit}: {number(p[0] * factor)}")
         for d in reversed(shown):
             dose, span = _dose(d.estimate), _predicted(d.estimate, name)
             if dose is not None and span is not None:
                 value, low_end, high_end = (v * factor for v in span)
                 plane.interval(dose * scale.factor, low_end, high_end, d.tone)
-                plane.dot(dose * scale.factor, value, d.tone, d.shape, f"{d.name}: {value:.3g} ({low_end:.3g} to {high_end:.3g})")
+                plane.dot(
+                    dose * scale.factor, value, d.tone, d.shape, f"{d.name}: {number(value)} ({number(low_end)} to {number(high_end)})"
+                )
         planes.append(plane)
     if not planes:
         return None
@@ -245,5 +248,5 @@ def _dose_row(name: str, estimate: Estimate | None, scale: Scale) -> tuple[Cell,
     cells: list[Cell] = [name, None if dose is None else scale.factor * dose]
     for quantity, (_, factor) in _PANELS.items():
         span = _predicted(estimate, quantity)
-        cells.append(None if span is None else f"{factor * span[0]:.3g} ({factor * span[1]:.3g} to {factor * span[2]:.3g})")
+        cells.append(None if span is None else "{} ({} to {})".format(*(number(factor * v) for v in span)))
     return tuple(cells)
