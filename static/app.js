@@ -144,5 +144,5 @@ makeSortable(document);
 for (const part of document.querySelectorAll("[data-refresh][id]")) setTimeout(() => refresh(part.id), Number(part.dataset.refresh) * 1000);
 
 // --- paper has the rows that a count of the page includes, also of a fold that nobody opened
-addEventListener("beforeprint", () => { for (const fold of document.querySelectorAll("details.counted:not([open])")) { fold.open = true; fold.dataset.printed = ""; } });
+addEventListener("beforeprint", () => { for (const fold of document.querySelectorAll("details:is(.counted, .file:has(.file)):not([open])")) { fold.open = true; fold.dataset.printed = ""; } });
 addEventListener("afterprint", () => { for (const fold of document.querySelectorAll("details[data-printed]")) { fold.open = false; delete fold.dataset.printed; } });
