@@ -55,8 +55,8 @@ def test_a_study_that_has_ended_is_read_and_nothing_in_it_changes(
     events = db.query(AuditEvent).filter(AuditEvent.entity == "study", AuditEvent.action == "update").order_by(AuditEvent.id)
     assert [(e.actor, e.reason) for e in events] == [("admin@clinic.example", why) for why in ("last visit held", "one more visit")]
     trail = client.get("/audit?entity=study").text
-    assert "ended study main" in trail
-    assert "opened study main again" in trail
+    assert "ended the study main" in trail
+    assert "opened again the study main" in trail
 
 
 def test_today_leaves_an_ended_study_out_until_it_is_asked_for(client: TestClient, enrolled: str) -> None:
