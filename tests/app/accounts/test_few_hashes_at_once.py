@@ -90,8 +90,9 @@ def test_two_at_a_time_whoever_asks_and_for_whatever(ada: int, at_once: list[int
         with transaction("test") as db:
             service.sign_in(db, ADA, PASSWORD)
 
-    acts: list[Callable[[], object]] = [lambda i=i: added(i) for i in range(4)]  # type: ignore[misc]
-    acts += [reset, lambda: service.confirm_password(ada, PASSWORD), signed_in] * 3
+    acts: list[Callable[[], object]] = [lambda i=i: added(i) for i in range(6)]  # type: ignore[misc]
+    # a try counts until it has proved right, and five of one account at once are too many
+    acts += [reset, lambda: service.confirm_password(ada, PASSWORD), signed_in] * 2
     assert in_threads(acts) == [None] * len(acts)
     assert len(at_once) == len(acts)
     assert max(at_once) == 2, "and two cores are used"
