@@ -26,7 +26,8 @@ SHOWS_NO_RESULTS = {
     # accounts, studies, and what is about no participant
     "/sign-in", "/account", "/accounts", "/studies", "/glossary", "/api-reference", "/styleguide", "/audit", "/search",
     "/healthz", "/readyz",
-    "/api/v1/studies", "/api/v1/studies/{study_code}/members", "/studies/{study_code}/column-mappings", "/api/v1/studies/{study_code}/column-mappings",
+    "/api/v1/studies", "/api/v1/studies/{study_code}/members",
+    "/studies/{study_code}/column-mappings", "/api/v1/studies/{study_code}/column-mappings",
     "/api/v1/bundle-key", "/api/v1/bundle-withdrawals",
     # who takes part, and what is agreed: the home page has its energy from /energy-saved
     "/", "/api/v1/participants", "/api/v1/participants/{code}", "/participants/new", "/participants/{code}/visits/new",
