@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -19,9 +19,9 @@ from app.accounts.models import Role, Scope, User
 from app.accounts.passwords import AT_ONCE, MIN_PASSWORD
 from app.accounts.permissions import Caller
 from app.platform.database import Db, new_session, now, set_actor
-from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany
+from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany, about
 from app.platform.web.bounded import Bounded
-from app.platform.web.forms import FormValues
+from app.platform.web.forms import FormValues, field_notes
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.settings import get_settings
@@ -108,12 +108,12 @@ def change_password(request: Request, db: Db, caller: CurrentCaller, values: For
     caller.require_browser()
     try:
         if values.get("password") != values.get("again"):
-            raise Invalid("The two new passwords differ.", "Type the same one twice.")
+            raise Invalid("The two new passwords differ.", "Type the same one twice.", field="again")
         present, new, code = (str(values.get(name, "")) for name in ("present", "password", "code"))
         service.change_own_password(db, _own_id(caller), present, new, code)
     except BetaloopError as error:
         db.rollback()
-        return _account_page(request, db, caller, error)
+        return _account_page(request, db, caller, error, refused=("password", {}))
     db.commit()
     return RedirectResponse("/sign-in?done=password", 303)
 
@@ -124,11 +124,12 @@ def begin_second_factor(request: Request, db: Db, caller: CurrentCaller, values:
     caller.require_browser()
     try:
         # else whoever finds a browser signed in could shut its user out
-        service.confirm_password(_own_id(caller), str(values.get("present", "")))
+        with about("present"):
+            service.confirm_password(_own_id(caller), str(values.get("present", "")))
         second_factor.begin(db, db.get_one(User, _own_id(caller)))
     except BetaloopError as error:
         db.rollback()
-        return _account_page(request, db, caller, error)
+        return _account_page(request, db, caller, error, refused=("begin", {}))
     db.commit()
     return RedirectResponse("/account#second-factor", 303)
 
@@ -141,7 +142,7 @@ def confirm_second_factor(request: Request, db: Db, caller: CurrentCaller, value
         codes = second_factor.confirm(db, db.get_one(User, _own_id(caller)), str(values.get("code", "")))
     except BetaloopError as error:
         db.rollback()
-        return _account_page(request, db, caller, error)
+        return _account_page(request, db, caller, error, refused=("confirm", {}))
     db.commit()
     return _account_page(request, db, caller, codes=codes)
 
@@ -151,11 +152,12 @@ def remove_second_factor(request: Request, db: Db, caller: CurrentCaller, values
     """Switch the second factor off with password and code; wrong ones are counted together with sign-ins."""
     caller.require_browser()
     try:
-        service.confirm_password(_own_id(caller), str(values.get("present", "")), str(values.get("code", "")))
+        with about("present"):
+            service.confirm_password(_own_id(caller), str(values.get("present", "")), str(values.get("code", "")))
         second_factor.remove(db, _own_id(caller))
     except BetaloopError as error:
         db.rollback()
-        return _account_page(request, db, caller, error)
+        return _account_page(request, db, caller, error, refused=("remove", {}))
     db.commit()
     return RedirectResponse("/account?done=factor", 303)
 
@@ -168,7 +170,7 @@ def create_token(request: Request, db: Db, caller: CurrentCaller, values: FormVa
         token = service.create_token(db, caller.label, str(values.get("name", "")), _scope(values), _days(values))
     except BetaloopError as error:
         db.rollback()
-        return _account_page(request, db, caller, error)
+        return _account_page(request, db, caller, error, refused=("token", values))
     db.commit()
     return _account_page(request, db, caller, token=token)
 
@@ -199,9 +201,9 @@ def add_user(request: Request, db: Db, caller: CurrentCaller, values: FormValues
         mine = [s.code for s in repository.studies(db) if service.administers(caller, s.id)]
         study = fields["study"] or (mine[0] if len(mine) == 1 else "")
         if study not in mine:
-            raise NotFound("There is no such study, or you do not administer it.")
+            raise NotFound("There is no such study, or you do not administer it.", field="study")
         if fields["role"] not in set(Role):
-            raise Invalid("Choose a role.", f"Known: {', '.join(Role)}.")
+            raise Invalid("Choose a role.", f"Known: {', '.join(Role)}.", field="role")
         password = str(values.get("password", ""))
         service.add_user(db, fields["email"], Role(fields["role"]), password, study, fields["name"].strip()[:200])
     except BetaloopError as error:
@@ -219,7 +221,7 @@ def reset_password(request: Request, user_id: RowId, db: Db, caller: CurrentCall
         service.set_password(db, user, str(values.get("password", "")))
     except BetaloopError as error:
         db.rollback()
-        return _accounts_page(request, db, caller, error)
+        return _accounts_page(request, db, caller, error, refused=f"user-{user_id}")
     db.commit()
     return RedirectResponse("/accounts?done=password", 303)
 
@@ -236,14 +238,14 @@ def set_active(user_id: RowId, db: Db, caller: CurrentCaller, values: FormValues
 def _scope(values: FormData) -> Scope:
     scope = str(values.get("scope", Scope.FULL))
     if scope not in set(Scope):
-        raise Invalid("Choose what the token may do.", f"Known: {', '.join(Scope)}.")
+        raise Invalid("Choose what the token may do.", f"Known: {', '.join(Scope)}.", field="scope")
     return Scope(scope)
 
 
 def _days(values: FormData) -> int:
     text = str(values.get("days", service.TOKEN_DAYS)).strip()
     if not text.isdecimal():
-        raise Invalid(f"'{text[:20]}' is no number of days.", f"Give 1 to {service.MOST_TOKEN_DAYS}.")
+        raise Invalid(f"'{text[:20]}' is no number of days.", f"Give 1 to {service.MOST_TOKEN_DAYS}.", field="days")
     return int(text[:6])
 
 
@@ -276,20 +278,34 @@ def _factor(db: Session, user: User) -> dict[str, Any]:
 
 
 def _account_page(
-    request: Request, db: Session, caller: Caller, error: BetaloopError | None = None, token: str = "", codes: Sequence[str] = ()
+    request: Request,
+    db: Session,
+    caller: Caller,
+    error: BetaloopError | None = None,
+    token: str = "",
+    codes: Sequence[str] = (),
+    refused: tuple[str, Mapping[str, Any]] = ("", {}),
 ) -> HTMLResponse:
+    """One's own access; `refused` is the form that `error` is about, and what was typed into it."""
     user = db.get_one(User, _own_id(caller))
     values = {"user": user, "tokens": repository.tokens_of(db, user.id), "token": token, "min_password": MIN_PASSWORD}
     values |= {"factor": _factor(db, user), "codes": codes}
     values |= {"sign_on_links": repository.sign_on_links(db, user.id)}
     values |= {"scopes": SCOPE_NAMES, "days": service.TOKEN_DAYS, "most_days": service.MOST_TOKEN_DAYS, "now": now()}
+    values |= {"refused": refused[0], "typed": refused[1], "remarks": field_notes(error, {})}
     problem = error.problem(request.url.path) if error else None
     return HTMLResponse(render(request, "accounts/account.html", problem=problem, **values), error.status if error else 200)
 
 
 def _accounts_page(
-    request: Request, db: Session, caller: Caller, error: BetaloopError | None = None, draft: dict[str, Any] | None = None
+    request: Request,
+    db: Session,
+    caller: Caller,
+    error: BetaloopError | None = None,
+    draft: dict[str, Any] | None = None,
+    refused: str = "new",
 ) -> HTMLResponse:
+    """Who may sign in; `refused` is the form that `error` is about."""
     page = render(
         request,
         "accounts/accounts.html",
@@ -297,6 +313,8 @@ def _accounts_page(
         studies=[s for s in repository.studies(db) if service.administers(caller, s.id)],
         roles=list(Role),
         draft=draft or {"email": "", "name": "", "role": Role.CLINICIAN, "study": ""},
+        refused=refused,
+        remarks=field_notes(error, {}),
         problem=error.problem(request.url.path) if error else None,
         min_password=MIN_PASSWORD,
     )

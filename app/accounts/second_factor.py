@@ -57,7 +57,7 @@ def confirm(db: Session, user: User, code: str) -> list[str]:
     if row is None or row.confirmed_at is not None:
         raise Invalid("No second factor is being set up.", "Begin again.")
     if not _takes_code(row, code):
-        raise Invalid("The code is wrong.", "Give the one that the app shows now; both clocks must be right.")
+        raise Invalid("The code is wrong.", "Give the one that the app shows now; both clocks must be right.", field="code")
     codes = [f"{secrets.token_hex(3)}-{secrets.token_hex(3)}" for _ in range(RECOVERY_CODES)]
     row.recovery = [_hash(c) for c in codes]
     row.confirmed_at = now()

@@ -19,7 +19,7 @@ from app.accounts.passwords import MIN_PASSWORD, FewAtOnce, place, weakness
 from app.accounts.permissions import MANAGE_ACCOUNTS, READ_AUDIT, Caller, Grant
 from app.platform.audit import record, record_once
 from app.platform.database import new_session, now, set_actor
-from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
+from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized, about
 from app.settings import get_settings
 
 FAILURES_ALLOWED = 5
@@ -44,10 +44,10 @@ def add_user(db: Session, email: str, role: Role, password: str, study_code: str
     """Make a user with a role in a study (the only one, unless named)."""
     address = normal_address(email)
     if address is None or not re.fullmatch(r"[^@\s]+@[^@\s]+", address):
-        raise Invalid(f"{email.strip()[:LONGEST_ADDRESS]!r} is no e-mail address.", "Give one like name@clinic.example.")
+        raise Invalid(f"{email.strip()[:LONGEST_ADDRESS]!r} is no e-mail address.", "Give one like name@clinic.example.", field="email")
     email = address
     if repository.user_by_email(db, email):
-        raise Conflict(f"There is already a user {email}.")
+        raise Conflict(f"There is already a user {email}.", field="email")
     check_password(password, email, name)
     with place():
         user = User(email=email, name=name, password_hash=_hasher.hash(password))
@@ -63,7 +63,9 @@ def check_password(password: str, email: str, name: str = "") -> None:
         why = weakness(password, email, name)
     if why is not None:
         raise Invalid(
-            f"The password {why}.", f"Use at least {MIN_PASSWORD} characters, such as four words that have nothing to do with each other."
+            f"The password {why}.",
+            f"Use at least {MIN_PASSWORD} characters, such as four words that have nothing to do with each other.",
+            field="password",
         )
 
 
@@ -86,7 +88,8 @@ def change_own_password(db: Session, user_id: int, present: str, new: str, code:
     """
     user = db.get_one(User, user_id)
     check_password(new, user.email, user.name)
-    confirm_password(user_id, present, code)
+    with about("present"):
+        confirm_password(user_id, present, code)
     set_password(db, user, new)
 
 
@@ -259,15 +262,15 @@ def create_token(db: Session, email: str, name: str, scope: Scope = Scope.FULL, 
         NotFound: no such user. Invalid: a bad name or number of days. Conflict: the user has a token of this name.
     """
     if not 1 <= days <= MOST_TOKEN_DAYS:
-        raise Invalid(f"A token cannot last {days} days.", f"Give 1 to {MOST_TOKEN_DAYS}.")
+        raise Invalid(f"A token cannot last {days} days.", f"Give 1 to {MOST_TOKEN_DAYS}.", field="days")
     user = repository.user_by_email(db, email)
     if user is None:
         raise NotFound(f"There is no user {email}.", "Make one with `betaloop user add`.")
     name = name.strip()
     if not name or len(name) > 100:
-        raise Invalid("A token needs a name of 1-100 characters.", "Name it after what will use it, e.g. 'upload-tablet'.")
+        raise Invalid("A token needs a name of 1-100 characters.", "Name it after what will use it, e.g. 'upload-tablet'.", field="name")
     if repository.token_by_name(db, user.id, name):
-        raise Conflict(f"{email} already has a token named '{name}'.", "Choose another name.")
+        raise Conflict(f"{email} already has a token named '{name}'.", "Choose another name.", field="name")
     token = _TOKEN_PREFIX + secrets.token_urlsafe(32)
     db.add(ApiToken(user_id=user.id, name=name, scope=scope, token_sha256=_hash(token), expires_at=now() + timedelta(days=days)))
     db.flush()

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.accounts.service import confirm_password
 from app.accounts.sign_on.service import use_confirmation
-from app.platform.errors import Forbidden
+from app.platform.errors import Forbidden, about
 from app.platform.signatures.models import Signature
 from app.platform.signatures.service import Signer, record
 
@@ -37,7 +37,8 @@ def sign(
     if caller.user_id is None:
         raise Forbidden("Only a person can sign.", "Sign in as the person who signs.")
     if password or caller.confirmed_at is None:
-        confirm_password(caller.user_id, password, code)
+        with about("password"):
+            confirm_password(caller.user_id, password, code)
     else:
         use_confirmation(db, caller)
     return record(db, Signer(caller.user_id, caller.label), kind=kind, subject_id=subject_id, meaning=meaning, content=content)

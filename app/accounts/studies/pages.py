@@ -21,7 +21,7 @@ from app.accounts.studies import repository, service
 from app.accounts.studies.schemas import HINT, NameChange, SiteIn, StudyChange, StudyIn
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.web.forms import FormValues
+from app.platform.web.forms import FormValues, field_notes
 from app.platform.web.templates import render
 
 router = APIRouter()
@@ -83,7 +83,7 @@ def grant(request: Request, study_code: str, db: Db, caller: CurrentCaller, valu
     def change() -> None:
         role = str(values.get("role", ""))
         if role not in set(Role):
-            raise Invalid("Choose a role.", f"Known: {', '.join(Role)}.")
+            raise Invalid("Choose a role.", f"Known: {', '.join(Role)}.", field="role")
         study = service.study_to_manage(db, study_code, caller)
         service.grant(db, study, str(values.get("email", "")), Role(role), str(values.get("site", "")) or None, caller)
 
@@ -110,7 +110,7 @@ def changed(request: Request, db: Session, caller: Caller, done: str, change: Ca
     except ValidationError as error:
         db.rollback()
         field = error.errors()[0]
-        what = Invalid(f"The {field['loc'][0]}: {field['msg']}.", HINT)
+        what = Invalid(f"The {field['loc'][0]}: {field['msg']}.", HINT, field=str(field["loc"][0]))
         return _page(request, db, caller, what)
     except BetaloopError as error:
         db.rollback()
@@ -123,7 +123,9 @@ def reason_of(values: FormData) -> str:
     """Why something changes. Raises Invalid where nobody says."""
     reason = str(values.get("reason", "")).strip()
     if not 1 <= len(reason) <= 1000:
-        raise Invalid("There is no reason, or it has more than 1000 characters.", "Say why this changes; the audit trail keeps it.")
+        raise Invalid(
+            "There is no reason, or it has more than 1000 characters.", "Say why this changes; the audit trail keeps it.", field="reason"
+        )
     return reason
 
 
@@ -149,6 +151,8 @@ def _page(request: Request, db: Session, caller: Caller, error: BetaloopError | 
         shown=shown,
         users=[u for u in users if u.active and manages(caller, u)],
         roles=list(Role),
+        refused=request.url.path,
+        remarks=field_notes(error, {}),
         may_add=len(mine) == len(accounts.studies(db)),
         problem=error.problem(request.url.path) if error else None,
     )

@@ -26,7 +26,7 @@ def add_study(db: Session, draft: StudyIn, caller: Caller) -> Study:
     others = accounts.studies(db)
     _require_all(others, caller)
     if repository.study_by_code(db, draft.code):
-        raise Conflict(f"There is already a study '{draft.code}'.", "Choose another code.")
+        raise Conflict(f"There is already a study '{draft.code}'.", "Choose another code.", field="code")
     study = Study(code=draft.code, name=draft.name)
     db.add(study)
     db.flush()
@@ -62,7 +62,7 @@ def change_study(db: Session, study: Study, change: StudyChange, caller: Caller)
             stands in its way may be another study's.
     """
     if change.name is None and change.code_prefix is None:
-        raise Invalid("Nothing is to change.", "Give a name or a prefix.")
+        raise Invalid("Nothing is to change.", "Give a name or a prefix.", field="name")
     set_reason(db, change.reason)
     if change.code_prefix is not None:
         _require_all(accounts.studies(db), caller)
@@ -85,7 +85,7 @@ def set_ended(db: Session, row: Study | Site, ended: bool, reason: str) -> None:
 def add_site(db: Session, study: Study, draft: SiteIn) -> Site:
     """Add a site. Raises Conflict where its code is taken."""
     if repository.site_by_code(db, study.id, draft.code):
-        raise Conflict(f"Study '{study.code}' has a site '{draft.code}' already.", "Choose another code.")
+        raise Conflict(f"Study '{study.code}' has a site '{draft.code}' already.", "Choose another code.", field="code")
     site = Site(study_id=study.id, code=draft.code, name=draft.name)
     db.add(site)
     db.flush()
@@ -160,7 +160,7 @@ def _require_all(studies: Iterable[Study], caller: Caller) -> None:
 def _user(db: Session, email: str) -> User:
     user = accounts.user_by_email(db, email)
     if user is None:
-        raise NotFound(f"There is no user {email.strip()[:254]}.", "Add the user first.")
+        raise NotFound(f"There is no user {email.strip()[:254]}.", "Add the user first.", field="email")
     return user
 
 

@@ -211,6 +211,7 @@ def _page(
         warnings=[text for _, text in wording.plain_warnings(view.warnings)] if view else [],
         method_notes=wording.method_notes(view.warnings) if view else [],
         remarks=field_notes(error, dict.fromkeys(values, "")) if values is not None else {},
+        signing_notes={name: note for name, note in field_notes(error, {}).items() if name in ("password", "code")},
         problem=error.problem(request.url.path) if error else None,
         may_override=may_approve,
         drafting=drafting,

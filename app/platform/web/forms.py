@@ -72,8 +72,7 @@ def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] |
 
 
 def _said(error: Mapping[str, Any]) -> str:
-    """What is wrong with a field; a pattern is no sentence, and the field's name or help says what it takes. One that is empty needs a
-    value."""
+    """What is wrong with a field; a pattern is no sentence, and the field's name or help says what it takes. An empty one needs a value."""
     if error["input"] is None:
         return "give a value"
     if error["type"] == "string_pattern_mismatch":
