@@ -54,6 +54,8 @@ PROMISES = [
     ),
     *_of(
         "platform/json_members",
+        ("malformed bodies are answered as described", "except (ValueError, RecursionError):", "except RecursionError:",
+         f"{MALFORMED}::test_every_malformed_body_is_answered_as_described"),
         ("a document with a doubled member is refused", "if doubled is not None:", "if False:",
          f"{MEMBERS}::test_a_doubled_member_is_refused_and_nothing_is_stored"),
     ),
@@ -348,6 +350,9 @@ PROMISES = [
     ),
     *_of(
         "platform/web/schemas",
+        ("every bound is one that readers of a JSON schema know", "Int = Annotated[int, _FitsTheDatabase()]",
+         "Int = Annotated[int, Strict(), AfterValidator(int)]",
+         "tests/app/test_openapi.py::test_every_bound_is_one_that_readers_of_a_json_schema_know"),
         ("bounds are published as readers know them", "if described.get(bound) == limit:", "if bound in described:",
          f"{NUMBERS}::test_bounds_beside_null_and_of_items_are_those_of_a_json_schema"),
     ),

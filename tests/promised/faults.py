@@ -22,6 +22,11 @@ FAULTS = [
          f"{INTERRUPTED}::test_a_disk_that_stays_full_is_no_fault_of_the_file"),
     ),
     *_of(
+        "ingest/uploads/interrupted",
+        ("nothing new is taken where a study has ended", "if why := why_left(participant):", "if why := '':",
+         f"{INTERRUPTED}::test_what_was_cut_short_waits_while_nothing_new_is_taken"),
+    ),
+    *_of(
         "ingest/uploads/receiving",
         ("a full disk is no fault of the file", "            if passing(fault) is not None:\n", "            if False:\n",
          f"{INTERRUPTED}::test_a_disk_that_stays_full_is_no_fault_of_the_file"),

@@ -67,6 +67,8 @@ PEOPLE: list[Promise] = [
     ),
     *of(
         "accounts/service",
+        ("who signs out is signed out on the server", "        row.ended_at = now()\n", "        pass\n",
+         "tests/app/pages/test_sign_in_pages.py::test_signing_out_ends_the_session_on_the_server"),
         ("an address has one account", "    if repository.user_by_email(db, email):\n        raise Conflict",
          "    if False:\n        raise Conflict", f"{ACCOUNTS}::test_names_of_tokens_and_addresses_are_unique"),
         ("stored passwords cost what they should", "FewAtOnce(time_cost=2", "FewAtOnce(time_cost=1",

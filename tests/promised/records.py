@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from tests.promised.promise import Promise
 from tests.promised.promise import of as _of
 
 CHAIN, PAST = "tests/app/platform/test_audit_chain.py", "tests/app/platform/audit/test_past_the_trail.py"
@@ -23,6 +24,19 @@ RECORDS = [
          f"{PAST}::test_what_would_keep_later_writes_from_the_trail_is_named"),
     ),
     *_of(
+        "platform/service_role",
+        ("the service may not delete what was entered", "or table in DELETED_FROM", "or True",
+         f"{KEPT}::test_the_service_may_not_delete_what_was_entered_or_measured"),
+        at_start=True,
+    ),
+    Promise("nobody deletes a confirmed session", "migrations/versions/20261126_nothing_deleted.py", "    op.execute(KEPT)\n", "",
+            f"{KEPT}::test_a_confirmed_session_is_deleted_by_nobody", at_start=True),
+    *_of(
+        "ingest/proposals/service",
+        ("a question is never about nothing", "    if asked:\n        one", "    if False:\n        one",
+         "tests/app/ingest/proposals/test_proposals.py::test_a_proposal_that_a_data_query_is_about_is_neither_dropped_nor_cut"),
+    ),
+    *_of(
         "study/doses/service",
         ("doses are not deleted", "    dose.removed_at = now()\n", "    db.delete(dose)\n",
          f"{KEPT}::test_a_dose_that_was_taken_back_stays_and_may_be_entered_anew"),
@@ -35,6 +49,9 @@ RECORDS = [
     ),
     *_of(
         "study/outcomes/service",
+        ("grasp tests that moved stay", "    for row in elsewhere:\n        row.removed_at = now()\n", 
+         "    for row in elsewhere:\n        db.delete(row)\n",
+         f"{KEPT}::test_grasp_tests_that_were_replaced_or_moved_stay_as_they_were"),
         ("replaced minutes stay as they were", "if before is not None and tremor.same_values(before, row):", "if before is not None:",
          f"{KEPT}::test_minutes_that_a_newer_reading_replaced_stay_as_they_were"),
         ("grasp tests outlast a proposal", "    for row in of_files.grasp_tests(db, session.id):\n        row.removed_at = now()\n", "",

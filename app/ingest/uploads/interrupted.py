@@ -20,7 +20,7 @@ from app.ingest.uploads.service import UploadOutcome
 from app.platform.database import transaction
 from app.platform.errors import Conflict, Invalid
 from app.platform.jobs.children.child import places
-from app.study import service as study_service
+from app.study import service as study
 from app.study.models import Participant
 
 log = structlog.get_logger()
@@ -38,24 +38,11 @@ class ResumedUpload:
     left: bool = False
 
 
-def why_left(participant: Participant) -> str | None:
-    """Why an upload of the participant that was cut short is not read, in a sentence; None where it is.
-
-    Participants who have withdrawn, sites and studies that have ended get no new data, not those either whose bytes came before.
-    """
-    try:
-        study_service.refuse_withdrawn(participant)
-        study_service.refuse_ended(participant.site)
-    except Conflict as refused:
-        return refused.detail
-    return None
-
-
 def resume(actor: str) -> Iterator[ResumedUpload]:
     """Read the kept files of interrupted uploads and make or propose their sessions, each upload by itself; yields as it goes.
 
-    Those of participants who have withdrawn, and of sites and studies that have ended, are left as they are. A file of which not all
-    bytes had come is not there: its sender saw the upload fail, and sends it again.
+    Those of participants who have withdrawn, and of sites and studies that have ended, are left as they are. A file of which not all bytes
+    had come is not there: its sender saw the upload fail, and sends it again.
 
     Args:
         actor: who stands in the audit trail.
@@ -85,6 +72,19 @@ def keep_resuming(actor: str, stop: Event, every_s: float = RESUME_EVERY_S) -> N
             log.error("interrupted uploads could not be looked for", places=places(fault))
         if stop.wait(every_s):
             return
+
+
+def why_left(participant: Participant) -> str | None:
+    """Why an upload of the participant that was cut short is not read, in a sentence; None where it is.
+
+    Participants who have withdrawn, sites and studies that have ended get no new data, not those either whose bytes came before.
+    """
+    try:
+        study.refuse_withdrawn(participant)
+        study.refuse_ended(participant.site)
+    except Conflict as refused:
+        return refused.detail
+    return None
 
 
 def _resume(db: Session, upload_id: int) -> ResumedUpload:
