@@ -37,11 +37,12 @@ def start_job(
 
     Raises:
         UnknownKind: there is no such kind. Invalid: params that break its schema, or something that it requires is not there.
-        Forbidden: the caller may not run jobs.
+        Forbidden: the caller may not run jobs. Conflict: the participant has withdrawn, or the study has ended, meanwhile.
     """
     study.require(caller, can.RUN_JOBS, participant)
     wanted = registry.kind(kind)
     checked = jobs.checked_params(kind, params)
+    study.require_still_taking_part(db, participant)  # an end cancels the jobs that it sees: one that came later would run
     # two requests at once: the second waits here and finds the job of the first
     learning.lock_participant(db, participant.id)
     if not again or wanted.one_at_a_time:

@@ -59,6 +59,12 @@ def sites(db: Session, caller: Caller) -> Sequence[Site]:
     return db.scalars(select(Site).where(in_scope(caller)).order_by(Site.code)).all()
 
 
+def hold_participation(db: Session, participant: Participant) -> None:
+    """Read again whether the participant takes part and the study goes on, and let nobody end either before this transaction ends."""
+    db.refresh(participant.site.study, ["ended_at"], with_for_update={"read": True, "of": Study})
+    db.refresh(participant, ["status"], with_for_update={"of": Participant})
+
+
 def participants_of_study(db: Session, study_id: int) -> Sequence[int]:
     """Numbers of a study's participants."""
     return db.scalars(select(Participant.id).join(Participant.site).where(Site.study_id == study_id).order_by(Participant.id)).all()

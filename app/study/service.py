@@ -235,6 +235,16 @@ def refuse_withdrawn(participant: Participant) -> None:
         )
 
 
+def require_still_taking_part(db: Session, participant: Participant) -> None:
+    """Raises Conflict where the participant has withdrawn, or the study has ended, since the caller was judged.
+
+    Neither happens from here to the end of the transaction: whoever withdraws or ends waits for it, and sees what it made.
+    """
+    repository.hold_participation(db, participant)
+    refuse_ended_study(participant.site)
+    refuse_withdrawn(participant)
+
+
 def refuse_ended(site: Site) -> None:
     """Raises Conflict for new participants and new data of a site or a study that has ended."""
     if site.ended_at is not None:

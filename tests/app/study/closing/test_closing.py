@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -11,9 +12,12 @@ from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
 from app import cli
+from app.accounts.permissions import SYSTEM
+from app.pipeline.service import start_job
 from app.platform.audit import AuditEvent
 from app.platform.errors import Conflict
 from app.platform.jobs.models import Job, JobStatus
+from app.study import repository as study
 from tests.app.conftest import table
 from tests.conftest import PASSWORD
 
@@ -78,6 +82,38 @@ def test_jobs_of_an_ended_study_are_cancelled(client: TestClient, enrolled: str,
     assert started.status_code in (201, 202), started.text
     assert client.post(f"{STUDY}/end", json=WHY).status_code == 200
     assert db.get_one(Job, started.json()["id"]).status == JobStatus.CANCELLED
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body"),
+    [("post", f"{STUDY}/end", WHY), ("patch", "/api/v1/participants/P1", {"status": "withdrawn", "reason": "moved away"})],
+)
+def test_a_job_of_a_request_that_was_judged_before_the_end_is_refused(
+    client: TestClient, enrolled: str, rng: Any, db: Session, method: str, path: str, body: dict[str, str]
+) -> None:
+    assert send_file(client, rng) == 201
+    judged = study.participant_by_code(db, enrolled, SYSTEM)
+    assert judged.site.study.ended_at is None
+    assert client.request(method, path, json=body).status_code == 200
+    with pytest.raises(Conflict, match=r"has (ended|withdrawn)"):
+        start_job(db, judged, "pipeline", {"preset": "quick"}, SYSTEM)
+    db.rollback()
+    assert db.query(Job).count() == 0
+
+
+def test_who_ends_a_study_waits_for_a_job_that_is_asked_for_and_cancels_it(
+    client: TestClient, enrolled: str, rng: Any, db: Session
+) -> None:
+    assert send_file(client, rng) == 201
+    job = start_job(db, study.participant_by_code(db, enrolled, SYSTEM), "pipeline", {"preset": "quick"}, SYSTEM).job
+    with ThreadPoolExecutor(1) as other:
+        ending = other.submit(client.post, f"{STUDY}/end", json=WHY)
+        with pytest.raises(TimeoutError):
+            ending.result(timeout=1)
+        db.commit()
+        assert ending.result(timeout=20).status_code == 200
+    db.refresh(job)
+    assert job.status == JobStatus.CANCELLED
 
 
 def test_an_ended_site_takes_neither_enrolments_nor_uploads_and_all_else_goes_on(
