@@ -45,7 +45,8 @@ class CutShort(BetaloopError):
 
     Args:
         upload_id: the upload. kept, of: how many of its files are kept.
-        beneath: the fault, where it is one that passes (a full disk, a database that is away): its status is this error's."""
+        beneath: the fault, where it is one that passes (a full disk, a database that is away): its status is this error's.
+    """
 
     status = 500
     title = "Something went wrong on our side"
@@ -173,8 +174,7 @@ def receive(
     if not incoming:
         raise Invalid("The upload holds no file.", "Choose at least one file.", field="file")
     beta = beta or BetaStated()
-    said = _said(stated, beta)
-    upload = Upload(participant_id=participant.id, created_by=caller.label, stated=said)
+    upload = Upload(participant_id=participant.id, created_by=caller.label, stated=_said(stated, beta))
     db.add(upload)
     db.flush()
     number = upload.id  # known whatever becomes of the database
