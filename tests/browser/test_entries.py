@@ -177,12 +177,12 @@ def test_a_refused_form_is_kept_and_no_secret_ever_is(tab: Watched) -> None:
     assert page.input_value("[name=number]") == "1"
     tab.open("/accounts")
     page.fill("main [name=email]", "new@clinic.example")
-    page.fill("#f-password", "a first password")
+    page.fill("#f-new-password", "a first password")
     kept: dict[str, Any] = json.loads(page.evaluate(KEPT))
     assert "new@clinic.example" in json.dumps(kept)
     assert "a first password" not in json.dumps(kept)
     page.reload()
-    assert (page.input_value("main [name=email]"), page.input_value("#f-password")) == ("new@clinic.example", "")
+    assert (page.input_value("main [name=email]"), page.input_value("#f-new-password")) == ("new@clinic.example", "")
 
 
 def test_what_stood_beside_something_too_large_stands_in_the_form_again(tab: Watched) -> None:

@@ -24,8 +24,8 @@ def test_every_file_is_a_line_and_only_a_problem_stands_open(browser: TestClient
     page = browser.post(f"/participants/{enrolled}/upload", data=fields, files=[("file", f) for f in files]).text
     told = lines(page)
     assert {name: opened for name, (opened, _) in told.items()} == {"good.csv": False, "bad.csv": True, "noise.bin": True}
-    assert re.fullmatch(r"read 4 to look at table, \d+ B · 1 session · 50 rows of 2 s: .*", told["good.csv"][1]), told["good.csv"]
-    assert told["bad.csv"][1].startswith("columns not known 1 problem unreadable, 8 B")
+    assert re.fullmatch(r"file \d+ read 4 to look at table, \d+ B · 1 session · 50 rows of 2 s: .*", told["good.csv"][1]), told["good.csv"]
+    assert re.match(r"file \d+ columns not known 1 problem unreadable, 8 B", told["bad.csv"][1])
     assert "1 problem" in told["noise.bin"][1]
     seen = above_fold(page)
     assert "Removed" not in seen

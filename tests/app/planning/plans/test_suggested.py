@@ -117,8 +117,8 @@ def test_policies_that_do_the_same_stand_under_their_teacher_and_can_still_be_ti
     visit = client.post("/api/v1/participants/P1/visits", json={"number": 2}).json()["id"]
     page = client.get(f"/visits/{visit}/plan", headers={"accept": "text/html"}).text
     assert page.count('name="policy_ids"') == 3
-    (fold,) = re.findall(r"<details><summary><small>and 1 that does the same</small>(.*?)</details>", page, re.S)
+    (fold,) = re.findall(r"<details class=\"counted\"><summary><small>and 1 that does the same</small>(.*?)</details>", page, re.S)
     assert re.findall(r'aria-label="Test (p\d)"', fold) == ["p1"]
     assert client.post(f"/api/v1/visits/{visit}/plan", json={"policy_ids": [b]}).status_code == 201
     again = client.get(f"/visits/{visit}/plan", headers={"accept": "text/html"}).text
-    assert "<details open><summary><small>and 1 that does the same" in again, "what the draft holds is not hidden"
+    assert '<details class="counted" open><summary><small>and 1 that does the same' in again, "what the draft holds is not hidden"
