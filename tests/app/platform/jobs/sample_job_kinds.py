@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.jobs import JobContext, JobError, JobKind, StepReport, register, write_atomically
 from app.platform.jobs.worker import Pace, run_worker
+from app.platform.web.schemas import Text
 
 PREPARED: list[int] = []
 """The processes that have prepared this module, those of which ours is a fork among them."""
@@ -92,7 +93,7 @@ def _store(db: Session, job_id: str, results: list[dict[str, Any]]) -> dict[str,
 class FailParams(BaseModel):
     """How to fail."""
 
-    how: str
+    how: Text
 
 
 def fail(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
