@@ -6,7 +6,8 @@
 
 The sessions are those of a virtual patient of part A by the stratified design; policies are constants and proportional controllers. Wall
 time is from the answer to the job's request to the moment at which the job says it has ended; `cores_used` is the time in which the
-machine's cores were not idle over that time, of whatever ran on it, so run it on a quiet machine.
+machine's cores were not idle over that time, of whatever ran on it, so run it on a quiet machine. The single evaluation also prints how
+long each of its steps took.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import io
 import json
 import os
 import time
+from datetime import datetime
 from typing import Any
 
 import httpx2 as httpx
@@ -107,6 +109,16 @@ def run_jobs(installed: Installation, caller: httpx.Client, bodies: list[dict[st
     return {"wall_s": round(wall, 1), "jobs_per_hour": round(3600 * len(ids) / wall, 1), "cores_used": round(cores - idle_s / wall, 2)}
 
 
+def seconds_of_steps(caller: httpx.Client) -> dict[str, float]:
+    """Wall seconds of each step of the newest job; steps run side by side, as many as there are cores, and share them."""
+    newest = _must(caller.get(f"/participants/{CODE}/jobs"))["items"][0]["id"]
+    return {
+        step["key"]: (datetime.fromisoformat(step["finished_at"]) - datetime.fromisoformat(step["started_at"])).total_seconds()
+        for step in _must(caller.get(f"/jobs/{newest}"))["steps"]
+        if step["started_at"] and step["finished_at"]
+    }
+
+
 def _must(answer: httpx.Response) -> Any:
     if answer.status_code >= 400:
         raise RuntimeError(f"{answer.request.method} {answer.request.url}: {answer.status_code} {answer.text[:500]}")
@@ -120,6 +132,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, help=f"{JOBS} jobs with so many workers instead of one evaluation")
     chosen = parser.parse_args()
     sessions, policies = (QUICK_SESSIONS, QUICK_POLICIES) if chosen.quick else (SESSIONS, POLICIES)
+    steps: dict[str, float] = {}
     with installation(workers=chosen.workers or 1) as installed:
         tokens = installed.add_people(PEOPLE)
         for name in (*installed.webs, *installed.workers):
@@ -130,9 +143,12 @@ def main() -> None:
         run_jobs(installed, caller, [EVALUATE])
         if chosen.workers is None:
             figures = run_jobs(installed, caller, [{"kind": "evaluate"}])
+            steps = seconds_of_steps(caller)
         else:
             figures = run_jobs(installed, caller, [TRAIN if i % 2 else EVALUATE for i in range(JOBS // 6 if chosen.quick else JOBS)])
     figures |= {"sessions": sessions, "policies": policies, "workers": chosen.workers or 1, "load_before": round(os.getloadavg()[0], 1)}
+    for key, seconds in sorted(steps.items(), key=lambda item: -item[1]):
+        print(f"{key:24}{seconds:8.1f} s")
     print(json.dumps({"name": "jobs", "figures": figures}))
 
 

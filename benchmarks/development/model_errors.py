@@ -2,6 +2,7 @@
 
     python -m benchmarks.development.model_errors --quick
     python -m benchmarks.development.model_errors --out FOLDER          the 60 worlds of part A with both designs; resumable
+    python -m benchmarks.development.model_errors --part B              the present constants on part B, where none was fitted
 
 The posterior's draws are made without any model error, and held against true differences of candidates to cDBS. Then the two constants of
 each component are those of the least mean interval score (Gneiting and Raftery 2007) of these differences, a normal's 90 % interval of the
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from benchmarks.support.cells import Cells
+from benchmarks.support.looks import look, said
 from benchmarks.support.ope_cases import CDBS, DESIGNS, STEPS, Case, virtual_case
 from benchmarks.support.ope_scores import interval_score
 from ml.ope.posterior.constants import MODEL_ERRORS, ModelError, error_unit
@@ -91,24 +93,28 @@ def main() -> None:
     """Print scores and constants by component and, as the last line, one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_WORLDS} worlds, few simulated sessions")
+    parser.add_argument("--part", default="A", choices=("A", "B"), help="A to fit on, B to report on")
     parser.add_argument("--every", type=int, default=1, help="take every so manyth world")
     parser.add_argument("--out", type=Path, help="folder of finished worlds; a temporary one by default")
     chosen = parser.parse_args()
+    look(chosen.part, " ".join(["model_errors", *sys.argv[1:]]))
+    sys.stdout.write(f"{said()}\n")
     torch.set_num_threads(1)
     out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-model-errors-"))
     out.mkdir(parents=True, exist_ok=True)
     cells = Cells(out / f"model-errors{'-quick' if chosen.quick else ''}.jsonl")
     for index in range(0, WORLDS_PER_PART, chosen.every)[: QUICK_WORLDS if chosen.quick else None]:
-        if cells.get(f"A{index:02d}") is None:
+        name = f"{chosen.part}{index:02d}"
+        if cells.get(name) is None:
             start = time.process_time()
-            case = virtual_case("A", index, QUICK_TRUTH if chosen.quick else TRUTH)
+            case = virtual_case(chosen.part, index, QUICK_TRUTH if chosen.quick else TRUTH)
             rows = {} if case.truth["flat"] else {design: rows_of(case, case.data(design)) for design in DESIGNS}
-            cells.add(f"A{index:02d}", rows=rows, seconds=time.process_time() - start)
+            cells.add(name, rows=rows, seconds=time.process_time() - start)
     figures = {}
     for component, present in MODEL_ERRORS.items():
-        rows = np.array([row for c in cells.all("A") for of in c["rows"].values() for row in of.get(component, [])])
-        best = least(rows)
-        for label, error in (("none", ModelError(0.0, 0.0)), ("present", present), ("least", best)):
+        rows = np.array([row for c in cells.all(chosen.part) for of in c["rows"].values() for row in of.get(component, [])])
+        scored = {"none": ModelError(0.0, 0.0), "present": present} | ({"least": least(rows)} if chosen.part == "A" else {})
+        for label, error in scored.items():
             value, held = score(rows, error)
             figures[f"{component}_{label}"] = value
             constants = f"base {error.base:.4f}, reach {error.reach:.4f}"

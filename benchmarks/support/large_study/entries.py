@@ -16,14 +16,15 @@ from app.platform.database import transaction
 
 LFP_HZ, LFP_MINUTES, TREND_DAYS = 250, 10, 60
 STEPS_OF_A_PROPOSAL = 300
-DRAFTER = "engineer@clinic.example"
+DRAFTER = "neurologist@clinic.example"
+WHY_UNSAFE = "A plan of every participant is measured, whatever the verdict."
 
 
 def callers(app: Any, admin: str) -> tuple[TestClient, TestClient]:
     """Who signs, and who drafts what is signed; both with tokens."""
     with transaction("bench") as db:
         if not any(u.email == DRAFTER for u in repository.users(db)):
-            accounts.add_user(db, DRAFTER, Role.ENGINEER, "pages of a large study")
+            accounts.add_user(db, DRAFTER, Role.CLINICIAN, "pages of a large study")
         tokens = [accounts.create_token(db, email, "bench") for email in (admin, DRAFTER)]
     first, second = (TestClient(app, headers={"Authorization": f"Bearer {token}"}) for token in tokens)
     return first, second
@@ -55,6 +56,7 @@ def complete(signer: TestClient, drafter: TestClient, code: str, password: str, 
     for policy in policies:
         _send(signer, f"/policies/{policy}/release", json={"password": password})
     draft = {"policy_ids": policies, "random_sessions": 1, "seed": 1, "min_ma": 0.0, "max_ma": 3.0, "ramp_ma_per_s": 1.5}
+    draft["overrides"] = [{"policy_id": policy, "reason": WHY_UNSAFE} for policy in policies]
     _send(drafter, f"/visits/{planned}/plan", json=draft)
     _send(signer, f"/visits/{planned}/plan/approve", json={"password": password})
     waiting = next(f["id"] for f in unknown["files"] if f["waits_for_mapping"])
