@@ -39,6 +39,8 @@ NEAR_SPREAD: Final = 0.05
 """Draws of a session near an amplitude reach this far from it, as a fraction of the cDBS amplitude."""
 EVERYWHERE: Final = 0.2
 """Share of draws that come from all of [B, 1], so that every amplitude has a density in every session."""
+EARLY_RANDOM_SESSIONS: Final = 3
+"""Random sessions that a visit is offered while there is no policy to test: with a cDBS session first, an hour."""
 LADDER_STEP: Final = 0.2
 LADDER_SECONDS: Final = 120.0
 

@@ -50,13 +50,13 @@ def _undecided(reasons: Sequence[Flag]) -> str:
     return f"not sure enough: {', and '.join(told)}" if told else "whether it is no worse than cDBS is still open"
 
 
-def likely(within: float, *, defined: bool = False) -> str:
-    """The chance that no outcome is worse than its margin allows.
+def likely(within: float) -> str:
+    """The chance that no outcome is worse than its margin allows; always in these words, as a shorter form reads as another claim.
 
     Args:
-        within: that probability. defined: whether words near by have said by how much something may be worse.
+        within: that probability.
     """
-    return f"{chance(within)} likely no worse than cDBS" + ("" if defined else " by more than the margins")
+    return f"{chance(within)} likely no worse than cDBS by more than the margins"
 
 
 def further_sessions(reasons: Sequence[Flag]) -> str:
@@ -68,18 +68,18 @@ def further_sessions(reasons: Sequence[Flag]) -> str:
     return f"{' '.join(told)} would tell"
 
 
-def effect(differences: Mapping[str, Difference], within: float | None = None, *, defined: bool = False) -> str:
+def effect(differences: Mapping[str, Difference], within: float | None = None) -> str:
     """What a policy is expected to change against cDBS, in one line.
 
     Args:
-        differences: by quantity, as the answer's rows have them. within, defined: as `likely` has them; no word of it without `within`.
+        differences: by quantity, as the answer's rows have them. within: as `likely` has it; no word of it where that is None.
     """
     told = [
         change(name, scale * differences[quantity].value, digits, unit)
         for quantity, name, scale, digits, unit in _CHANGES
         if quantity in differences
     ]
-    return (", ".join(told) or "what it would change is not estimated") + ("" if within is None else f"; {likely(within, defined=defined)}")
+    return (", ".join(told) or "what it would change is not estimated") + ("" if within is None else f"; {likely(within)}")
 
 
 def change(name: str, difference: float, digits: int, unit: str) -> str:

@@ -8,6 +8,7 @@ from app.evaluation import verdict_wording, wording
 from app.evaluation.ranking.answer import OFF_SHARE
 from app.evaluation.ranking.judged import Judged
 from app.platform.web.templates import render_part
+from ml.ope.posterior.verdict import NEARLY_OFF
 
 
 def what_next(judged: Judged, *, may_run: bool) -> Markup:
@@ -27,6 +28,7 @@ def what_next(judged: Judged, *, may_run: bool) -> Markup:
             drawn=judged.random_sessions(settings),
             minutes=round(minutes) if minutes >= 1 else round(minutes, 1),
             off_share=OFF_SHARE,
+            nearly_off=NEARLY_OFF,
             margins=judged.participant.margins_in_force,
             plainly=verdict_wording.plainly,
             effect=verdict_wording.effect,

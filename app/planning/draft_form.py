@@ -26,11 +26,8 @@ from app.planning.protocol.schedule import most_policies, total_minutes
 from app.platform.errors import Invalid, NotFound
 from app.platform.web.forms import parse
 from app.study.models import Participant, Visit
-from ml.designs import LOW_AMPLITUDE
+from ml.designs import EARLY_RANDOM_SESSIONS, LOW_AMPLITUDE
 from ml.ope.posterior.further_sessions import MOST_HELD, Place
-
-EARLY_RANDOM_SESSIONS = 3
-"""What the form offers while a participant has no policy: with a cDBS session first, an hour."""
 
 LABELS = {
     "minutes_per_session": "Minutes per session",

@@ -11,8 +11,9 @@ from app.evaluation.estimates.coverage import STORED
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.evaluation.ranking.decisions import Decided
+from app.study.margins.service import margins_of
 from ml.ope.estimate import Estimate
-from ml.ope.posterior.verdict import SAME_AMPLITUDE, interval, outcome_draws
+from ml.ope.posterior.verdict import SAME_AMPLITUDE, chance_within, interval, outcome_draws
 from ml.ope.support.behaviour_map import BehaviourMap
 
 ORDER = ("test", "test_with_care", "cannot_tell", "not_advised", "unsafe", "same_as_cdbs")
@@ -44,6 +45,21 @@ class Difference:
     value: float
     low: float
     high: float
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """The best amplitude held all the time by the scores that rank, where that is another than cDBS: what a controller has to beat.
+
+    Attributes:
+        fraction: of the cDBS amplitude. ma: mA; None where the cDBS amplitude is not known. differences: to cDBS, by quantity.
+        within: probability that grasp, rating and tremor are all no worse than cDBS by more than their margins.
+    """
+
+    fraction: float
+    ma: float | None
+    differences: dict[str, Difference]
+    within: float | None
 
 
 @dataclass(frozen=True)
@@ -86,6 +102,8 @@ class Answer:
     Attributes:
         rows: distinct behaviours, what to test first. like_cdbs, like_off: folded away.
         ordered: whether the data can order policies. under_cdbs: what is expected under cDBS itself, by quantity, less energy.
+        cdbs_ma: its amplitude, mA; None where it is not known. sessions: that the estimates rest on; None without any.
+        fixed: the best fixed amplitude; None where that is cDBS, or none was evaluated.
     """
 
     rows: tuple[Row, ...]
@@ -93,6 +111,9 @@ class Answer:
     like_off: tuple[Row, ...]
     ordered: bool
     under_cdbs: dict[str, float]
+    cdbs_ma: float | None = None
+    sessions: int | None = None
+    fixed: Fixed | None = None
 
     def of(self, code: str) -> list[Row]:
         """Rows that stand so and are not retired."""
@@ -157,7 +178,10 @@ def answer(found: Assessment) -> Answer:
     rows.sort(key=lambda r: ORDER.index(r.decided.standing))  # stable: within a verdict as ranked
     off = [r for r in rows if _nearly_off(r.one.posterior) > OFF_SHARE]
     same = [r for r in rows if r.decided.decision == "same_as_cdbs" and r not in off]
-    return Answer(tuple(r for r in rows if r not in off and r not in same), tuple(same), tuple(off), found.ordered, _under_cdbs(found))
+    distinct = tuple(r for r in rows if r not in off and r not in same)
+    sessions = found.cdbs.posterior.n if found.cdbs and found.cdbs.posterior else None
+    usual = _under_cdbs(found)
+    return Answer(distinct, tuple(same), tuple(off), found.ordered, usual, found.cdbs_ma, sessions, _fixed(found))
 
 
 def differences(own: Estimate | None, cdbs: Estimate | None) -> dict[str, Difference]:
@@ -240,6 +264,16 @@ def _row(found: Assessment, one: Assessed, twins: tuple[Row, ...] = ()) -> Row:
     cdbs = found.cdbs.posterior if found.cdbs else None
     ma = None if limit is None or found.cdbs_ma is None else limit * found.cdbs_ma
     return Row(one, twins, one.decided, differences(one.posterior, cdbs), limit, ma)
+
+
+def _fixed(found: Assessment) -> Fixed | None:
+    one = next((a for a in found.references if a.reference == "best_constant"), None)
+    cdbs = found.cdbs.posterior if found.cdbs else None
+    if one is None or one.posterior is None or cdbs is None or one.policy.amplitude is None or not found.ordered:
+        return None
+    ma = None if found.cdbs_ma is None else one.policy.amplitude * found.cdbs_ma
+    within = chance_within(one.posterior, cdbs, margins_of(found.participant.margins_in_force))
+    return Fixed(one.policy.amplitude, ma, differences(one.posterior, cdbs), within)
 
 
 def _held_back(row: Row) -> bool:

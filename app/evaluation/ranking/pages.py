@@ -30,6 +30,7 @@ from app.platform.web.templates import render, render_part
 from app.study.deps import CurrentParticipant, ResultsViewed
 from app.study.models import Participant
 from app.study.service import may
+from ml.designs import EARLY_RANDOM_SESSIONS
 from ml.ope import registry as estimators
 
 router = APIRouter()
@@ -92,6 +93,8 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
         return render_part(
             "evaluation/_ranking.html",
             base=f"/participants/{participant.code}",
+            code=participant.code,
+            random_sessions=EARLY_RANDOM_SESSIONS,
             ranking=found,
             answer=answered,
             picture=judged.picture(settings.lower_bound),

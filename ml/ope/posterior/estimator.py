@@ -28,6 +28,7 @@ from ml.ope.posterior.held_out import HeldOut, held_out
 from ml.ope.posterior.skill import ordering_skill
 from ml.ope.posterior.structures import STRUCTURES, Fit, no_answer
 from ml.ope.posterior.support import LATE_STEPS, SessionSupport, Support
+from ml.ope.posterior.verdict import NEARLY_OFF
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale
 from ml.ope.support.coverage import AmplitudeSupport
@@ -45,7 +46,6 @@ LEAST_DRAWS = 6
 LEAST_WEIGHT = 0.02
 """Structures below this weight have none."""
 
-NEARLY_OFF = 0.2
 LIMITS = {"energy": (0.0, 1.0), "grasp_hz": (0.0, np.inf), "rating": (1.0, 10.0), "tremor_percent": (0.0, 100.0)}
 
 

@@ -108,7 +108,7 @@ def verdict(
         unchecked: why what the data cover could not be checked; None where it was.
     """
     gaps = slacks(own, cdbs, margins) if cdbs is not None else {}
-    within = float(np.mean(_all_within(gaps))) if gaps else None
+    within = _share_within(gaps)
     saves = _saves(own, cdbs) if cdbs is not None else None
     chances = _chances(within, saves, levels)
     hazards = _hazards(own, gaps, levels, adverse_event)
@@ -164,6 +164,15 @@ def slacks(own: Estimate, cdbs: Estimate, margins: Margins) -> dict[str, Floats]
     return found
 
 
+def chance_within(own: Estimate, cdbs: Estimate, margins: Margins) -> float | None:
+    """Probability that every known outcome keeps within its margin of cDBS, all together; None where none is known.
+
+    Raises:
+        ValueError: draws of the policy and of cDBS that are not aligned.
+    """
+    return _share_within(slacks(own, cdbs, margins))
+
+
 def outcome_draws(estimate: Estimate, name: str) -> Floats | None:
     """Draws of one predicted quantity, [draws]; None where there are too few to tell a probability, or one is not finite."""
     drawn = np.asarray((estimate.details.get("outcome_draws") or {}).get(name) or [], dtype=np.float64)
@@ -188,6 +197,10 @@ def interval(draws: Floats) -> tuple[float, float]:
 
 def _all_within(gaps: Mapping[str, Floats]) -> NDArray[np.bool_]:
     return np.asarray(np.min(np.stack(list(gaps.values())), axis=0) >= 0)
+
+
+def _share_within(gaps: Mapping[str, Floats]) -> float | None:
+    return float(np.mean(_all_within(gaps))) if gaps else None
 
 
 def _saves(own: Estimate, cdbs: Estimate) -> float | None:

@@ -118,7 +118,7 @@ def test_the_first_screen_says_what_to_test_why_and_at_what_risk_without_a_word_
     assert (
         "minutes each (expected against cDBS): p0 : energy \N{MINUS SIGN}29 %, grasp \N{MINUS SIGN}0.2 Hz, rating unchanged, tremor +4 "
         "percentage points; "
-        "85 % likely no worse than cDBS by more than the margins." in words
+        "85 % likely no worse than cDBS by more than the margins; never run so far." in words
     )
     assert re.search(r"Worth a test, \d+ minutes each \(", words)
     assert re.search(r"Worth a test with care, \d+ minutes, one of them at a visit \(expected against cDBS\): p2 , not below 1.5 mA", words)
@@ -202,7 +202,9 @@ def test_a_ranking_with_nothing_to_test_says_so_why_and_what_to_do(client: TestC
     ) in words
     assert "tremor +25 percentage points" in words, "what it would cost the patient"
     assert "p2 : acts like no stimulation, nearly off more than 80 % of the time" in words
-    assert "To expect under cDBS itself: grasp 2.0 Hz, rating 7.0 of 10 (10 is best), tremor 20 % of the time." in words
+    assert "To expect under cDBS itself (3.0 mA): grasp 2.0 Hz, rating 7.0 of 10 by the patient (10 is best), tremor 20 % of " in words
+    assert "percentage points more than under cDBS (up to 30 % of the time). “Nearly off” is below " in words
+    assert "Predicted from 12 recorded sessions." in words
     page = client.get(PAGE).text
     assert not re.search("tick policies|ticked policies|Skip to the candidates", page), "there is nothing to tick"
 

@@ -1,0 +1,53 @@
+"""What stands beside the answer of the ranking: the best fixed amplitude, and the sessions to hold where no policy is worth a test."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+from fastapi.testclient import TestClient
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.learning.models import Policy
+from tests.app.evaluations import judged
+from tests.app.words import above_fold
+from tests.ml.ope.posterior.draws import N, cdbs
+
+PAGE = "/participants/P1/ranking"
+Judge = Callable[..., int]
+
+
+def test_the_best_fixed_amplitude_stands_beside_the_answer_where_it_is_not_that_of_cdbs(
+    client: TestClient, policies: list[int], judge: Judge, db: Session
+) -> None:
+    judge({policies[0]: judged(50.0)})
+    assert "For comparison" not in above_fold(client.get(PAGE).text), "no other amplitude was evaluated"
+    constants = db.scalars(select(Policy).where(Policy.kind == "baseline", Policy.algorithm == "constant").order_by(Policy.id)).all()
+    low = next(p for p in constants if p.config["amplitude"] < 1)
+    drawn = {"energy": [0.5] * N, "grasp_hz": [1.7] * 250 + [1.9] * 750}
+    judge({policies[0]: judged(50.0), low.id: judged(60.0, outcome_draws=drawn)})
+    assert (
+        f"For comparison, {3 * low.config['amplitude']:.1f} mA all the time, the best fixed amplitude by the same scores: energy "
+        "\N{MINUS SIGN}50 %, grasp \N{MINUS SIGN}0.2 Hz, rating unchanged, tremor unchanged; 75 % likely no worse than cDBS by "
+        "more than the margins."
+    ) in above_fold(client.get(PAGE).text)
+    judge({policies[0]: judged(50.0), low.id: judged(-60.0, outcome_draws=drawn)})
+    assert "For comparison" not in above_fold(client.get(PAGE).text), "cDBS is the best fixed amplitude"
+
+
+def test_where_nothing_is_worth_a_test_random_and_cdbs_sessions_are_planned_at_a_click(
+    client: TestClient, policies: list[int], judge: Judge
+) -> None:
+    judge({policies[0]: judged(50.0)})
+    assert "Plan random and cDBS sessions" not in client.get(PAGE).text
+    judge({policies[0]: judged(50.0, told=False)}, cdbs(told=False).to_json())
+    page = client.get(PAGE).text
+    form = re.search(r'<form method="post" action="([^"]+/plan/draft)"(?:(?!</form>).)*Plan random and cDBS sessions of P1', page, re.S)
+    assert form is not None
+    sent = dict(re.findall(r'name="(\w+)" value="(\d+)"', form[0])) | {"visit_number": "7", "visit_date": "2031-01-07"}
+    planned = client.post(form[1], data=sent, follow_redirects=False)
+    assert planned.status_code == 303, planned.text
+    visit = int(planned.headers["location"].split("/")[2])
+    sessions = client.get(f"/api/v1/visits/{visit}/plan").json()["sessions"]
+    assert sorted({s["controller"] for s in sessions}) == ["cdbs", "random"]
