@@ -64,7 +64,7 @@ def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Cal
     """Add a visit. Raises Conflict when its number is taken, Unusual for an amplitude outside the usual that nobody has confirmed."""
     require(caller, can.WRITE_STUDY, participant)
     if repository.visit_by_number(db, participant.id, draft.number):
-        raise Conflict(f"Participant {participant.code} already has a visit {draft.number}.", "Choose the next number.")
+        raise Conflict(f"Participant {participant.code} already has a visit {draft.number}.", "Choose the next number.", field="number")
     _each_once(draft.cdbs_amplitudes)
     questions.refuse(q for a in draft.cdbs_amplitudes if (q := _asked(a)))
     visit = Visit(participant_id=participant.id, number=draft.number, date=draft.date, note=draft.note)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from fastapi import APIRouter, Request
-from fastapi.responses import HTMLResponse
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
+from app.accounts.permissions import Caller
 from app.evaluation import verdict_wording
 from app.evaluation.ranking.answer import Answer
 from app.evaluation.ranking.service import current
@@ -17,21 +18,59 @@ from app.learning import repository as learning
 from app.learning.deps import CurrentOwnPolicy
 from app.learning.models import Policy
 from app.learning.policies.curves import curve_charts
+from app.learning.policies.service import retire
+from app.learning.schemas import ALGORITHM_NAMES, PolicyChange
 from app.learning.sweeps.comparison import below_bound
 from app.platform.database import Db
-from app.platform.errors import NotFound
+from app.platform.errors import BetaloopError, Invalid, NotFound
+from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.study import repository as study_repository
 from app.study.deps import CurrentParticipant, ResultsViewed
-from app.study.service import may
+from app.study.models import Participant
+from app.study.service import may, require
 from ml.policies.logged_range import LARGEST_SHARE_BELOW
 
 router = APIRouter()
+
+_LABELS = {"retired_reason": "Reason"}
 
 
 @router.get("/participants/{code}/policies/{policy_id}", dependencies=[ResultsViewed])
 def policy_page(request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """One policy: its verdict and picture, where it comes from, its learning curves, its bundle."""
+    return _page(request, participant, policy, db, caller)
+
+
+@router.post("/participants/{code}/policies/{policy_id}/retire")
+def retire_policy(
+    request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller, values: FormValues
+) -> Response:
+    """Retire a policy with a reason, or take it back into use."""
+    back, reason = values.get("back") == "yes", str(values.get("reason", ""))
+    try:
+        require(caller, can.WRITE_POLICIES, participant)
+        if not back and not reason.strip():
+            raise Invalid("A policy is retired with a reason.", "Say why it is no longer ranked or planned.", field="reason")
+        change = parse(PolicyChange, {"retired_reason": "" if back else reason}, _LABELS, {"retired_reason": "reason"})
+        retire(db, participant, policy, change.retired_reason, caller)
+        db.commit()
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, participant, policy, db, caller, error, reason)
+    return RedirectResponse(f"/participants/{participant.code}/policies/{policy.id}?done={'back' if back else 'retired'}", 303)
+
+
+def _page(
+    request: Request,
+    participant: Participant,
+    policy: Policy,
+    db: Session,
+    caller: Caller,
+    error: BetaloopError | None = None,
+    reason: str = "",
+) -> HTMLResponse:
+    """The page; `reason` is that of the form which was refused."""
     try:
         judged = current(db, participant, caller)
     except NotFound:
@@ -57,8 +96,12 @@ def policy_page(request: Request, participant: CurrentParticipant, policy: Curre
         effect=verdict_wording.effect,
         standing_names=verdict_wording.STANDING_NAMES,
         may_write=may(caller, can.WRITE_POLICIES, participant),
+        algorithm_names=ALGORITHM_NAMES,
+        reason=reason,
+        remarks=field_notes(error, {"reason": reason}),
+        problem=error.problem(request.url.path) if error else None,
     )
-    return HTMLResponse(page)
+    return HTMLResponse(page, error.status if error else 200)
 
 
 def _same(policy: Policy, answered: Answer) -> list[PolicyHead]:

@@ -98,7 +98,7 @@ def remove_mapping(request: Request, mapping_id: RowId, db: Db, caller: CurrentC
         service.remove(db, mapping_id, str(values.get("reason", ""))[:1000], caller)
     except BetaloopError as error:
         db.rollback()
-        return _list_page(request, db, study, caller, error)
+        return _list_page(request, db, study, caller, error, mapping_id)
     db.commit()
     return RedirectResponse(f"/studies/{study.code}/column-mappings?done=removed", 303)
 
@@ -187,7 +187,10 @@ def _form_page(request: Request, table: WaitingTable, typed: dict[str, str], err
     return HTMLResponse(page, error.status if error else 200)
 
 
-def _list_page(request: Request, db: Session, study: Study, caller: Caller, error: BetaloopError | None = None) -> HTMLResponse:
+def _list_page(
+    request: Request, db: Session, study: Study, caller: Caller, error: BetaloopError | None = None, sent: int | None = None
+) -> HTMLResponse:
+    """The list; `sent` is the mapping whose form was refused."""
     rows = mappings_out(repository.versions(db, study.id), repository.present(db, study.id))
     page = render(
         request,
@@ -199,6 +202,8 @@ def _list_page(request: Request, db: Session, study: Study, caller: Caller, erro
         holds_names=HOLDS_NAMES,
         formats=dict(TIME_FORMATS),
         removable={m.id for m in rows if service.may_remove(caller, study.id, m.created_by)},
+        sent=sent,
+        remarks=field_notes(error, {}),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

@@ -126,7 +126,7 @@ def remove(db: Session, mapping_id: int, reason: str, caller: Caller) -> ColumnM
     if newest is None or newest.id != row.id or row.removed:
         raise Conflict(f"Column mapping {row.id} is not in force any more.", "Load the list again.")
     if not reason.strip():
-        raise Invalid("Removing a column mapping needs a reason.", "Say why.")
+        raise Invalid("Removing a column mapping needs a reason.", "Say why.", field="reason")
     set_reason(db, reason.strip())
     ended = ColumnMapping(
         study_id=row.study_id,

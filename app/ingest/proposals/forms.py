@@ -19,7 +19,7 @@ from app.platform.errors import Invalid
 from app.platform.web.forms import FieldNote, parse
 from app.study import blinding
 from app.study import repository as study
-from app.study.models import Controller, SessionSegment, StudySession
+from app.study.models import SessionSegment, StudySession
 from app.study.sessions.usable_steps import UsableSteps
 
 LABELS = {
@@ -28,6 +28,8 @@ LABELS = {
 }  # fmt: skip
 FIELDS = {"start_s": "from", "stop_s": "to", "control_stream": "control", "control_channel": "control", "control_program": "program"}
 """What the form calls the fields of a correction, where it calls them otherwise."""
+_PART_LABELS = {"start_s": "Begin", "stop_s": "End", "controller": "Controller"}
+
 HIDDEN = "hidden"
 """Stands for a controller that is stated and may not be told; sent back, it changes nothing."""
 PARTS = 6
@@ -154,9 +156,13 @@ def as_parts(session: StudySession, rows: list[dict[str, str]]) -> list[PartIn]:
             continue
         try:
             start, stop = _seconds(session, row["from"]), _seconds(session, row["to"])
-            parts.append(PartIn(start_s=start, stop_s=stop, controller=Controller(row["controller"]) if row["controller"] else None))
+            fields = {"start_s": f"{start:.3f}", "stop_s": f"{stop:.3f}", "controller": row["controller"]}
+            parts.append(parse(PartIn, fields, _PART_LABELS))
         except ValueError as error:
-            errors.append({"where": f"row {i}", "what": str(error).splitlines()[0], "name": f"part-{i}"})
+            errors.append({"where": f"row {i}", "what": str(error), "name": f"part-{i}"})
+        except Invalid as error:
+            what = "; ".join(f"{e['where']}: {e['what']}" for e in error.extra["errors"])
+            errors.append({"where": f"row {i}", "what": what, "name": f"part-{i}"})
     if errors:
         raise Invalid("Some parts cannot be used.", "Correct them and send the form again.", errors=errors)
     if not parts:

@@ -16,7 +16,7 @@ from app.learning.gate import service as gates
 from app.learning.schemas import GateChange
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.study import repository as study_repository
 from app.study.deps import CurrentParticipant, ResultsViewed
@@ -63,10 +63,10 @@ def _page(
         participant=participant,
         gate=gate,
         grounds=wording.gate_grounds(gate),
-        notes={t.field: wording.gate_test_note(t) for t in gate.tests},
         alpha=gates.ALPHA,
         typed=typed or dict.fromkeys(LABELS, ""),
         may_decide=caller.may(can.APPROVE_PLAN, site.study_id, site.id),
+        remarks=field_notes(error, typed or {}),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

@@ -104,7 +104,7 @@ def decide(db: Session, participant: Participant, choice: GateChoice, reason: st
     """
     study.require(caller, can.APPROVE_PLAN, participant)
     if not reason.strip():
-        raise Invalid("A decision on what policies learn from needs its reason.", "Say why in a sentence.")
+        raise Invalid("A decision on what policies learn from needs its reason.", "Say why in a sentence.", field="reason")
     row = BufferGateDecision(participant_id=participant.id, choice=choice, reason=reason.strip(), created_by=caller.label)
     set_reason(db, row.reason)
     db.add(row)

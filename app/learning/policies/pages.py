@@ -1,8 +1,8 @@
-"""HTML pages of learning: policies, one policy, one snapshot."""
+"""HTML pages of learning: policies, one snapshot."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, File, Form, Request, UploadFile
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
@@ -12,14 +12,14 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning import repository
-from app.learning.deps import CurrentOwnPolicy, CurrentSnapshot
+from app.learning.deps import CurrentSnapshot
 from app.learning.policies import service
 from app.learning.policies.uploads import read_limited
-from app.learning.schemas import ALGORITHM_NAMES, PolicyChange, PolicyLabel
+from app.learning.schemas import ALGORITHM_NAMES, PolicyLabel
 from app.learning.snapshots.coverage import describe
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import field_notes, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
@@ -28,7 +28,7 @@ from app.study.service import may
 
 router = APIRouter()
 
-LABELS = {"name": "Name", "retired_reason": "Reason"}
+LABELS = {"name": "Name"}
 
 
 @router.get("/participants/{code}/policies")
@@ -49,23 +49,14 @@ def add_policy(
     """Add a policy made elsewhere."""
     try:
         if file is None or not file.filename:
-            raise Invalid("No file was chosen.", "Choose an ONNX file.")
+            raise Invalid("No file was chosen.", "Choose an ONNX file.", field="file")
         label = parse(PolicyLabel, {"name": name}, LABELS).name
         row = service.add_external(db, participant, label, read_limited(file), file.filename, caller)
         db.commit()
     except BetaloopError as error:
         db.rollback()
-        return _policies(request, participant, db, caller, 50, 0, error.problem(request.url.path), name, error.status)
+        return _policies(request, participant, db, caller, 50, 0, error, name)
     return RedirectResponse(f"/participants/{participant.code}/policies/{row.id}?done=added", 303)
-
-
-@router.post("/participants/{code}/policies/{policy_id}/retire")
-def retire_policy(participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
-    """Retire a policy with a reason, or take it back."""
-    reason = parse(PolicyChange, {"retired_reason": values.get("reason", "")}, LABELS).retired_reason
-    service.retire(db, participant, policy, reason, caller)
-    db.commit()
-    return RedirectResponse(f"/participants/{participant.code}/policies/{policy.id}?done={'retired' if reason else 'back'}", 303)
 
 
 @router.get("/snapshots/{snapshot_id}")
@@ -82,9 +73,8 @@ def _policies(
     caller: Caller,
     limit: int,
     offset: int,
-    problem: dict[str, Any] | None = None,
+    error: BetaloopError | None = None,
     name: str = "",
-    status: int = 200,
 ) -> HTMLResponse:
     rows, total = repository.policies(db, participant.id, limit, offset)
     snapshots, snapshot_count = repository.snapshots(db, participant.id, 5, 0)
@@ -100,9 +90,10 @@ def _policies(
         snapshot_count=snapshot_count,
         sweeps=repository.sweeps(db, participant.id, 10, 0)[0],
         algorithm_names=ALGORITHM_NAMES,
-        problem=problem,
+        problem=error.problem(request.url.path) if error else None,
+        remarks=field_notes(error, {"name": name}),
         name=name,
         window=participant.current_settings.window,
         may_write=may(caller, can.WRITE_POLICIES, participant),
     )
-    return HTMLResponse(page, status)
+    return HTMLResponse(page, error.status if error else 200)

@@ -76,9 +76,10 @@ def add_external(db: Session, participant: Participant, name: str, content: byte
         raise Invalid(
             f"'{file_name}' is no policy that betaloop can run: {error}.",
             f"Give an ONNX file with one input [N, {settings.window}] of beta windows, oldest first, and one output [N, 1] in [0, 1].",
+            field="file",
         ) from error
     if repository.policy_by_name(db, participant.id, name):
-        raise Conflict(f"Participant {participant.code} already has a policy '{name}'.", "Choose another name.")
+        raise Conflict(f"Participant {participant.code} already has a policy '{name}'.", "Choose another name.", field="name")
     row = Policy(
         participant_id=participant.id,
         name=name,
@@ -96,7 +97,7 @@ def add_external(db: Session, participant: Participant, name: str, content: byte
         db.flush()
     except IntegrityError as error:
         db.rollback()
-        raise Conflict(f"Participant {participant.code} already has a policy '{name}'.", "Choose another name.") from error
+        raise Conflict(f"Participant {participant.code} already has a policy '{name}'.", "Choose another name.", field="name") from error
     return row
 
 

@@ -13,6 +13,8 @@ def read_limited(file: UploadFile) -> bytes:
     content = file.file.read(service.UPLOAD_LIMIT + 1)
     if len(content) > service.UPLOAD_LIMIT:
         raise TooLarge(
-            f"'{file.filename}' is larger than {service.UPLOAD_LIMIT >> 20} MiB.", "A policy of the study's kind has some kilobytes."
+            f"'{file.filename}' is larger than {service.UPLOAD_LIMIT >> 20} MiB.",
+            "A policy of the study's kind has some kilobytes.",
+            field="file",
         )
     return content

@@ -16,7 +16,7 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError
 from app.platform.jobs import repository as jobs
 from app.platform.jobs import service as job_service
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant, ResultsViewed
 from app.study.models import Participant
@@ -63,6 +63,7 @@ def _page(
         fresh=fresh_rates(params.training()),
         refresh_s=REFRESH_S,
         workers=len(jobs.live_workers(db, job_service.STALE_S)),
+        remarks=field_notes(error, given),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

@@ -24,7 +24,7 @@ from app.planning.plans.view import PlanView, read_plan, shown
 from app.planning.plans.visits import remove_visit, today, visit_for_draft
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, NotFound
-from app.platform.web.forms import FormValues, field_notes, parse
+from app.platform.web.forms import FormValues, field_notes, parse, renamed
 from app.platform.web.schemas import Int, Model, PagingQuery
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant, CurrentVisit, VisitViewed
@@ -94,15 +94,20 @@ def plans(request: Request, participant: CurrentParticipant, db: Db, paging: Pag
 @router.post("/participants/{code}/plan/draft")
 def draft_from_ranking(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Draft a visit from the policies ticked in the ranking; where no visit is chosen, ask which."""
-    wanted, plan_in = (
-        parse(VisitChoice, {k: "" if v == "new" else v for k, v in values.items()}, draft_form.LABELS),
-        draft_form.draft_of(values),
-    )
-    if wanted.visit_id is None and wanted.visit_number is None:
-        return _choose_visit(request, db, participant, caller, values)
-    visit = visit_for_draft(db, participant, wanted.visit_id, wanted.visit_number, wanted.visit_date, caller)
-    service.draft_plan(db, visit, plan_in, caller)
-    db.commit()
+    chosen: Visit | None = None
+    try:
+        wanted = parse(VisitChoice, {k: "" if v == "new" else v for k, v in values.items()}, draft_form.LABELS)
+        if wanted.visit_id is None and wanted.visit_number is None:
+            return _choose_visit(request, db, participant, caller, values)
+        visit = visit_for_draft(db, participant, wanted.visit_id, wanted.visit_number, wanted.visit_date, caller)
+        chosen = visit if wanted.visit_id is not None else None
+        service.draft_plan(db, visit, draft_form.draft_of(values), caller)
+        db.commit()
+    except BetaloopError as error:
+        db.rollback()
+        if chosen is None:
+            return _choose_visit(request, db, participant, caller, values, renamed(error, {"number": "visit_number"}))
+        return HTMLResponse(_page(request, db, chosen, caller, error, values), error.status)
     return RedirectResponse(f"/visits/{visit.id}/plan?done=drafted", 303)
 
 
@@ -148,7 +153,9 @@ def remove(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller,
     return RedirectResponse(f"/participants/{code}/plans?done=removed", 303)
 
 
-def _choose_visit(request: Request, db: Session, participant: Participant, caller: Caller, values: FormData) -> HTMLResponse:
+def _choose_visit(
+    request: Request, db: Session, participant: Participant, caller: Caller, values: FormData, error: BetaloopError | None = None
+) -> HTMLResponse:
     """Ask which visit the ticked policies are for; what was sent goes on with the answer."""
     require(caller, can.DRAFT_PLAN, participant)
     sent = [(name, str(value)) for name, value in values.multi_items() if name not in VisitChoice.model_fields]
@@ -159,9 +166,12 @@ def _choose_visit(request: Request, db: Session, participant: Participant, calle
         sent=sent,
         open_visits=repository.open_visits(db, participant.id, today()),
         plans={plan.visit_id: plan for plan, _ in repository.plans(db, participant.id, 500, 0)[0] if plan.status != "superseded"},
-        next_number=repository.next_visit_number(db, participant.id),
+        number=str(values.get("visit_number", "")) or repository.next_visit_number(db, participant.id),
+        day=str(values.get("visit_date", "")),
+        remarks=field_notes(error, dict.fromkeys(VisitChoice.model_fields, "")),
+        problem=error.problem(request.url.path) if error else None,
     )
-    return HTMLResponse(page)
+    return HTMLResponse(page, error.status if error else 200)
 
 
 def _page(

@@ -46,7 +46,7 @@ def visit_for_draft(
     if number is None:
         raise Invalid("No visit is chosen.", "Choose an open visit, or name the number and the date of a new one.")
     if day is None:
-        raise Invalid(f"The new visit {number} has no date.", "Give the day on which the participant comes.")
+        raise Invalid(f"The new visit {number} has no date.", "Give the day on which the participant comes.", field="visit_date")
     return study.add_visit(db, participant, VisitIn(number=number, date=day), caller)
 
 

@@ -38,7 +38,7 @@ from app.planning.visit_day.screening import rules
 from app.planning.visit_day.serializers import day_out
 from app.platform.database import Db, now
 from app.platform.errors import BetaloopError, Invalid, NotFound
-from app.platform.web.forms import FormValues, parse
+from app.platform.web.forms import FormValues, field_notes, parse, renamed
 from app.platform.web.schemas import Model
 from app.platform.web.templates import STATIC, render
 from app.study.deps import CurrentVisit, VisitViewed
@@ -63,7 +63,12 @@ _PAYLOADS: dict[str, type[Model]] = {
     "note": NotePayload, "skip": ReasonPayload, "repeat": ReasonPayload, "adverse_event": AdverseEventPayload,
     "dose": DosePayload,
 }  # fmt: skip
+_EVENT_FIELDS = {"kind": "kind_of_event"}
+"""What the form of an adverse event calls a field of its payload."""
 _LABELS = {
+    "kind": "Adverse event",
+    "severity": "Severity",
+    "note": "What happened",
     "value": "Rating",
     "hz": "Grasp frequency",
     "grade": "Grade",
@@ -117,11 +122,12 @@ def enter(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, 
         entry, plan_id = _entry(values)
         result = service.add_entries(db, visit, plan_id, [entry], caller)[0]
         if result.outcome == "refused":
-            raise Invalid(result.detail, result.hint)
+            raise Invalid(result.detail, result.hint, **({"field": result.field} if result.field else {}))
         db.commit()
     except BetaloopError as error:
         db.rollback()
-        return HTMLResponse(_page(request, db, visit, caller, error, values), error.status)
+        shown = renamed(error, _EVENT_FIELDS) if values.get("kind") == "adverse_event" else error
+        return HTMLResponse(_page(request, db, visit, caller, shown, values), error.status)
     chosen = f"?session={entry.plan_item_id}" if entry.plan_item_id is not None and entry.kind not in ("session_end", "skip") else ""
     return RedirectResponse(f"/visit-day/{visit.id}{chosen}", 303)
 
@@ -168,14 +174,14 @@ def _page(
     day = service.read_day(db, visit, caller)
     shown = day_out(day, caller)
     states = {slot.plan_item_id: state_of(day.entries, slot.plan_item_id) for slot in shown.slots}
-    typed = dict(values.items()) if values else {}
-    wanted = _number(request.query_params.get("session", "") or str(typed.get("plan_item_id", "")))
+    typed = {name: str(value) for name, value in values.items()} if values else {}
+    wanted = _number(request.query_params.get("session", "") or typed.get("plan_item_id", ""))
     unfinished = (slot for slot in shown.slots if states[slot.plan_item_id] not in ("done", "skipped"))
     current = next((s for s in shown.slots if s.plan_item_id == wanted), None) or next(unfinished, None)
     attempt = last_attempt(day.entries, current.plan_item_id) if current else 1
     said = standing(day.entries)
     mine = [e for e in said if current and (e.plan_item_id, e.attempt) == (current.plan_item_id, attempt)]
-    note = str(typed.get("text") or typed.get("note") or "")
+    note = typed.get("text") or typed.get("note") or ""
     return render(
         request,
         "planning/visit_day/day.html",
@@ -192,7 +198,8 @@ def _page(
         severe=open_severe(day.entries),
         confirmed=[e for e in said if e.kind == "clinical_settings" and e.plan_item_id is None],
         new_id=lambda: str(uuid.uuid4()),
-        typed_note=note,
+        typed=typed,
+        remarks=field_notes(error, typed),
         name_words=" ".join(service.words_like_names(note)),
         problem=error.problem(request.url.path) if error else None,
         **_frame(),

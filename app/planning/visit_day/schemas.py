@@ -226,6 +226,7 @@ class EntryResult(Model):
     outcome: Literal["stored", "known", "refused"] = Field(description="`refused`: not stored; keep it and show why.")
     detail: str = ""
     hint: str = ""
+    field: str = Field("", description="Of the payload, where one is what is wrong with a refused entry; empty where it is the whole.")
 
 
 class EntriesOut(Model):

@@ -107,7 +107,8 @@ def add_entries(db: Session, visit: Visit, plan_id: int, entries: Sequence[Entry
             if entry.kind == "dose":
                 doses.add_dose(db, visit, dose_of(entry), caller)
         except BetaloopError as error:
-            results.append(EntryResult(uuid=entry.uuid, outcome="refused", detail=error.detail, hint=error.hint))
+            field = str(error.extra.get("field", ""))
+            results.append(EntryResult(uuid=entry.uuid, outcome="refused", detail=error.detail, hint=error.hint, field=field))
             continue
         known[entry.uuid] = _store(db, plan, entry, caller)
         _record_event(db, visit, items.get(entry.plan_item_id or 0), known[entry.uuid], caller)
@@ -159,9 +160,10 @@ def _require_same(stored: DayEntry, entry: EntryIn, plan: Plan) -> None:
 def _check(entry: EntryIn, items: dict[int, PlanItem]) -> None:
     if entry.plan_item_id is not None and entry.plan_item_id not in items:
         raise Invalid(f"The plan has no session {entry.plan_item_id}.", "Load the page of the day again.")
-    found = screen(*_free_text(entry))
+    field, text, no_names = _free_text(entry)
+    found = screen(text, no_names)
     if found:
-        raise Invalid(wording.screened(found), "Take it out, or say that a word is no name.")
+        raise Invalid(wording.screened(found), "Take it out, or say that a word is no name.", field=field)
 
 
 def dose_of(entry: EntryIn) -> DoseIn:
@@ -179,14 +181,15 @@ def dose_of(entry: EntryIn) -> DoseIn:
     return DoseIn(drug=entry.payload.drug, mg=entry.payload.mg, taken_at=taken_at)
 
 
-def _free_text(entry: EntryIn) -> tuple[str, Sequence[str]]:
-    """What somebody wrote, and which of its words they say are no names."""
+def _free_text(entry: EntryIn) -> tuple[str, str, Sequence[str]]:
+    """The field of the payload that somebody wrote, its text, and which of its words they say are no names."""
     payload = entry.payload
     if isinstance(payload, NotePayload):
-        return payload.text, payload.no_names
+        return "text", payload.text, payload.no_names
     if isinstance(payload, AdverseEventPayload):
-        return payload.note, payload.no_names
-    return getattr(payload, "reason", "") or getattr(payload, "text", ""), ()
+        return "note", payload.note, payload.no_names
+    reason = getattr(payload, "reason", "")
+    return ("reason", reason, ()) if reason else ("text", getattr(payload, "text", ""), ())
 
 
 def _store(db: Session, plan: Plan, entry: EntryIn, caller: Caller) -> DayEntry:

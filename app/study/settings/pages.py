@@ -31,7 +31,7 @@ router = APIRouter()
 @router.get("/participants/{code}/settings")
 def settings(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Present settings, with every one explained, and the versions before."""
-    return _settings_page(request, db, participant, caller, form.texts(participant.current_settings))
+    return settings_page(request, db, participant, caller, form.texts(participant.current_settings))
 
 
 @router.post("/participants/{code}/settings")
@@ -49,12 +49,12 @@ def change_settings(request: Request, participant: CurrentParticipant, db: Db, c
     except BetaloopError as error:
         db.rollback()
         typed = form.texts(participant.current_settings) | changes.fields
-        return _settings_page(request, db, participant, caller, typed, error, reason=reason_of(values))
+        return settings_page(request, db, participant, caller, typed, error, reason=reason_of(values))
     db.commit()
     return RedirectResponse(f"/participants/{participant.code}/settings?done={'changed' if row.version != before else 'same'}", 303)
 
 
-def _settings_page(
+def settings_page(
     request: Request,
     db: Session,
     participant: Participant,
@@ -62,7 +62,10 @@ def _settings_page(
     values: dict[str, str],
     error: BetaloopError | None = None,
     reason: str | None = None,
+    taking_part: dict[str, str] | None = None,
 ) -> HTMLResponse:
+    """The page; `values` stand in its form, `error` says why it was refused, or, where `taking_part` has what was typed there, the form
+    that says whether the participant takes part."""
     page = render(
         request,
         "study/settings.html",
@@ -76,7 +79,8 @@ def _settings_page(
         may_write=may(caller, can.WRITE_SETTINGS, participant),
         may_change_status=may(caller, can.WRITE_STUDY, participant),
         problem=error.problem(request.url.path) if error else None,
-        remarks=field_notes(error, values),
+        taking_part=taking_part or {"status": participant.status, "status_reason": ""},
+        remarks=field_notes(error, values if taking_part is None else taking_part),
     )
     return HTMLResponse(page, error.status if error else 200)
 
