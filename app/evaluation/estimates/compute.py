@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any, cast
 from app.learning.snapshots.buffers import read_buffer
 from app.platform import files
 from app.platform.jobs import StepReport, write_atomically
+from app.platform.web.numbers import number
 from ml import progress
+from ml.faults import said_of
 from ml.loading import load_libraries
 from ml.ope.compare.skill import choose_default
 from ml.ope.dlsm.config import DlsmConfig
@@ -58,7 +60,7 @@ def fit_dlsm(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[
     try:
         member = estimator.fit_member(buffer, params["member"], report.curves(estimator.config.steps, "dlsm_"), workdir)
     except ValueError as error:
-        return {"failed": str(error)}
+        return {"failed": said_of(error, report.log)}
     report.log(f"member {params['member'] + 1} {_ended(member.course, estimator.config.steps)}")
     return {"held_out_score": float(member.check.score), "checks": len(member.course)}
 
@@ -67,7 +69,7 @@ def _ended(course: Sequence[tuple[int, float, float]], steps: int) -> str:
     """How a member's training ended, from its (update, loss, held-out score) and the updates that it might have taken."""
     last, (best, _, score) = course[-1][0], min(course, key=lambda check: check[2] if math.isfinite(check[2]) else math.inf)
     end = "ran to its last update" if last >= steps else f"was stopped early, at update {last} of {steps}"
-    return f"{end}: the best held-out score, {score:.4g}, was that of update {best}, which is kept"
+    return f"{end}: the best held-out score, {number(score, 4)}, was that of update {best}, which is kept"
 
 
 def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
@@ -111,7 +113,7 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -
         fitted = estimator.fit(buffer, fitting, workdir)
         estimates = fitted.evaluate(policies, params["horizon_steps"], rolling)
     except ValueError as error:
-        return {"failed": str(error)}
+        return {"failed": said_of(error, report.log)}
     return {"estimates": {policy_id: _finite(e.to_json()) for policy_id, e in estimates.items()}}
 
 
@@ -133,7 +135,7 @@ def check_coverage(params: dict[str, Any], workdir: Path, report: StepReport) ->
         found = diagnose(buffer, policies, params["horizon_steps"], report.curves(1.0))
         drawn = behaviour_map(buffer, policies)
     except ValueError as error:
-        return {"failed": str(error), "session_noise": session_noise(buffer)}
+        return {"failed": said_of(error, report.log), "session_noise": session_noise(buffer)}
     return {
         "policies": {policy_id: _finite(d.to_json()) for policy_id, d in found.items()},
         "map": drawn.to_json(),
@@ -168,7 +170,7 @@ def choose_method(params: dict[str, Any], workdir: Path, report: StepReport) -> 
             report=report.curves(1.0),
         )
     except ValueError as error:
-        return {"failed": str(error)}
+        return {"failed": said_of(error, report.log)}
     return {"choice": _finite(choice.to_json())}
 
 

@@ -18,6 +18,7 @@ from app.learning.training.results import CLONE, POLICY, policy_file, training_f
 from app.platform import files
 from app.platform.jobs import JobError, StepReport, write_atomically
 from ml import rl
+from ml.faults import said_of
 from ml.loading import load_libraries
 from ml.ope.fqe.score import fqe_value
 from ml.ope.posterior.gains import PosteriorGain, Tests, gains_over_cdbs
@@ -81,7 +82,7 @@ def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
 def _why(error: Exception, report: StepReport) -> str:
     """Why a training ended, for who reads results; which network's loss it was goes to the log."""
     if not isinstance(error, rl.TrainingDiverged):
-        return str(error)
+        return said_of(error, report.log)
     report.log(str(error))
     return "the training diverged; lower the learning rates"
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ml.faults import BROKE, own_words
 from ml.ope.behaviour import Key, clones, controllers
 from ml.ope.compare.aggregate import combine
 from ml.ope.compare.metrics import spearman
@@ -255,7 +256,7 @@ def _predict(
         try:
             found[method] = estimator.fit(part).evaluate({"left out": policy}, horizon)["left out"]
         except ValueError as error:  # what a method says of data that it cannot work on
-            failed[method] = str(error)
+            failed[method] = own_words(error) or BROKE
     return found
 
 

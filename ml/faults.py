@@ -1,0 +1,30 @@
+"""Tells what our own code says of data from what a library says of its arrays."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+
+_OURS = ("app", "ml")
+BROKE = "its computation broke down on these data; the log tells engineers where"
+
+
+def own_words(error: Exception) -> str | None:
+    """What an error says where our own code raised it, as a sentence for who reads results; None where a library did.
+
+    What is raised by a function written in C counts as the code that called it.
+    """
+    frame = error.__traceback__
+    while frame is not None and frame.tb_next is not None:
+        frame = frame.tb_next
+    home = str(frame.tb_frame.f_globals.get("__name__", "")) if frame is not None else ""
+    of_a_library = type(error) is not ValueError and type(error).__module__.partition(".")[0] not in _OURS
+    return None if of_a_library or home.partition(".")[0] not in _OURS else str(error)
+
+
+def said_of(error: Exception, log: Callable[[str], None]) -> str:
+    """Why a method gave nothing, for who reads results; what a library said of it goes to `log`."""
+    if (said := own_words(error)) is not None:
+        return said
+    log("".join(traceback.format_exception(error)).rstrip())
+    return BROKE
