@@ -13,7 +13,7 @@ from app.accounts.permissions import Caller
 from app.evaluation.replay import wording
 from app.evaluation.replay.figure import LOOKS, figure, frame
 from app.evaluation.replay.preselected import TWO, best_first
-from app.evaluation.replay.service import MOST, fitting, recorded, replay_over, sessions_to_replay
+from app.evaluation.replay.service import MOST, fitting, newest_fitting, recorded, replay_over, sessions_to_replay
 from app.learning import repository as learning
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
@@ -35,8 +35,8 @@ def compare(
     policy: Annotated[list[RowId] | None, Query(max_length=20)] = None,
     at: Annotated[int, Query(ge=0, le=10**6)] = 0,
 ) -> HTMLResponse:
-    """Two or three policies over a session: what each would have asked; the newest session and the two best of the ranking that take its
-    beta where none are named."""
+    """Two or three policies over a session: what each would have asked. Where no session is named, the newest whose beta they take; where
+    no policies are, the two best of the ranking that take its beta."""
     sessions = sessions_to_replay(db, participant)
     available = list(learning.candidates(db, participant.id))
     best = best_first(db, participant, available, caller) if not policy else []
@@ -45,7 +45,10 @@ def compare(
     found, problem, status = None, None, 200
     if chosen is not None and wanted:
         try:
-            data = recorded(db, participant, chosen, caller)
+            named = learning.policies_named(db, participant.id, wanted)
+            data = None if session else newest_fitting(db, participant, sessions, best or named, caller, every=bool(policy))
+            data = data or recorded(db, participant, chosen, caller)
+            chosen = data.session.id
             if fit := fitting(db, participant, data, best)[:TWO]:
                 wanted = [p.id for p in fit]
             named = learning.policies_named(db, participant.id, wanted)

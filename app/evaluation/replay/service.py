@@ -32,6 +32,9 @@ ASK = "app.evaluation.replay.compute:ask"
 MOST = 3
 """Policies at once: more lines hide each other."""
 
+MOST_TRIED = 20
+"""Sessions whose beta is read to find one that fits; with more the page would take seconds where none does."""
+
 MOST_STEPS = 5000
 """Steps of a session that are run: at 2 s nearly three hours."""
 Floats = NDArray[np.float64]
@@ -69,6 +72,33 @@ def fitting(db: Session, participant: Participant, data: SessionData, policies: 
     """Of some policies those that take beta as the session has it, in the same order; all of them where it has none."""
     trace = data.table.beta_trace
     return [p for p in policies if trace is None or _signal(db, participant, p) == (trace.unit, trace.source)]
+
+
+def newest_fitting(
+    db: Session, participant: Participant, sessions: Sequence[StudySession], policies: Sequence[Policy], caller: Caller, *, every: bool
+) -> SessionData | None:
+    """The first of some sessions, newest first, whose beta policies take; None where none of the first MOST_TRIED has it.
+
+    Args:
+        db, participant, caller: as in `replay`. sessions: as `sessions_to_replay` gives them. policies: at least one.
+        every: whether all the policies must take it, or one is enough.
+
+    Raises:
+        Forbidden: as `replay`.
+    """
+    taken = [_signal(db, participant, p) for p in policies]
+    for session in sessions[:MOST_TRIED]:
+        try:
+            data = recorded(db, participant, session.id, caller)
+        except Invalid:
+            continue  # the page of such a session says why its steps cannot be read
+        trace = data.table.beta_trace
+        if trace is None or not np.isfinite(data.table.beta).any():
+            continue
+        fits = [signal == (trace.unit, trace.source) for signal in taken]
+        if all(fits) if every else any(fits):
+            return data
+    return None
 
 
 def replay_over(db: Session, participant: Participant, data: SessionData, policies: Sequence[Policy]) -> ReplayOut:

@@ -83,3 +83,14 @@ def test_a_policy_of_another_beta_is_not_among_those_that_a_session_begins_with(
     change = {"settings": {"beta_source": "time_domain"}, "reason": "another source"}
     assert client.put("/api/v1/participants/P1/settings", json=change).status_code == 200
     assert compared(client, f"/participants/P1/compare?session={session}") == (session, ["p2"]), "the others take another beta now"
+
+
+def test_without_a_session_the_newest_whose_beta_policies_take_is_shown(
+    client: TestClient, policies: list[int], judge: Callable[..., int], upload: Upload
+) -> None:
+    a, b, c = policies
+    fits = upload("cdbs", lead=10)
+    upload("cdbs", lead=10, beta_unit="mV")
+    judge({a: judged(70.0), b: judged(60.0), c: judged(50.0)})
+    assert compared(client, "/participants/P1/compare") == (fits, ["p0", "p1"]), "the newest one is in another unit"
+    assert compared(client, f"/participants/P1/compare?policy={c}") == (fits, ["p2"])
