@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from html import escape
 
 from app.platform.web.charts import side_by_side
+from app.platform.web.numbers import stated
 
 COLOURS = {"cdbs": "#0067a8", "rl": "#c24e00", "distilled": "#9b3f86", "no_dbs": "#5d6770", "random": "#00795a", "other": "#7a6200"}
 PANEL_W, PANEL_H, LEFT, TOP, BOTTOM, GAP, EMPTY_W = 250, 190, 52, 44, 52, 18, 1000
@@ -77,7 +78,7 @@ def _panel(panel: Panel, x: float, w: float) -> list[str]:
     for i in range(5):
         at = low + (high - low) * i / 4
         parts.append(f'<line x1="{x:.1f}" y1="{y(at):.1f}" x2="{x + w:.1f}" y2="{y(at):.1f}" stroke="#e5e7eb"/>')
-        parts.append(f'<text x="{x - 6:.1f}" y="{y(at) + 4:.1f}" text-anchor="end" fill="#6b7280">{at:.3g}</text>')
+        parts.append(f'<text x="{x - 6:.1f}" y="{y(at) + 4:.1f}" text-anchor="end" fill="#6b7280">{stated(at, 3)}</text>')
     step, scale = w / max(1, len(panel.boxes)), PANEL_H * 0.94 / (high - low)
     for i, box in enumerate(panel.boxes):
         parts += _box(box, x + step * (i + 0.5), min(26.0, step * 0.6), y, bottom, scale)

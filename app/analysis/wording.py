@@ -8,6 +8,7 @@ from app.analysis.evidence.facts import Excluded, LeftOut, Missing
 from app.analysis.primary.results import Basis, Comparison, Disagreement, Tested
 from app.analysis.primary.verdict import LockedMargins, NoVerdict, VerdictResult
 from app.platform.web.charts import counted
+from app.platform.web.numbers import p_text
 from app.study.blinding import CONTROLLER_NAMES
 from ml.statistics.noninferiority import (
     ENERGY,
@@ -135,6 +136,8 @@ def verdict_sentence(name: str, found: Verdict, visits: int, *, planned: bool) -
     if found.open == (ENERGY,):
         open_ = f"{name} is non-inferior on grasp, rating and tremor, but a saving of energy is not shown"
     more = _more(found, planned=planned)
+    if not visits and more:
+        return f"Nothing can be said of {name} yet: {more}."
     return f"Inconclusive {over}: {open_}{f'; {more}' if more else ''}."
 
 
@@ -194,16 +197,21 @@ def judged_as(outcome: str, unit: str) -> str:
 
 def verdict_kind(result: VerdictResult) -> str:
     """Whether a verdict confirms, and why not."""
+    return f"{'Confirmatory' if result.confirmatory else 'Exploratory'}: {verdict_ground(result)}"
+
+
+def verdict_ground(result: VerdictResult) -> str:
+    """Why a verdict confirms, or does not, to stand behind that word."""
     locked = result.locked
     if result.confirmatory:
         left = f" Visits before the lock ({_numbers(result.left_to_exploration)}) are left out." if result.left_to_exploration else ""
         return (
-            f"Confirmatory: the margins (version {locked.version}) were locked on {locked.locked_at:%Y-%m-%d %H:%M} UTC by "
+            f"the margins (version {locked.version}) were locked on {locked.locked_at:%Y-%m-%d %H:%M} UTC by "
             f"{locked.locked_by}, before every session that counts here.{_superseded(locked)}{left}"
         )
     if locked.locked_at is None:
-        return "Exploratory: nobody has locked the margins, so that they could still be chosen by the data."
-    return "Exploratory: this takes in visits from before the margins were locked; it does not confirm."
+        return "nobody has locked the margins, so that they could still be chosen by the data."
+    return "this takes in visits from before the margins were locked; it does not confirm."
 
 
 def _superseded(locked: LockedMargins) -> str:
@@ -273,7 +281,7 @@ def no_association(why: Unavailable) -> str:
 def no_population_claim(found: Summary) -> str:
     """What a summary of so few participants does not say."""
     k = found.participants
-    floor = f"With {k} participants the two-sided sign test cannot go below {found.smallest_sign_p:.3g}".replace("0.", ".")
+    floor = f"With {k} participants the two-sided sign test cannot go below {p_text(found.smallest_sign_p)}"
     if found.population_claim:
         return f"{floor}; the summary describes these {k} participants, and their spread is shown beside it."
     return f"{floor}: the summary describes these {k} participants and claims nothing about other people."

@@ -8,6 +8,7 @@ from typing import Any
 from app.ingest.models import ColumnMapping
 from app.ingest.proposals.evidence import Evidence, Reason, Source, stored_courses
 from app.platform.errors import BetaloopError, DatabaseAway, GivenUp, StorageFull
+from app.platform.web.numbers import stated
 from app.study.models import Recording
 from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern
 
@@ -147,15 +148,20 @@ def _steps(facts: Mapping[str, Any]) -> str:
 
 
 def _program(facts: Mapping[str, Any]) -> str:
-    ran = {
-        "moved": "{low:.3g} to {high:.3g} mA",
-        "constant": "constant at {high:.3g} mA",
-        "off": "off",
-        "unknown": "not known",
-    }
-    each = ", ".join(f"program {p['number']} {ran[p['how']].format_map(p)}" for p in facts["programs"])
+    each = ", ".join(f"program {p['number']} {_ran(p)}" for p in facts["programs"])
     several = sum(p["how"] == "moved" for p in facts["programs"]) > 1
     return f"{each}{': several moved, say which one the controller set' if several else ''}"
+
+
+def _ran(program: Mapping[str, Any]) -> str:
+    """What a program stimulated with."""
+    match program["how"]:
+        case "moved":
+            return f"{stated(program['low'], 3)} to {stated(program['high'], 3)} mA"
+        case "constant":
+            return f"constant at {stated(program['high'], 3)} mA"
+        case how:
+            return {"off": "off", "unknown": "not known"}[how]
 
 
 _NO_AMPLITUDE = "the file states no amplitude"
@@ -163,7 +169,7 @@ _NO_AMPLITUDE = "the file states no amplitude"
 
 def _course(c: Course) -> str:
     """How the amplitude of one side ran."""
-    level = f"{c.median:.3g} {c.unit}" if c.median is not None else ""
+    level = f"{stated(c.median, 3)} {c.unit}" if c.median is not None else ""
     match c.pattern:
         case Pattern.UNKNOWN:
             return _NO_AMPLITUDE
@@ -172,10 +178,10 @@ def _course(c: Course) -> str:
         case Pattern.OFF:
             return f"the amplitude is 0 in all {c.known} steps where it is known"
         case Pattern.AT_CDBS:
-            against = f" of {c.cdbs_ma:.3g} mA" if c.cdbs_ma else ""
+            against = f" of {stated(c.cdbs_ma, 3)} mA" if c.cdbs_ma else ""
             return f"about {level} throughout, within {100 * CDBS_TOLERANCE:.0f} % of the cDBS amplitude{against}"
         case Pattern.VARIES:
-            return f"the amplitude varies between {c.low:.3g} and {c.high:.3g} {c.unit}: say which controller it was"
+            return f"the amplitude varies between {stated(c.low, 3)} and {stated(c.high, 3)} {c.unit}: say which controller it was"
         case Pattern.CONSTANT_WITHOUT_CDBS:
             return f"the amplitude is constant at {level}, but no cDBS amplitude is stated to hold it against"
         case Pattern.CONSTANT:

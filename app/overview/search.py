@@ -16,8 +16,9 @@ from app.accounts.permissions import Caller
 from app.overview import repository
 from app.platform.database import Db
 from app.platform.jobs import registry
+from app.platform.web.numbers import when
 from app.platform.web.schemas import Text
-from app.platform.web.templates import render, when
+from app.platform.web.templates import render
 
 router = APIRouter()
 

@@ -11,6 +11,7 @@ from typing import Any
 from app.analysis.evidence.facts import Facts
 from app.analysis.evidence.service import Evidence
 from app.platform.web.charts import ACCENT, GRID, MUTED, SYMBOLS, TEXT, WARN, Cell, Chart, Link, colour, counted, figure, marker
+from app.platform.web.numbers import hover
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import SettingsVersion, Visit
 
@@ -115,7 +116,7 @@ def _panels(
     height = 1 / max(1, len(panels))
     data: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
-        "xaxis": {"type": "date", "anchor": "free", "position": 0, "zeroline": False},
+        "xaxis": {"type": "date", "anchor": "free", "position": 0, "zeroline": False, "showgrid": False},
         "margin": {"l": 78, "r": 16, "t": 30, "b": 48},
         "legend": {"orientation": "h", "y": 1.01, "yanchor": "bottom", "x": 0},
         "showlegend": True,
@@ -135,7 +136,7 @@ def _panels(
             {
                 "type": "scatter", "mode": "markers", "x": x, "y": values, "yaxis": f"y{suffix}", "showlegend": False, "name": name,
                 "marker": {"size": 7, "color": colours, "symbol": shapes, "opacity": 0.85}, "customdata": pages, "text": began,
-                "hovertemplate": f"%{{text}}<br>{name} %{{y:.3g}} {unit}<extra></extra>",
+                "hovertemplate": f"%{{text}}<br>{name} {hover()} {unit}<extra></extra>",
             }
         )  # fmt: skip
     return data, layout

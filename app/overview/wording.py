@@ -26,7 +26,7 @@ _TASKS: dict[Task, str | Callable[[int], str]] = {
     Task.WAIT_FOR_RANKING: "The first ranking is being made",
     Task.RANK: "No ranking yet: start the pipeline",
     Task.OPEN_KEY: "A blinded visit is held, and nothing learns from it: open the key of its plan",
-    Task.RANK_AGAIN: "New sessions since the last ranking; it is stale",
+    Task.RANK_AGAIN: "New sessions since the last ranking, which is out of date",
     Task.TRAIN_NEXT: "New sessions since the last ranking: train the next generation",
     Task.DRAFT_PLAN: "No plan for this visit yet",
     Task.APPROVE_PLAN: "A visit plan waits for approval",

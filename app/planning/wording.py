@@ -16,6 +16,7 @@ from app.planning.visit_day.record import Contradiction, Entry, grasp_hz, moment
 from app.planning.visit_day.schemas import SlotOut
 from app.planning.visit_day.screening import Found
 from app.platform.web.charts import counted
+from app.platform.web.numbers import stated
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller
 from ml.deploy.manifest import BundleManifest
@@ -157,7 +158,7 @@ def from_the_day(who: Sequence[str]) -> str:
 def day_differs(name: str, entered: float, known: float) -> str:
     """A QoC that the clinic day has otherwise than the session, which keeps its own."""
     what, unit = {"rating": ("rating", ""), "grasp_hz": ("grasp frequency", " Hz")}[name]
-    return f"The clinic day has a {what} of {entered:.3g}{unit}, the session {known:.3g}{unit}; the session keeps its own."
+    return f"The clinic day has a {what} of {stated(entered, 3)}{unit}, the session {stated(known, 3)}{unit}; the session keeps its own."
 
 
 def open_contradiction(kind: str) -> str:

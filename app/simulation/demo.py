@@ -31,7 +31,7 @@ from app.platform.database import now, transaction
 from app.platform.errors import BetaloopError
 from app.platform.migrate import migrate
 from app.platform.start import require_data_folder, require_free
-from app.platform.web.templates import time_left
+from app.platform.web.numbers import time_left
 from app.settings import get_settings, private_folder, written_once
 from app.simulation.demo_study import DemoVisit, demo_visits, participant_body
 

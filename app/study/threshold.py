@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.platform.errors import Invalid
+from app.platform.web.numbers import number
 from app.study import blinding, repository
 from app.study.models import Controller, Participant, SettingsVersion, Trace
 from app.study.traces import laid_out, traces_of
@@ -58,7 +59,7 @@ def mdp_settings(settings: SettingsVersion, suggestion: SuggestedThreshold | Non
         Invalid: xi_beta is not set; names the suggestion from the data where there is one.
     """
     if settings.xi_beta is None:
-        hint = f" A suggestion from the data: {suggestion.value:.4g} {suggestion.unit}." if suggestion is not None else ""
+        hint = f" A suggestion from the data: {number(suggestion.value, 4)} {suggestion.unit}." if suggestion is not None else ""
         raise Invalid(
             f"Participant {settings.participant.code} has no beta threshold xi_beta yet; the paper gives no default.",
             f"Set xi_beta in the participant's settings.{hint}",

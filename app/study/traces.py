@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
+from app.platform.web.numbers import stated
 from app.study import cdbs_amplitude, repository
 from app.study.models import Recording, SettingsVersion, StudySession, Trace
 from ml.formats.beta import ERROR_STREAM
@@ -173,7 +174,7 @@ def beta_of_part(trace: Trace, settings: SettingsVersion, start_s: float, stop_s
     Raises:
         Invalid: a part of more than MOST_STEPS, or a trace that is not on the participant's grid.
     """
-    t_s = _rows(f"The part from {start_s:.9g} s", stop_s - start_s, settings)
+    t_s = _rows(f"The part from {stated(start_s, 9)} s", stop_s - start_s, settings)
     beta = np.full(t_s.size, np.nan)
     _place(beta, t_s, trace, start_s, settings.period_s)
     return beta
@@ -223,7 +224,8 @@ def _rows(named: str, duration_s: float, settings: SettingsVersion) -> NDArray[n
     steps = int(np.floor(duration_s / settings.period_s + 1e-6))
     if steps > MOST_STEPS:
         raise Invalid(
-            f"{named} is said to last {duration_s:.9g} s: {steps} steps of {settings.period_s:g} s, where {MOST_STEPS} are the most.",
+            f"{named} is said to last {stated(duration_s, 9)} s: {steps} steps of {stated(settings.period_s)} s, "
+            f"where {MOST_STEPS} are the most.",
             "Exclude it, or drop its proposal. Send a table whose times are Unix times again, with seconds from the session's start.",
         )
     return settings.period_s * np.arange(-settings.window + 1, steps + 1, dtype=np.float64)

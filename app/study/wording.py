@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from app.platform.web.numbers import stated
 from app.study.adverse_events.models import EventKind, Severity
 from app.study.characteristics.schemas import CharacteristicsFields, Symptom, Target
 from app.study.doses.drugs import DRUGS, Drug
@@ -17,6 +18,8 @@ from app.study.sessions.models import Activity
 from app.study.settings.form import LABELS as SETTING_LABELS
 from app.study.usual.values import Question, Why
 
+DEVICE_NAMES = {"rcs": "RC+S", "percept": "Percept"}
+"""Of kinds of devices that are not called by their own word."""
 EVENT_KINDS = {
     EventKind.DYSKINESIA: "Dyskinesia",
     EventKind.SPEECH: "Speech",
@@ -60,11 +63,11 @@ UNUSUAL_HINT = "Correct them, or say that they are right; nothing was saved yet.
 
 def unusual(asked: Question) -> str:
     """What is asked about one value."""
-    value = f"{asked.value:.4g} {asked.unit}".strip()
+    value = f"{stated(asked.value, 4)} {asked.unit}".strip()
     usual = f"{asked.low:g} to {asked.high:g} {asked.unit}".strip()
     match asked.code:
         case Why.SHARE:
-            return f"{value}: less than one per cent. Was it meant as a share, {100 * asked.value:.3g} %?"
+            return f"{value}: less than one per cent. Was it meant as a share, {stated(100 * asked.value, 3)} %?"
         case Why.FAR_FROM_VISIT:
             return f"{value}, where the other sessions of this visit have {usual}: 1 is worst, 10 is best. Is it right?"
         case Why.BELOW:
@@ -188,7 +191,7 @@ def _above_cdbs(f: Mapping[str, Any]) -> str:
 
 def _amplitude(f: Mapping[str, Any]) -> str:
     of = f" on the {f['side']}" if f["side"] else ""
-    share = f"{100 * f['mean_fraction']:.0f} % of the cDBS amplitude" if f["mean_fraction"] is not None else f"{f['mean']:.3g} mA"
+    share = f"{100 * f['mean_fraction']:.0f} % of the cDBS amplitude" if f["mean_fraction"] is not None else f"{stated(f['mean'], 3)} mA"
     return f"{_SAID[f['controller']]}, but its mean amplitude{of} is {share}. Correct one of them."
 
 
@@ -262,8 +265,8 @@ _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     ),
     Kind.LOGGED_CDBS: _logged_cdbs,
     Kind.LAST_DOSE: lambda f: (
-        f"The last dose is said to have been {f['stated']:.3g} h before the start, which counts; by the visit's doses it was "
-        f"{f['by_doses']:.3g} h. Correct one of them."
+        f"The last dose is said to have been {stated(f['stated'], 3)} h before the start, which counts; by the visit's doses it was "
+        f"{stated(f['by_doses'], 3)} h. Correct one of them."
     ),
     Kind.NO_POLICY: lambda f: (
         "No policy is named for this session: it cannot be compared with its estimate. Name one on the session's page."

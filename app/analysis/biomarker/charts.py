@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from app.analysis.biomarker.service import Pairing
 from app.platform.web.charts import Cell, Chart, Link, apart_where_equal, axis, counted, figure
+from app.platform.web.numbers import number
 
 NAMES = {
     "mean_beta": "Mean beta amplitude", "amplitude": "Mean amplitude", "medication_h": "Time since the last dose", "months": "Months",
@@ -41,13 +42,14 @@ def scatter(pair: Pairing, beta_unit: str) -> Chart:
     visits, across = [p[1] for p in points], [p[2] for p in points]
     width = (max(across) - min(across)) or abs(across[0]) or 1.0 if across else 1.0
     places = apart_where_equal([(p[2], p[3]) for p in points], _STEP * width)
-    bar = {"title": {"text": "Visit"}, "thickness": 10, "tickvals": _some(sorted(set(visits)))}
+    bar = {"title": {"text": "Visit", "font": {"size": 12}}, "thickness": 10, "tickvals": _some(sorted(set(visits)))}
     data = [
         {
             "type": "scatter", "mode": "markers", "x": places, "y": [p[3] for p in points],
             "marker": {"size": 8, "color": visits, "colorscale": SCALE, "showscale": len(set(visits)) > 1, "colorbar": bar},
             "customdata": [p[0] for p in points], "meta": "/sessions/",
-            "text": [f"Session {p[0]}, visit {p[1]}<br>{p[2]:.3g}, {p[3]:.3g}" for p in points], "hovertemplate": "%{text}<extra></extra>",
+            "text": [f"Session {p[0]}, visit {p[1]}<br>{number(p[2])}, {number(p[3])}" for p in points],
+            "hovertemplate": "%{text}<extra></extra>",
         }
     ]  # fmt: skip
     layout = {

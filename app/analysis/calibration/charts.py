@@ -8,6 +8,7 @@ from typing import Any
 from app.analysis.calibration.schemas import AccuracyOut, CalibrationOut, MethodMetricOut, PredictionOut, TestedPolicyOut
 from app.evaluation.ranking.charts import style
 from app.platform.web.charts import MUTED, Chart, axis, counted, figure
+from app.platform.web.numbers import hover
 from ml.ope.registry import shown as method_of
 
 QUANTITY_NAMES = {
@@ -87,7 +88,7 @@ def metrics(found: CalibrationOut) -> Chart:
                     "color": [style(m.method)["color"] for m in rows],
                     "symbol": [style(m.method)["symbol"] for m in rows],
                 },
-                "hovertemplate": "%{y}: %{x:.3g}<extra>" + title + "</extra>",
+                "hovertemplate": f"%{{y}}: {hover('x')}<extra>{title}</extra>",
             }
         )
         more = {"range": [-1.1, 1.1]} if metric == "rank_correlation" else {"rangemode": "tozero"}
@@ -143,7 +144,7 @@ def over_visits(found: CalibrationOut, method: str) -> Chart | None:
                     "yaxis": f"y{suffix}",
                     "line": {"color": marks["color"], "width": 2.5 if chosen else 1.2},
                     "marker": {"size": 9 if chosen else 6, "color": marks["color"], "symbol": marks["symbol"]},
-                    "hovertemplate": "visit %{x}: %{y:.3g}<extra>" + method_of(name).name + "</extra>",
+                    "hovertemplate": f"visit %{{x}}: {hover()}<extra>{method_of(name).name}</extra>",
                 }
                 | ({"error_y": _error_bars(values)} if chosen else {})
             )
@@ -197,7 +198,7 @@ def quantities(found: CalibrationOut, method: str) -> list[Chart]:
             "y": [factor * q.actual for _, q in own],
             "text": [label(p) for p, _ in own],
             "marker": {"size": 9, "color": marks["color"], "symbol": ["circle" if p.reference else marks["symbol"] for p, _ in own]},
-            "hovertemplate": "%{text}: predicted %{x:.3g}, seen %{y:.3g}<extra></extra>",
+            "hovertemplate": f"%{{text}}: predicted {hover('x')}, seen {hover()}<extra></extra>",
         }
         charts.append(
             Chart(

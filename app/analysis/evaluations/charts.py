@@ -5,6 +5,7 @@ from __future__ import annotations
 from app.analysis.evaluations.service import BySeed, SeedRow
 from app.analysis.figures import Box, Panel
 from app.platform.web.charts import TEXT, Cell, Chart, axis, counted, figure, side_by_side
+from app.platform.web.numbers import hover
 
 METRICS = {
     "mae": ("Mean absolute error", "reward, lower is better"),
@@ -54,7 +55,7 @@ def _chart(found: BySeed, metric: str) -> Chart:
         {"type": "bar", "x": list(range(len(names))), "y": means, "marker": {"color": "token:accent/0.3"}, "name": "mean"},
         {
             "type": "scatter", "mode": "markers", "x": x, "y": [v for _, v in points], "marker": {"size": 9, "color": TEXT}, "name": "seed",
-            "text": [f"seed {s}" for s, _ in points], "hovertemplate": "%{text}: %{y:.3g}<extra></extra>",
+            "text": [f"seed {s}" for s, _ in points], "hovertemplate": f"%{{text}}: {hover()}<extra></extra>",
         },
     ]  # fmt: skip
     layout = {

@@ -12,7 +12,7 @@ from app.analysis.metrics.service import FiveMetrics, MetricResult
 from app.analysis.metrics.shown import for_readers
 from app.platform.kept import kept
 from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, counted, figure, marker, side_by_side
-from app.platform.web.templates import p_text
+from app.platform.web.numbers import hover, p_text
 from app.study.models import Controller
 
 SHORT = {Controller.DISTILLED: "Distilled"}
@@ -82,7 +82,7 @@ def points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
         "y": [float(f"{v:.4g}") for v in g.values], "cliponaxis": False,
         "marker": marker(g.controller, 8, opacity=0.9, line={"color": "token:surface", "width": 0.7}), "name": g.label,
         "customdata": list(g.session_ids), "meta": "/sessions/",
-        "hovertemplate": f"{g.label}, session %{{customdata}}<br>%{{y:.4g}} {unit}<extra></extra>",
+        "hovertemplate": f"{g.label}, session %{{customdata}}<br>{hover(digits=4)} {unit}<extra></extra>",
     }  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from math import comb
 
 import numpy as np
 
+from app.platform.web.numbers import p_text
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import Controller
 from ml.statistics.multiplicity import holm
@@ -111,7 +112,7 @@ def not_enough(tested: Group, cdbs: Group) -> str:
     unequal = "" if needed == cdbs.n else f", or {needed} against {cdbs.n}"
     return (
         f"needs at least 4 sessions on each side{unequal}; {found}. "
-        f"So few cannot give a two-sided p below {smallest_p(tested.n, cdbs.n):.2g}"
+        f"So few cannot give a two-sided p below {p_text(smallest_p(tested.n, cdbs.n))}"
     )
 
 

@@ -6,6 +6,7 @@ from app.analysis import wording
 from app.analysis.evidence.measurements import HIGHER_IS_BETTER
 from app.analysis.primary.results import Comparison, Tested
 from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, counted, figure, horizontal, marker
+from app.platform.web.numbers import hover, number
 from ml.statistics.within_visits.contrasts import Average
 
 
@@ -20,7 +21,7 @@ def by_visit(tested: Tested, found: Comparison, unit: str) -> Chart:
             "type": "scatter", "mode": "markers", "x": places, "y": [factor * (r.contrast or 0.0) for r in rows],
             "marker": marker(tested.controller, 10),
             "text": [f"Visit {r.visit}: {len(r.tested)} against {counted(len(r.cdbs), 'session')}" for r in rows],
-            "hovertemplate": "%{text}<br>%{y:.3g} " + unit + "<extra></extra>", "name": name,
+            "hovertemplate": f"%{{text}}<br>{hover()} {unit}<extra></extra>", "name": name,
         }
     ]  # fmt: skip
     ticks = [str(r.visit) for r in rows]
@@ -34,7 +35,7 @@ def by_visit(tested: Tested, found: Comparison, unit: str) -> Chart:
                     "type": "data", "symmetric": False, "array": [high - estimate], "arrayminus": [estimate - low], "width": 8,
                 },
                 "marker": {"symbol": "line-ew-open", "size": 18, "color": TEXT, "line": {"width": 3}}, "line": {"color": TEXT},
-                "hovertemplate": f"Average {estimate:.3g} ({low:.3g} to {high:.3g}) {unit}<extra></extra>",
+                "hovertemplate": f"Average {number(estimate)} ({number(low)} to {number(high)}) {unit}<extra></extra>",
             }
         )  # fmt: skip
         places, ticks = [*places, len(rows) + 0.3], [*ticks, "Average"]

@@ -11,8 +11,8 @@ from markupsafe import Markup
 from app.evaluation.ranking.answer import QUANTITIES, Row, map_of
 from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.platform.web.charts import Cell, written
+from app.platform.web.numbers import number
 from app.platform.web.svg import Plane, apart, drawing
-from app.platform.web.templates import number
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.verdict import interval, outcome_draws
 from ml.ope.support.behaviour_map import DOSES, BehaviourMap

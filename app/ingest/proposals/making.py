@@ -17,6 +17,7 @@ from app.ingest.proposals.service import renew
 from app.ingest.proposals.slots import differs_from_slot, visit_of_slot
 from app.ingest.sessions import Placement, StatedSession, add_session
 from app.ingest.uploads import outcomes as outcomes_intake
+from app.platform.web import numbers
 from app.study import repository as study
 from app.study.models import Participant, Recording, StudySession
 from app.study.sessions import conditions, logged
@@ -65,7 +66,7 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     session = add_session(db, guess.visit, placement, stated.controller, stated.policy_id, stated.hemisphere, stated.counts)
     guesses.policy_by_log(db, session)
     program = control_channel.choose_program(db, session)
-    length = f"{session.duration_s / 60:.1f} min" if session.duration_s else "no data"
+    length = f"{numbers.stated(round(session.duration_s / 60, 1))} min" if session.duration_s else "no data"
     seen, usable = _seen(session, placement), sentence(usable_steps(db, session))
     if stated.counts:
         ran = wording.HIDDEN if session.visit.sealed else stated.controller

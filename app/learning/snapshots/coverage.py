@@ -13,6 +13,7 @@ from app.accounts.permissions import Caller
 from app.learning.models import BufferSnapshot
 from app.learning.snapshots.buffers import read_buffer
 from app.platform.web.charts import ACCENT, CONTROLLERS, WARN, Chart, axis, counted, figure
+from app.platform.web.numbers import stated
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study.models import StudySession
@@ -129,7 +130,7 @@ def _beta_chart(buffer: ReplayBuffer) -> Chart:
         {
             "type": "scatter",
             "mode": "lines",
-            "name": f"threshold {xi:.4g}",
+            "name": f"threshold {stated(xi, 4)}",
             "x": labels,
             "y": [xi] * len(labels),
             "line": {"color": WARN, "dash": "dash"},

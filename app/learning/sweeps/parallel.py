@@ -13,7 +13,8 @@ from markupsafe import Markup
 from app.learning.schemas import ALGORITHM_NAMES
 from app.learning.sweeps.comparison import Candidate, held_near
 from app.platform.web.charts import Cell, counted
-from app.platform.web.svg import Plane, apart, drawing, shown_tick
+from app.platform.web.numbers import stated
+from app.platform.web.svg import Plane, apart, drawing
 
 W, H, TOP, BOTTOM, LEFT, RIGHT = 1120.0, 400.0, 66.0, 26.0, 96.0, 118.0
 LEAST = 2
@@ -61,6 +62,10 @@ class Axis:
     ticks: list[tuple[float, str]]
     cells: list[Cell]
     always: bool = False
+
+
+BETWEEN = 0.06
+"""Share of a column's height below which two numbers beside it would meet."""
 
 
 @dataclass(frozen=True)
@@ -142,12 +147,12 @@ def _number(name: str, values: Sequence[float | None], logarithmic: bool = False
         return 0.5 if high == low else (scale(value) - low) / (high - low)
 
     ticks = [min(known), max(known)] if high > low else [low if not logarithmic else min(known)]
-    if name == "Gain over cDBS" and low < 0 < high:
+    if name == "Gain over cDBS" and low < 0 < high and BETWEEN < place(0.0) < 1 - BETWEEN:
         ticks.insert(1, 0.0)
     return Axis(
         name,
         [place(float(v)) if v is not None and float(v) in usable else None for v in values],
-        [(place(t), shown_tick(float(f"{t:.3g}"))) for t in ticks],
+        [(place(t), stated(t, 3)) for t in ticks],
         cells,
         always,
     )
@@ -185,4 +190,4 @@ def _names(plane: Plane, candidates: Sequence[Candidate], last: Axis, stands: Se
 
 
 def _cell(value: Any) -> str:
-    return "—" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+    return "—" if value is None else stated(value, 3) if isinstance(value, float) else str(value)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from app.overview.signals.serializers import decibel
 from app.overview.signals.service import SignalWindow
 from app.platform.web.charts import ACCENT, Cell, axis, figure, written
+from app.platform.web.numbers import hover
 from app.platform.web.png import colour_scale, picture
 from app.platform.web.svg import Plane, drawing
 from ml.sample_views import Spectrogram, fewer_columns
@@ -32,7 +33,7 @@ def chart_figure(window: SignalWindow, span_s: tuple[float, float], low_hz: floa
     data: list[dict[str, Any]] = [
         {
             "type": "scatter", "mode": "lines", "name": "LFP", "x": np.round(x / 60, 6), "y": y, "connectgaps": False,
-            "line": {"color": ACCENT, "width": 1}, "hovertemplate": f"%{{x:.4f}} min<br>%{{y:.3g}} {unit}<extra></extra>",
+            "line": {"color": ACCENT, "width": 1}, "hovertemplate": f"%{{x:.4f}} min<br>{hover()} {unit}<extra></extra>",
         },
         {
             "type": "heatmap", "name": "Power", "x": columns, "y": window.power.hz, "z": power.T, "yaxis": "y2", "zmin": bottom,
@@ -78,13 +79,13 @@ def picture_of(window: SignalWindow, low_hz: float, high_hz: float) -> Markup:
     hz = window.power.hz
     first = TOP + LFP_H + BETWEEN
     below = Plane(LEFT, first, W - LEFT - RIGHT, POWER_H, span, (float(hz[0]), float(hz[-1])) if hz.size else (0.0, 1.0))
-    if power.size:
+    below.axes("Time in the session (min)", "Frequency (Hz)", x_ticks=10, y_ticks=5)
+    if power.size:  # over the grid, which would cross out what it shows
         left = below.at_x(window.power.first_s / 60)
         right = below.at_x((window.power.first_s + window.power.width_s * power.shape[0]) / 60)
         place = f'x="{left:.1f}" y="{first:.1f}" width="{right - left:.1f}" height="{POWER_H:.1f}"'
         look = 'preserveAspectRatio="none" style="image-rendering: pixelated"'
         below.parts.append(f'<image href="{picture(power.T[::-1], bottom, top)}" {place} {look}/>')
-    below.axes("Time in the session (min)", "Frequency (Hz)", x_ticks=10, y_ticks=5)
     for edge in (low_hz, high_hz):
         y_edge = below.at_y(edge)
         place = f'x1="{LEFT}" x2="{W - RIGHT}" y1="{y_edge:.1f}" y2="{y_edge:.1f}"'

@@ -14,6 +14,7 @@ from app.overview.signals.service import SignalWindow, signals_of
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
 from app.platform.web.charts import written
+from app.platform.web.numbers import number
 from app.platform.web.templates import render
 from app.study.deps import CurrentSession, SessionViewed
 
@@ -82,12 +83,13 @@ def resolution(window: SignalWindow) -> str:
     """How much of the samples a figure shows, in words."""
     rates = " and ".join(f"{r:g}" for r in window.channel.rates_hz)
     shown = "every sample" if window.resolution_s == 0 else f"lowest and highest sample of every {1000 * window.resolution_s:.0f} ms"
-    return f"{window.channel.channel} · {written(window.channel.unit)} · {rates} Hz · n = {window.channel.samples} samples · {shown}"
+    named, samples = written(f"{window.channel.channel} · {window.channel.unit}"), number(window.channel.samples)
+    return f"{named} · {rates} Hz · n = {samples} samples · {shown}"
 
 
 def _named(channels: Any) -> list[tuple[int, str]]:
     many = len({c.recording for c in channels}) > 1
-    return [(c.number, c.channel + (f", {c.hemisphere or f'recording {c.recording}'}" if many else "")) for c in channels]
+    return [(c.number, written(c.channel) + (f", {c.hemisphere or f'recording {c.recording}'}" if many else "")) for c in channels]
 
 
 def _seconds(text: str) -> float | None:

@@ -25,6 +25,7 @@ from app.planning.plans.view import read_plan
 from app.planning.releases import service as releases
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
+from app.platform.web import numbers
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.settings import get_settings
@@ -141,7 +142,9 @@ def _page(
         if m.energy_of_cdbs is not None and m.charge_of_cdbs is not None:
             energy = [energy_words(m.energy_of_cdbs), battery_life_words(m.energy_of_cdbs, m.charge_of_cdbs)]
         # so many digits that a release signed as shown allows a plan with the same defaults (`releases.service.TOLERANCE`)
-        shown = {name: f"{getattr(m, name):.9g}" for name in ("min_ma", "max_ma", "ramp_ma_per_s")} | {"hemisphere": m.hemisphere or ""}
+        shown = {name: numbers.typed(getattr(m, name), 9) for name in ("min_ma", "max_ma", "ramp_ma_per_s")} | {
+            "hemisphere": m.hemisphere or ""
+        }
         facts |= {"manifest": m, "warnings": warning_sentences(m), "energy": energy, "shown": shown}
     except Invalid as reason:
         facts["unmade"] = reason.problem(request.url.path)

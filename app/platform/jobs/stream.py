@@ -16,7 +16,7 @@ from app.platform.jobs import repository
 from app.platform.jobs.models import Job, JobEvent, JobStatus
 from app.platform.jobs.service import describe_event
 from app.platform.jobs.titles import plain_words, reason
-from app.platform.web.templates import time_left
+from app.platform.web.numbers import time_left
 
 POLL_S = 0.5
 KEEP_ALIVE_S = 15.0

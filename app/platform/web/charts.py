@@ -159,7 +159,10 @@ def apart_where_equal(points: Sequence[tuple[float, float]], step: float) -> lis
 
 
 def written(text: str) -> str:
-    """A text with its units as people write them: device formats have `uV2` where a reader expects \u00b5V\u00b2."""
+    """A text with units and contacts as people write them: device formats have `uV2` where a reader expects \u00b5V\u00b2, and `key 0 +2-0`
+    or `ONE_THREE_RIGHT` for the channel between two contacts."""
+    text = _CONTACTS.sub("contacts +\\1\u2212\\2", text) if "key " in text else text
+    text = _PAIR.sub(_pair, text) if "_" in text else text
     return _SQUARED.sub("\u00b5V\u00b2", _MICRO.sub("\u00b5\\1", text)) if "u" in text else text
 
 
@@ -200,6 +203,16 @@ def _floats(values: np.ndarray[Any, Any]) -> list[Any]:
 
 
 _MICRO = re.compile(r"\bu([VAs]2?)\b")
+_NUMBERS = {"ZERO": 0, "ONE": 1, "TWO": 2, "THREE": 3}
+_PAIR = re.compile(rf"\b({'|'.join(_NUMBERS)})_(?:AND_)?({'|'.join(_NUMBERS)})_(LEFT|RIGHT)\b")
+
+
+def _pair(found: re.Match[str]) -> str:
+    """A sensing channel as Percept reports name it: `ONE_THREE_RIGHT` lies between contacts 1 and 3 of the right lead."""
+    return f"contacts {_NUMBERS[found[1]]}\u2013{_NUMBERS[found[2]]} {found[3].lower()}"
+
+
+_CONTACTS = re.compile(r"\bkey \d+ \+(\w+)-(\w+)\b")
 _SQUARED = re.compile("\u00b5V2\\b")
 
 _DIGITS = 7

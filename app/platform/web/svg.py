@@ -13,6 +13,8 @@ from html import escape
 
 from markupsafe import Markup
 
+from app.platform.web.numbers import stated
+
 LABEL = 12.0
 """Height of a line of text."""
 
@@ -30,11 +32,6 @@ def nice_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
     step *= next(m for m in (1, 2, 5, 10) if (high - low) / (m * step) <= wanted)
     first = math.ceil(low / step - 1e-9)
     return [round(k * step, 12) for k in range(first, math.floor(high / step + 1e-9) + 1)]
-
-
-def shown_tick(value: float) -> str:
-    """A tick's number, with a minus sign that is one."""
-    return f"{value:.6g}".replace("-", "\N{MINUS SIGN}")
 
 
 @dataclass
@@ -70,9 +67,9 @@ class Plane:
         for value in nice_ticks(*self.y, y_ticks):
             y = self.at_y(value)
             self.parts.append(_line(self.left, y, self.left + self.width, y, token("grid")))
-            self.text(self.left - 6, y + 4, shown_tick(value), "end", "muted")
+            self.text(self.left - 6, y + 4, stated(value), "end", "muted")
         for value in nice_ticks(*self.x, x_ticks):
-            self.text(self.at_x(value), bottom + 16, shown_tick(value), "middle", "muted")
+            self.text(self.at_x(value), bottom + 16, stated(value), "middle", "muted")
         self.parts.append(_line(self.left, bottom, self.left + self.width, bottom, token("border")))
         self.text(self.left + self.width / 2, bottom + 33, x_title, "middle")
         self.text(self.left - 36 if y_ticks else self.left, self.top - 10, y_title, "start")
@@ -82,7 +79,7 @@ class Plane:
         left, top = self.at_x(x0), self.at_y(y1)
         self.parts.append(
             f'<rect x="{left:.1f}" y="{top:.1f}" width="{self.at_x(x1) - left:.1f}" height="{self.at_y(y0) - top:.1f}" '
-            f'fill="{token(colour)}" fill-opacity="{opacity:.2f}"/>'
+            f'fill="{token(colour)}" fill-opacity="{opacity:.2f}" shape-rendering="crispEdges"/>'
         )
 
     def line(

@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 from app.platform.database import now, set_reason
 from app.platform.errors import Invalid
 from app.platform.web.charts import counted
+from app.platform.web.numbers import stated
 from app.study import repository
 from app.study.models import Hemisphere, QocRevision, StudySession
 from app.study.outcomes import repository as of_files
@@ -163,7 +164,7 @@ def derive_for_session(db: Session, session: StudySession) -> list[str]:
     if changed:
         _add_revision(db, session, changed)
     for clash in disagreements(session, found):
-        typed = "no value" if clash.typed is None else f"{clash.typed:.4g} {clash.derived.unit}"
+        typed = "no value" if clash.typed is None else f"{stated(clash.typed, 4)} {clash.derived.unit}"
         said.append(
             f"Session {session.id}: {clash.author} entered {typed} for {clash.derived.label.lower()}, which stays; "
             f"the files give {clash.derived.sentence}. Compare them on the session's page."

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
+from app.platform.web.numbers import stated
 from app.study import repository
 from app.study.characteristics.models import CharacteristicsVersion
 from app.study.models import Hemisphere, StudySession
@@ -60,7 +61,7 @@ class Derived:
     def sentence(self) -> str:
         """Value and basis in words."""
         what = self.label.lower()
-        return f"no {what} derived: {self.basis}" if self.value is None else f"{what} {self.value:.4g} {self.unit} ({self.basis})"
+        return f"no {what} derived: {self.basis}" if self.value is None else f"{what} {stated(self.value, 4)} {self.unit} ({self.basis})"
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ def _tremor_value(reading: TremorReading) -> tuple[float | None, str]:
         covered += f", {untold / 60:.1f} min of no class"
     if reading.unknown_s + max(0.0, untold) > MAX_UNKNOWN * whole:
         return None, f"{covered}; at most {100 * MAX_UNKNOWN:.0f} % of the session may be"
-    return reading.duration_weighted, f"duration-weighted, {covered}; by each minute's largest class {reading.arg_max:.4g} %"
+    return reading.duration_weighted, f"duration-weighted, {covered}; by each minute's largest class {stated(reading.arg_max, 4)} %"
 
 
 def grasp_outcome(db: Session, session: StudySession) -> GraspOutcome | None:
@@ -214,9 +215,10 @@ def _grasp_value(counted: list[GraspView], how: str) -> tuple[float | None, str]
     if odd := sum(int(v.implausible.sum()) for v in counted):
         without = [v.plausible_hz for v in counted if v.plausible_hz is not None]
         basis += f", {odd} intervals outside {low:g} to {high:g} s counted"
-        basis += f", without them {np.mean(without):.4g} Hz" if len(without) == len(counted) else ", nothing left without them"
+        left = f"without them {stated(float(np.mean(without)), 4)} Hz" if len(without) == len(counted) else "nothing left without them"
+        basis += f", {left}"
     if value >= MAX_GRASP_HZ:
-        return None, f"{basis}; {value:.4g} Hz is faster than any hand"
+        return None, f"{basis}; {stated(value, 4)} Hz is faster than any hand"
     return value, basis
 
 

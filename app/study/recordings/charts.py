@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.platform.web.charts import Cell, Chart, axis, figure
+from app.platform.web.numbers import hover
 from app.study.models import Recording, Trace
 from app.study.recordings.facts import clock_fit
 from app.study.traces import unpack
@@ -78,7 +79,7 @@ def spectrum_charts(recording: Recording, low_hz: float, high_hz: float) -> list
         lines = []
         for i, spectrum in enumerate(group):
             line = _line(str(spectrum["channel"]), _numbers(spectrum["hz"]), _numbers(spectrum["density"]), i, unit)
-            lines.append(line | {"mode": "lines", "hovertemplate": f"%{{x:.1f}} Hz<br>%{{y:.3g}} {unit}"})
+            lines.append(line | {"mode": "lines", "hovertemplate": f"%{{x:.1f}} Hz<br>{hover()} {unit}"})
         band = {
             "type": "rect", "xref": "x", "x0": low_hz, "x1": high_hz, "yref": "paper", "y0": 0, "y1": 1, "line": {"width": 0},
             "fillcolor": "token:accent/0.12", "layer": "below",
@@ -183,7 +184,7 @@ def _line(name: str, x: NDArray[np.float64], y: NDArray[np.float64], i: int, uni
         "type": "scatter", "mode": "lines+markers", "name": name, "x": x, "y": y, "connectgaps": False,
         "marker": {"size": 2.5, "color": colour},
         "line": {"color": colour, "dash": _DASHES[i // len(_COLOURS) % len(_DASHES)], "width": 1.3},
-        "hovertemplate": f"%{{x:.2f}} min<br>%{{y:.4g}} {unit}",
+        "hovertemplate": f"%{{x:.2f}} min<br>{hover(digits=4)} {unit}",
     }  # fmt: skip
 
 

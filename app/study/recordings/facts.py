@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from app.platform.web.numbers import stated
 from app.study.models import Recording
 from ml.formats.rcs.packets.time import Rejected
 from ml.formats.rcs.quality import REJECTED_WORDS
@@ -207,7 +208,11 @@ def _row(name: str, stored: Mapping[str, Any], clock: str) -> StreamQuality:
         remarks.append("the file gives no packet times: loss cannot be seen")
     if stored.get("rate_hz"):
         remarks.append(f"{_plain(stored['rate_hz'])} Hz")
-    remarks += [f"{_words(key)}: {_plain(value)}" for key, value in stored.items() if key not in _KNOWN and value not in (None, {}, [])]
+    remarks += [
+        f"{_SHOWN.get(key, _words(key))}: {_plain(value)}"
+        for key, value in stored.items()
+        if key not in _KNOWN and value not in (None, {}, [])
+    ]
     unseen = stored.get("loss_visible") is False
     return StreamQuality(
         _words(name),
@@ -223,6 +228,10 @@ def _row(name: str, stored: Mapping[str, Any], clock: str) -> StreamQuality:
         str(stored.get("clock", clock)),
         remarks,
     )
+
+
+_SHOWN = {"latency_median_ms": "median latency (ms)", "flat_share": "share of samples that stand still"}
+"""Names of further numbers of a stream that their own words do not tell."""
 
 
 def _rejected(stored: str) -> Rejected:
@@ -243,4 +252,4 @@ def _plain(value: Any) -> str:
         return ", ".join(f"{_words(k)} {_plain(v)}" for k, v in value.items())
     if isinstance(value, list):
         return ", ".join(_plain(v) for v in value[:12]) + (" …" if len(value) > 12 else "")
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return stated(value, 4) if isinstance(value, float) else str(value)

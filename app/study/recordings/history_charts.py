@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from app.platform.web.charts import Cell, Chart, axis, figure
+from app.platform.web.numbers import hover, stated
 from app.study.recordings.history import History, Spectrum, Trend
 
 SIDES = {"left": "token:cdbs", "right": "token:rl"}
@@ -43,7 +44,7 @@ def _trend_charts(history: History, number: int) -> list[Chart]:
     every = [t for trend in history.trends for t in trend.unix_s]
     averages = ", ".join(f"{t.side} n = {len(t.unix_s)}" for t in history.trends)
     window_s = _window_s(history.trends)
-    shown = f", lowest and highest of every {window_s / 3600:.3g} h" if window_s else ""
+    shown = f", lowest and highest of every {stated(window_s / 3600, 3)} h" if window_s else ""
     span = f"{_day(min(every))} to {_day(max(every))}, averages over 10 min{shown}, {averages}"
     power = [_line(t, t.power, "device units", window_s) for t in history.trends]
     top = max((v for t in history.trends for v in t.power if v is not None), default=1.0)
@@ -94,7 +95,7 @@ def _line(trend: Trend, values: Sequence[float | None], unit: str, window_s: flo
         "type": "scatter", "mode": "lines", "name": trend.side, "x": [_iso(at) for at, _ in shown], "y": [v for _, v in shown],
         "connectgaps": False,
         "line": {"color": SIDES.get(trend.side, "token:other"), "width": 1, "dash": "solid" if trend.side == "left" else "dot"},
-        "hovertemplate": f"%{{x}}<br>%{{y:.4g}} {unit}",
+        "hovertemplate": f"%{{x}}<br>{hover(digits=4)} {unit}",
     }  # fmt: skip
 
 
@@ -167,7 +168,7 @@ def _spectra_chart(identity: str, title: str, side: str, spectra: Sequence[Spect
         {
             "type": "scatter", "mode": "lines", "name": name, "x": s.hz, "y": s.magnitude,
             "line": {"color": _COLOURS[i % len(_COLOURS)], "dash": _DASHES[i // len(_COLOURS) % len(_DASHES)], "width": 1.3},
-            "hovertemplate": "%{x:.1f} Hz<br>%{y:.3g} uVp",
+            "hovertemplate": f"%{{x:.1f}} Hz<br>{hover()} uVp",
         }
         for i, (s, name) in enumerate(zip(shown, names, strict=True))
     ]  # fmt: skip

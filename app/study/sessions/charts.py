@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.platform.web.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, counted, figure, horizontal
-from app.study.recordings.charts import TIME, trace_name
+from app.platform.web.numbers import hover, number, stated
+from app.study.recordings.charts import TIME
 from app.study.sessions.data import SessionData
 from app.study.traces import amplitude_program, session_offset_s
 from ml.mdp import AMPLITUDE_TOLERANCE
@@ -146,13 +147,13 @@ def control_chart(data: SessionData) -> Chart:
         {
             "type": "scatter", "mode": "lines+markers", "name": name, **grid, "y": _drawn(table.beta), "connectgaps": False,
             "line": {"color": ACCENT, "width": 1.5}, "marker": {"size": 3.5, "color": ACCENT},
-            "hovertemplate": f"%{{x:.2f}} min<br>%{{y:.4g}} {unit}<extra></extra>",
+            "hovertemplate": f"%{{x:.2f}} min<br>{hover(digits=4)} {unit}<extra></extra>",
         },
         *_amplitude_traces(data, minutes, grid),
     ]  # fmt: skip
     layout: dict[str, Any] = {
         "grid": {"rows": 2, "columns": 1},
-        "xaxis": axis("Time in session", "min", anchor="y2", zeroline=False),
+        "xaxis": axis("Time in session", "min", anchor="y2", zeroline=False, range=[float(minutes[0]), float(minutes[-1])]),
         "yaxis": axis(name, unit, domain=[0.47, 1.0], zeroline=False, rangemode="tozero", fixedrange=True),
         "yaxis2": axis(
             "Amplitude", "mA" if _has(table.amplitude_ma) else "fraction", domain=[0.0, 0.38], rangemode="nonnegative", zeroline=False,
@@ -166,7 +167,7 @@ def control_chart(data: SessionData) -> Chart:
         line, _ = horizontal(data.threshold, "", WARN)
         layout["shapes"].append(line)
         # named in the legend: beta runs about the threshold, so that a label at the line would lie on the data
-        label = f"threshold {data.threshold:.4g} {unit}".strip()
+        label = f"threshold {stated(data.threshold, 4)} {unit}".strip()
         traces.append({"type": "scatter", "mode": "lines", "name": label, "x": [None], "y": [None], "line": line["line"]})
     missing = _mark_missing(layout, data) if table.beta_trace else 0
     if missing:
@@ -190,11 +191,15 @@ def control_chart(data: SessionData) -> Chart:
             {
                 "type": "scatter", "mode": "markers", "name": "above the axis", "x": minutes[over],
                 "y": np.full(int(over.sum()), 0.985 * top), "marker": {"symbol": "triangle-up-open", "size": 9, "color": BAD},
-                "customdata": table.beta[over], "hovertemplate": f"%{{customdata:.4g}} {unit}<extra>above the axis</extra>",
+                "customdata": table.beta[over], "hovertemplate": f"{hover('customdata', 4)} {unit}<extra>above the axis</extra>",
             }
         )  # fmt: skip
     if _has(table.amplitude_ma) and table.cdbs_ma:
-        _add(layout, horizontal(table.cdbs_ma, f"cDBS {table.cdbs_ma:.3g} mA", MUTED, "dot", "y2"))
+        held, _ = horizontal(table.cdbs_ma, "", MUTED, "dot", "y2")
+        layout["shapes"].append(held)
+        # in the legend too: a controller often asks for just that amplitude, and its line would lie under a label
+        label = f"cDBS {stated(table.cdbs_ma, 3)} mA"
+        traces.append({"type": "scatter", "mode": "lines", "name": label, "x": [None], "y": [None], "line": held["line"]})
         highest = 1.15 * max(table.cdbs_ma, float(np.nanmax(table.amplitude_ma)))
         layout["yaxis2"] |= {"range": [0, highest]}
         layout["yaxis3"] = axis(
@@ -211,7 +216,7 @@ def control_chart(data: SessionData) -> Chart:
         traces.append({"type": "scatter", "x": [minutes[0]], "y": [None], "yaxis": "y3", "showlegend": False, "hoverinfo": "skip"})
     subtitle = f"{unit or 'no unit'} over {settings.period_s:g} s · n = {known} of {int(np.sum(table.t_s > 0))} steps with a valid window"
     if over.any():
-        subtitle += f" · {int(over.sum())} above the axis, up to {float(np.nanmax(table.beta)):.3g}"
+        subtitle += f" · {int(over.sum())} above the axis, up to {number(float(np.nanmax(table.beta)))}"
     if spikes.any():
         subtitle += f" · power spikes left out of {counted(int(spikes.sum()), 'window')}"
     columns = ("Step end (s)", f"{name} ({unit or '—'})", "Amplitude (mA)", "Fraction of cDBS", "Mark")
@@ -220,8 +225,10 @@ def control_chart(data: SessionData) -> Chart:
         [float(t), _known(b), _known(a), _known(f), mark]
         for t, b, a, f, mark in zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, marks, strict=True)
     ]
-    title = f"{trace_name(table.beta_trace)} and amplitude" if table.beta_trace else "Amplitude"
-    return Chart("control", title[:1].upper() + title[1:], subtitle, figure(traces, **layout), columns, rows, height=470, zoom=TIME)
+    if table.beta_trace and table.beta_trace.channel not in ("", table.beta_trace.source):
+        subtitle = f"{table.beta_trace.channel} · {subtitle}"
+    title = f"{name} and amplitude of stimulation" if table.beta_trace else "Amplitude of stimulation"
+    return Chart("control", title, subtitle, figure(traces, **layout), columns, rows, height=470, zoom=TIME)
 
 
 def beta_by_amplitude(data: SessionData) -> Chart | None:
@@ -249,7 +256,7 @@ def beta_by_amplitude(data: SessionData) -> Chart | None:
         "type": "scatter", "mode": "lines+markers", "x": x, "y": y, "customdata": n, "line": {"color": GRID, "width": 1},
         "marker": {"color": ACCENT, "size": 8},
         "error_y": {"type": "data", "symmetric": False, "array": high - y, "arrayminus": y - low, "color": ACCENT, "thickness": 1.5},
-        "hovertemplate": f"%{{x:.3g}} {unit}<br>%{{y:.4g}} {beta_unit}<br>n = %{{customdata}} windows<extra></extra>",
+        "hovertemplate": f"{hover('x')} {unit}<br>{hover(digits=4)} {beta_unit}<br>n = %{{customdata}} windows<extra></extra>",
     }  # fmt: skip
     layout: dict[str, Any] = {"xaxis": axis("Amplitude", unit, zeroline=False), "yaxis": axis("Beta", beta_unit, rangemode="tozero")}
     if data.threshold is not None:
@@ -272,8 +279,8 @@ def _amplitude_traces(data: SessionData, minutes: NDArray[np.float64], grid: Map
     values = table.amplitude_ma if _has(table.amplitude_ma) else table.fraction
     # a row holds the amplitude over the period that ends at its time, so the line steps first and then runs
     base: dict[str, Any] = {"type": "scatter", "yaxis": "y2", "connectgaps": False, "line": {"shape": "vh", "color": TEXT, "width": 1.8}}
-    hover = "%{y:.3g}" + (" mA (%{customdata:.0%})" if _has(table.amplitude_ma) else "") + "<extra>amplitude</extra>"
-    line = {"mode": "lines", "name": "Amplitude", **grid, "y": _drawn(values), "hovertemplate": hover}
+    shown = hover() + (" mA (%{customdata:.0%})" if _has(table.amplitude_ma) else "") + "<extra>amplitude</extra>"
+    line = {"mode": "lines", "name": "Amplitude", **grid, "y": _drawn(values), "hovertemplate": shown}
     if _has(table.amplitude_ma):
         line["customdata"] = np.round(table.fraction, 2)  # said in whole per cent
     traces = [base | line]

@@ -16,6 +16,7 @@ from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, confirmed, field_notes, parse
+from app.platform.web.numbers import typed
 from app.platform.web.templates import render
 from app.study import repository, service
 from app.study.adverse_events.repository import events_of_session
@@ -35,7 +36,7 @@ from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.stimulation import beside, delivered
 from app.study.traces import NO_CONTROL, control_programs, session_offset_s
 from app.study.visits.blinded import blinded_page
-from app.study.wording import ACTIVITIES, EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
+from app.study.wording import ACTIVITIES, DEVICE_NAMES, EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
 from ml.energy import relative_energy
 
 router = APIRouter()
@@ -143,7 +144,7 @@ def exclude(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
     why = str(values.get("excluded_reason", "")).strip()
     try:
         if not include and not why:
-            raise Invalid("An exclusion needs a reason.", "Say why the session shall not count.")
+            raise Invalid("An exclusion needs a reason.", "Say why the session shall not count.", field="excluded_reason")
         change = SessionChange(excluded_reason=None if include else why[:1000], reason="included again" if include else why[:1000])
         service.change_session(db, session, change, caller)
     except BetaloopError as error:
@@ -239,7 +240,7 @@ def _qoc_revisions(session: StudySession) -> list[Shown]:
 def _shown_qoc(revision: QocRevision | None) -> dict[str, str]:
     """QoCs as the form shows them."""
     values = {n: getattr(revision, n, None) for n in ("grasp_hz", "rating", "tremor_percent")}
-    return {name: "" if value is None else f"{value:.4g}" for name, value in values.items()}
+    return {name: typed(value) for name, value in values.items()}
 
 
 def _conditions_revisions(session: StudySession) -> list[Shown]:
@@ -248,7 +249,7 @@ def _conditions_revisions(session: StudySession) -> list[Shown]:
     found = [Shown(0, dict.fromkeys(names, ""), "")]
     for row in session.conditions_revisions:
         values = {n: getattr(row, n) for n in names}
-        found.append(Shown(row.revision, {n: "" if v is None else f"{v:.6g}" for n, v in values.items()}, row.entered_by))
+        found.append(Shown(row.revision, {n: typed(v, 6) for n, v in values.items()}, row.entered_by))
     return found
 
 
@@ -313,6 +314,7 @@ def _page(
         open_queries=not_closed_of_session(db, session.id),
         since=since_last_dose(session),
         activities=ACTIVITIES,
+        device_names=DEVICE_NAMES,
         events=events_of_session(db, session.id),
         event_kinds=EVENT_KINDS,
         event_severities=EVENT_SEVERITIES,

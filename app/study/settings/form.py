@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Generic, TypeVar
 
+from app.platform.web.numbers import typed
+
 Row = TypeVar("Row")
 
 
@@ -172,4 +174,4 @@ def _text(value: Any) -> str:
         return ""
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.10g}" if isinstance(value, float) else str(value)
+    return typed(value, 10) if isinstance(value, float) else str(value)

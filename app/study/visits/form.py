@@ -9,6 +9,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
 from app.platform.web.forms import parse
+from app.platform.web.numbers import typed
 from app.study import repository
 from app.study.models import Hemisphere, Visit
 from app.study.schemas import CdbsAmplitudeModel, VisitChange
@@ -22,7 +23,7 @@ def texts(visit: Visit) -> dict[str, str]:
     """The visit as the form shows it."""
     fields = {"date": visit.date.isoformat() if visit.date else "", "note": visit.note or ""}
     fields |= {f"cdbs_{side}_{program}": "" for program in PROGRAMS for side in SIDES}
-    return fields | {f"cdbs_{a.hemisphere}_{a.program}": f"{a.amplitude_ma:.10g}" for a in visit.cdbs_amplitudes}
+    return fields | {f"cdbs_{a.hemisphere}_{a.program}": typed(a.amplitude_ma, 10) for a in visit.cdbs_amplitudes}
 
 
 def labels(fields: Mapping[str, str]) -> dict[str, str]:

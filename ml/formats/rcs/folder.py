@@ -201,7 +201,8 @@ def _elements(session: SessionFiles, files: Files, stem: str, infos: list[dict[s
     if notes.elements == 0:
         report.flagged.append("holds no data")
     else:
-        report.understood.append(f"{notes.elements} {'packets' if wanted else 'records'}")
+        one = "packet" if wanted else "record"
+        report.understood.append(f"{notes.elements} {one}{'' if notes.elements == 1 else 's'}")
 
 
 def _limited(elements: Iterable[Any], report: FileReport) -> Iterator[Any]:

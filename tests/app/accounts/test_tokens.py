@@ -19,7 +19,7 @@ from app.accounts.models import Role, Scope, User
 from app.accounts.permissions import PERMISSIONS, READ_ARMS, SCOPES, Caller, Grant
 from app.platform.database import now
 from app.platform.errors import Forbidden, Invalid, TooMany
-from app.platform.web.templates import when
+from app.platform.web.numbers import when
 from tests.conftest import PASSWORD
 
 ADA = "ada@clinic.example"

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from app.platform.database import now, transaction
 from app.platform.jobs.models import Job, JobStatus
-from app.platform.web.templates import minutes_left, time_left
+from app.platform.web.numbers import minutes_left, time_left
 from app.simulation import demo
 
 PAGES = ("/", "/participants/P1", "/participants/P1/ranking")

@@ -53,9 +53,9 @@ def test_ties_do_not_give_a_smaller_p_than_so_few_sessions_can() -> None:
         (
             2,
             5,
-            "needs at least 4 sessions on each side, or 3 against 5; No DBS has 2, cDBS 5. So few cannot give a two-sided p below 0.095",
+            "needs at least 4 sessions on each side, or 3 against 5; No DBS has 2, cDBS 5. So few cannot give a two-sided p below .095",
         ),
-        (3, 4, "needs at least 4 sessions on each side; No DBS has 3, cDBS 4. So few cannot give a two-sided p below 0.057"),
+        (3, 4, "needs at least 4 sessions on each side; No DBS has 3, cDBS 4. So few cannot give a two-sided p below .057"),
         (6, 2, "or 8 against 2; No DBS has 6, cDBS 2"),
         (0, 9, "needs at least 4 sessions with this metric on each side; No DBS has 0, cDBS 9"),
         (9, 0, "No DBS has 9, cDBS 0"),

@@ -52,5 +52,5 @@ def test_the_page_shows_minutes_and_n_for_every_participant(upload, client, enro
     upload("cdbs", steps=300)
     page = client.get("/trial-time")
     assert page.status_code == 200
-    assert "10 <span" in page.text
+    assert "10<span" in page.text
     assert "(1)" in page.text

@@ -8,7 +8,7 @@ from pathlib import Path
 from app.analysis.biomarker.charts import SCALE
 from app.analysis.figures import COLOURS
 from app.platform.web.charts import figure, written
-from app.platform.web.templates import fixed, number, place, rate, stated, typed, whole
+from app.platform.web.numbers import fixed, hover, number, place, rate, stated, typed, whole
 
 ROOT = Path(__file__).parents[4]
 STATIC = ROOT / "static"
@@ -16,8 +16,10 @@ OWN_FORMAT = re.compile(r"(?<!\{)%[-+0]*\d*(?:\.\d+)?[gfeGE]\b|\|\s*round\b")
 """A number that a template formats by itself: `"%.3g"|format(x)`, `x|round`."""
 
 OWN_DIGITS = re.compile(r":[-+,z]*\.\d+[geE]\}")
-TOLD_BY_MODULES = ("app/evaluation/ranking/picture.py",)
-"""Modules whose tables and marks take numbers as pages do; others still write theirs."""
+OWN_PLACES = ("app/platform/web/numbers.py", "app/tablet/", "app/analysis/calibration/export.py")
+"""Where a format of digits stands: the one place of the pages, what the tablet writes to its wire and terminal, and a file of data."""
+ROUNDED = 'float(f"'
+"""How a line begins to round numbers that stay numbers."""
 
 
 def test_what_rounds_to_nothing_has_no_sign() -> None:
@@ -35,12 +37,14 @@ def test_numbers_are_formatted_in_one_place() -> None:
         for n, line in enumerate(path.read_text().splitlines(), 1)
         if (hit := OWN_FORMAT.findall(line))
     }
-    for path in TOLD_BY_MODULES:
+    for path in (p for p in ROOT.glob("app/**/*.py") if not p.relative_to(ROOT).as_posix().startswith(OWN_PLACES)):
         found |= {
-            f"{path}:{n}": hit for n, line in enumerate((ROOT / path).read_text().splitlines(), 1) if (hit := OWN_DIGITS.findall(line))
+            f"{path.relative_to(ROOT)}:{n}": hit
+            for n, line in enumerate(path.read_text().splitlines(), 1)
+            if ROUNDED not in line and (hit := OWN_DIGITS.findall(line))
         }
     assert OWN_DIGITS.findall('f"{a:.3g} {b:,.2e}"') == [":.3g}", ":,.2e}"]
-    assert found == {}, "use the filters number, fixed, stated, whole, typed or place"
+    assert found == {}, "use number, fixed, stated, whole, typed, place or hover of app.platform.web.numbers"
     assert OWN_FORMAT.findall('{{ "%g"|format(x) }} {{ "%.3g mA"|format(x) }} {{ x|round|int }} {% for %} {{ "%d"|format(3) }} 4 %') == [
         "%g", "%.3g", "|round",
     ]  # fmt: skip
@@ -80,3 +84,12 @@ def test_figures_hold_as_many_digits_as_a_trace_and_their_units_in_writing() -> 
     made = figure([{"y": [1 / 3, float("nan"), 2]}], yaxis={"title": "beta (uV2)"})
     assert made["data"][0]["y"] == [0.3333333, None, 2]
     assert made["layout"]["yaxis"]["title"] == "beta (\u00b5V\u00b2)"
+
+
+def test_a_number_of_few_digits_shows_no_exponent_and_keeps_its_size() -> None:
+    assert [stated(v, 3) for v in (2.5, 0.3333333, 1234.5, 12345678.0)] == ["2.5", "0.333", "1\u202f234", "12\u202f345\u202f678"]
+    assert [typed(2.4790827393, 10), typed(2.4790827393)] == ["2.479082739", "2.479"]
+
+
+def test_the_hover_text_of_a_chart_writes_digits_without_an_exponent() -> None:
+    assert [hover(), hover("x"), hover("customdata", 4)] == ["%{y:,.3~r}", "%{x:,.3~r}", "%{customdata:,.4~r}"]

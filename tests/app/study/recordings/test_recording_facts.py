@@ -45,7 +45,7 @@ def test_packets_left_out_stand_under_their_reason(rejected: dict[str, int]) -> 
         "4 left out: PacketGenTime steps back",
         "1 left out: timestamp more than a day off",
         "2 left out: fields missing or of the wrong kind",
-        "flat share: key 0 0.01",
+        "share of samples that stand still: key 0 0.01",
     ]
 
 
