@@ -65,6 +65,12 @@ def _thin(flag: Flag) -> str:
 
 
 OUTCOME_NAMES = {"grasp_hz": "grasp", "rating": "rating", "tremor_percent": "tremor"}
+OUTCOMES_WITH_UNITS = {
+    "r_end": "End-of-session reward",
+    "grasp_hz": "Grasp (Hz)",
+    "rating": "Rating (points)",
+    "tremor_percent": "Tremor (% of minutes)",
+}
 
 _UNSKILLED = {
     "no_better_than_equal": "left-out sessions are predicted no better than by calling all of them equal",

@@ -252,7 +252,7 @@ class FittedDlmm:
         values = np.array([r.step_return[i].mean() for r in runs]) + ends
         value = float(values.mean())
         monte_carlo = np.mean([r.step_return[i].var() / r.step_return.shape[1] for r in runs]) / len(runs)
-        level = self.end.residual[0] ** 2 / len(self.buffer.sessions) if with_end else 0.0
+        level = self.end.by_session.residual[0] ** 2 / len(self.buffer.sessions) if with_end else 0.0
         spread = float(values.var(ddof=1)) if len(runs) > 1 else 0.0
         error = float(np.sqrt(spread + monte_carlo + level))
         reach = float(ndtri((1 + LEVEL) / 2)) * error

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings
-from ml.ope.outcomes.model import EndModel, fit_end_model
+from ml.ope.outcomes.model import EndModel, LeftOut, fit_end_model
 from ml.ope.outcomes.steps import end_reward_by_step
 from ml.ope.scale import outcome_table
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -36,7 +36,8 @@ class EndReward:
     Attributes:
         model: of the outcomes, with constants of 0 where a QoC is left out. level: what those left out add to r_end on average.
         settings: of the MDP. factor: (1 - gamma) / (1 - gamma^H).
-        skill: 1 - leave-one-session-out error / variance of r_end.
+        skill: 1 - squared error of r_end of left-out sessions / that of saying the mean. visit_skill: the same of left-out visits, held
+            against the mean of the other visits; None where there is one visit.
         sessions: with an r_end.
     """
 
@@ -45,6 +46,7 @@ class EndReward:
     settings: MdpSettings
     factor: float
     skill: float
+    visit_skill: float | None
     sessions: int
 
     def per_step(self, session: SessionTrajectory) -> Floats:
@@ -56,7 +58,8 @@ def fit_end_reward(buffer: ReplayBuffer) -> EndReward | None:
     """Learn the share from the QoCs that are predicted better than by their mean; None without one, or with too few sessions.
 
     Too few are fewer than `FEWEST_SESSIONS` with an r_end. A QoC that nothing predicts, such as a noisy rating, is left out, so that it
-    does not drown what another tells; None too where what is left predicts r_end of left-out sessions no better than its mean.
+    does not drown what another tells; None too where what is left predicts r_end no better than its mean. To see that, sessions are left
+    out, and visits: the first would miss what a noisy session hides, the second what days hide that differ by more than doses do.
     """
     settings = buffer.settings
     rated = sum(s.end_reward(settings) is not None and bool(s.usable().any()) for s in buffer.sessions)
@@ -64,24 +67,26 @@ def fit_end_reward(buffer: ReplayBuffer) -> EndReward | None:
         return None
     model = fit_end_model(buffer)
     table = outcome_table(buffer)[:, 1:]
-    told = np.array([model.seen[k] and model.skill[k] > 0 for k in (1, 2, 3)])
+    ways = [model.by_session, model.by_visit][: min(2, len({s.visit for s in buffer.sessions}))]
+    told = np.array([model.seen[k] and any(left.skill[k] > 0 for left in ways) for k in (1, 2, 3)])
     constants = np.where(told, model.constants, 0.0)
-    skill = _skill(model, constants, table)
-    if not constants.any() or skill <= 0:
+    skills = [_skill(model, left, constants, table) for left in ways]
+    if not constants.any() or max(skills) <= 0:
         return None
     factor = (1 - settings.gamma) / (1 - settings.gamma ** buffer.median_steps())
     shared = replace(model, constants=constants, seen=(True, *model.seen[1:]))
     left = model.constants != constants
     level = float(np.nanmean(table[:, left], axis=0) @ model.constants[left])
-    return EndReward(shared, level, settings, factor, skill, rated)
+    return EndReward(shared, level, settings, factor, skills[0], skills[1] if len(skills) > 1 else None, rated)
 
 
-def _skill(model: EndModel, constants: Floats, table: Floats) -> float:
-    """1 - leave-one-session-out error / variance of r_end, where only QoCs with a constant that is not 0 are predicted; table [n, 3]."""
-    counted = model.constants != 0
-    known = np.isfinite(table[:, counted]).all(1) & np.isfinite(model.left_out[:, 1:][:, constants != 0]).all(1)
-    measured = table[known][:, counted]
-    predicted = np.where(constants[counted] != 0, model.left_out[known, 1:][:, counted], measured.mean(0))
-    ends, guessed = measured @ model.constants[counted], predicted @ model.constants[counted]
-    variance = float(ends.var()) if known.any() else 0.0
-    return 1 - float(np.mean((ends - guessed) ** 2)) / variance if variance > 0 else 0.0
+def _skill(model: EndModel, left: LeftOut, constants: Floats, table: Floats) -> float:
+    """`EndReward.skill` or `visit_skill`, where only QoCs with a constant that is not 0 are predicted; table [n, 3]."""
+    counted, by_model = model.constants != 0, constants != 0
+    said = np.where(by_model, left.predicted[:, 1:], left.mean[:, 1:])[:, counted]
+    known = np.isfinite(table[:, counted]).all(1) & np.isfinite(said).all(1) & np.isfinite(left.mean[:, 1:][:, counted]).all(1)
+    if not known.any():
+        return 0.0
+    ends, guessed, mean = (v[known] @ model.constants[counted] for v in (table[:, counted], said, left.mean[:, 1:][:, counted]))
+    without = float(np.mean((ends - mean) ** 2))
+    return 1 - float(np.mean((ends - guessed) ** 2)) / without if without > 0 else 0.0

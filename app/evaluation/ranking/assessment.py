@@ -109,6 +109,11 @@ class Assessment:
         """Of predicted with observed rewards of left-out sessions; None where it is not known."""
         return self._posterior_detail("skill").get("held_out_correlation")
 
+    @property
+    def left_out_outcomes(self) -> Mapping[str, Mapping[str, float | None]]:
+        """How well outcomes of left-out sessions and visits are predicted (`EndModel.predictability`); empty in earlier versions."""
+        return self._posterior_detail("left_out_outcomes")
+
     def _posterior_detail(self, name: str) -> Mapping[str, Any]:
         found = next((a.posterior for a in self.assessed if a.posterior is not None), None)
         return (found.details.get(name) or {}) if found is not None else {}

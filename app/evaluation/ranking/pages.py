@@ -106,6 +106,8 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             weights=assessment.weights,
             correlation=assessment.held_out_correlation,
             errors=assessment.standard_errors,
+            outcomes=assessment.left_out_outcomes,
+            outcome_names=wording.OUTCOMES_WITH_UNITS,
             unfolded=unfolded,
             levels=participant.current_margins,
             forest=charts.forest(found),

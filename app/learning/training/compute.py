@@ -206,7 +206,7 @@ def _share_of_end(learnt: ReplayBuffer, config: rl.TrainConfig) -> dict[str, Any
     if config.aim != "return":
         return {}
     share = rl.fit_end_reward(learnt)
-    return {"end_reward": {"skill": share.skill, "sessions": share.sessions} if share else None}
+    return {"end_reward": {"skill": share.skill, "visit_skill": share.visit_skill, "sessions": share.sessions} if share else None}
 
 
 def stored_gains(

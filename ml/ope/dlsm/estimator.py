@@ -173,7 +173,7 @@ class FittedDlsm:
         residuals = np.concatenate([np.asarray(c.residual_end) for c in self.checks])
         if not residuals.size or not self.end.seen[0]:
             return "latent"
-        return "latent" if float(np.mean(residuals**2)) <= self.end.residual[0] ** 2 else "summaries"
+        return "latent" if float(np.mean(residuals**2)) <= self.end.by_session.residual[0] ** 2 else "summaries"
 
     def held_out_skill(self) -> dict[str, Any]:
         """Held-out free-running skill of the members together: 1 is perfect, 0 no better than the mean of the learnt sessions.
@@ -283,7 +283,7 @@ class FittedDlsm:
         residuals = [np.concatenate([np.asarray(getattr(c, name)) for c in self.checks])]
         total = 0.0
         if self.end_source == "summaries":
-            total = float(self.end.residual[0]) ** 2 / len(self.buffer.sessions)
+            total = float(self.end.by_session.residual[0]) ** 2 / len(self.buffer.sessions)
         else:
             residuals.append(np.concatenate([np.asarray(c.residual_end) for c in self.checks]))
         for found in residuals:

@@ -301,7 +301,8 @@ class FittedLinear:
         with_end = self.end.seen[0]
         return {
             "replay_skill": self.skill,
-            "end_skill": float(self.end.skill[0]) if with_end else None,
+            "end_skill": float(self.end.by_session.skill[0]) if with_end else None,
+            "outcomes": self.end.predictability(),
             "sessions": len(self.buffer.sessions),
         }
 

@@ -10,6 +10,7 @@ eta_m = x_m theta, with a Gaussian prior of theta. Three families:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import expit, ndtr
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Kind = Literal["gaussian", "rounded", "binomial"]
 
 ROUNDS: Final = 25
@@ -68,17 +70,52 @@ class Solved:
     degrees: Floats
     log_evidence: Floats
 
-    def left_out(self, p: Problem, weights: Floats) -> Floats:
-        """Expected outcome of every session from the others, [n], averaged by weights [K]: one Newton step from the mode of all."""
-        result = np.zeros(len(p.y))
-        for k in np.flatnonzero(weights).tolist():
-            jacobian, weight, residual = (v[0] for v in _terms(p.only(k), self.mode[k : k + 1], self.dispersion[k : k + 1]))
-            away = jacobian @ self.factor[k] @ self.factor[k].T
-            leverage = np.minimum(weight * np.sum(away * jacobian, axis=1), 0.99)
-            theta = self.mode[k] - away * (residual / (1 - leverage))[:, None]
-            eta = np.einsum("nmq,nq->nm", p.design[k], theta)
-            result += weights[k] * mean_of(p.kind, eta, p.parts, float(self.dispersion[k]))
-        return result
+    def left_out(self, p: Problem, at: Floats, groups: Sequence[Indices], extra: Floats, weights: Floats | None = None) -> Floats:
+        """Expected outcome of every session from the sessions of the other groups, [n].
+
+        One Newton step from the mode of all. Dispersions are those of all.
+
+        Args:
+            p: what was solved. at: design to predict from, shape of `p.design`.
+            groups: indices of the sessions that are left out together; each session is in one group.
+            extra: variance of the predictor of a session whose group is left out, beside that of its noise, [K].
+            weights: of the regressions, [K]; by default by the evidence of what is left.
+        """
+        group, surprise = np.zeros(len(p.y), dtype=np.int64), np.zeros((len(self.mode), len(groups)))
+        for g, members in enumerate(groups):
+            group[members] = g
+        each = np.zeros((len(self.mode), len(p.y)))
+        for k in range(len(self.mode)):
+            theta, surprise[k] = self._without(p.only(k), k, _padded(groups))
+            eta = np.einsum("nmq,nq->nm", at[k], theta[group])
+            each[k] = mean_of(p.kind, eta, p.parts, float(self.dispersion[k]), float(extra[k]))
+        left = self.log_evidence[:, None] - surprise
+        shares = np.exp(left - left.max(0)) if weights is None else np.tile(weights[:, None], len(groups))
+        return np.asarray(np.sum((shares / shares.sum(0))[:, group] * each, axis=0), dtype=np.float64)
+
+    def _without(self, one: Problem, k: int, members: Indices) -> tuple[Floats, Floats]:
+        """Mode of regression k without each of G groups, [G, q], and the log density of the group given the rest, [G]; members [G, m]."""
+        mode, dispersion = self.mode[k : k + 1], self.dispersion[k : k + 1]
+        jacobian, weight, residual = (v[0] for v in _terms(one, mode, dispersion))
+        root, there = np.sqrt(weight), members >= 0
+        reach = np.where(there[..., None], (root[:, None] * (jacobian @ self.factor[k]))[members], 0.0)
+        away = np.where(there, (residual / root)[members], 0.0)
+        # leverages of a group: of a session alone its own; below 1 because of the prior, which a weak one may not show in numbers
+        leverage, axes = np.linalg.eigh(reach @ np.swapaxes(reach, 1, 2))
+        rest = 1 - np.minimum(leverage, 0.99)
+        turned = np.einsum("gmj,gm->gj", axes, away)
+        moved = np.einsum("gmq,gmj,gj->gq", reach, axes, turned / rest)
+        fit = log_likelihood(one.kind, one.y, one.size, _eta(one, mode), one.parts, dispersion)[0]
+        density = np.where(there, fit[members], 0.0).sum(1) + 0.5 * (np.log(rest) - turned**2 * (1 - rest) / rest).sum(1)
+        return mode - moved @ self.factor[k].T, density
+
+
+def _padded(groups: Sequence[Indices]) -> Indices:
+    """Indices of groups side by side, [G, m]; -1 where a group has fewer."""
+    result = np.full((len(groups), max(len(g) for g in groups)), -1, dtype=np.int64)
+    for row, members in zip(result, groups, strict=True):
+        row[: len(members)] = members
+    return result
 
 
 def solve(p: Problem) -> Solved:

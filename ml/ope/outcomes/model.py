@@ -7,14 +7,16 @@ coefficients, and what the model gets wrong for both cancels in their difference
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings
+from ml.ope.estimate import OUTCOMES
 from ml.ope.outcomes.minutes import ABOVE, BETA, Minutes, of_buffer
-from ml.ope.outcomes.regressions import ORDER, WIDER, Outcome, Regression, Sessions, burden_of, fit
+from ml.ope.outcomes.regressions import ORDER, WIDER, Left, Outcome, Regression, Sessions, burden_of, fit
 from ml.ope.scale import FEWEST_OUTCOMES, outcome_table
 from ml.trajectories import ReplayBuffer
 
@@ -28,6 +30,24 @@ RANGES = {1: (0.0, np.inf), 2: (1.0, 10.0), 3: (0.0, 100.0)}
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """What is said of sessions that are left out; columns are r_end, grasp, rating and tremor.
+
+    Attributes:
+        predicted: [n, 4]; NaN where there is none.
+        mean: what to say without a model, [n, 4]: the mean of the sessions, for a left-out visit that of the other visits; NaN where none
+            is known.
+        residual: root mean squared error, [4]; of sessions 0 where unseen, of visits NaN where unseen or where there is one visit.
+        skill: 1 - squared error / that of saying the mean, [4]; NaN where unseen.
+    """
+
+    predicted: Floats
+    mean: Floats
+    residual: Floats
+    skill: Floats
+
+
+@dataclass(frozen=True)
 class EndModel:
     """Outcomes of sessions; columns of every result are r_end, grasp, rating and tremor in their units.
 
@@ -38,10 +58,9 @@ class EndModel:
         sessions: of the buffer.
         draws: D.
         seen: outcomes that are predicted; r_end where every QoC that counts in it is, or where none counts.
-        skill: 1 - leave-one-session-out error / variance, [4]; NaN where unseen.
-        residual: root mean squared leave-one-session-out error, [4]; 0 where unseen.
+        by_session: predictions of sessions from all others; ratings given the tremor that the session had. by_visit: from the other visits,
+            as a day to come is predicted.
         day_share: share of an outcome's unexplained variance that sessions of one visit have in common, [4]; NaN where unseen.
-        left_out: leave-one-session-out predictions, [n, 4]; NaN where there is none.
     """
 
     constants: Floats
@@ -52,10 +71,9 @@ class EndModel:
     sessions: Sessions
     draws: int
     seen: tuple[bool, ...]
-    skill: Floats
-    residual: Floats
+    by_session: LeftOut
+    by_visit: LeftOut
     day_share: Floats
-    left_out: Floats
 
     def predict(self, minutes: Minutes, own: Sessions | None = None) -> Floats:
         """Posterior mean [..., 4] of sessions of any leading shape on a new day; with `own` their last axis is those sessions."""
@@ -121,6 +139,19 @@ class EndModel:
         outcomes[..., 0] = outcomes[..., 1:] @ self.constants if self.seen[0] else self.unseen[0]
         return outcomes
 
+    def predictability(self) -> dict[str, dict[str, float | None]]:
+        """Errors and skill of left-out sessions and visits, JSON-able, by outcome: those that are predicted, r_end where a QoC counts."""
+        return {
+            name: {
+                "session_error": _rounded(self.by_session.residual[j]),
+                "session_skill": _rounded(self.by_session.skill[j]),
+                "visit_error": _rounded(self.by_visit.residual[j]),
+                "visit_skill": _rounded(self.by_visit.skill[j]),
+            }
+            for j, name in enumerate(OUTCOMES)
+            if self.seen[j] and (j > 0 or self.constants.any())
+        }
+
     def ordered(self) -> list[tuple[Outcome, Regression]]:
         """The regressions in the order in which they are predicted."""
         return [(outcome, self.regressions[outcome]) for outcome in ORDER if outcome in self.regressions]
@@ -157,18 +188,22 @@ def fit_end_model(buffer: ReplayBuffer, draws: int = 0, seed: int = 0, severity:
         if known[column] < FEWEST_OUTCOMES:
             continue
         y = table[:, column] / (100.0 if outcome == "tremor" else 1.0)
-        tremor = _filled(table[:, 3] / 100.0) if outcome == "rating" and "tremor" in regressions else None
-        regressions[outcome] = fit(outcome, y, minutes, burden, tremor, sessions, size, draws, wider, rng)
+        tremor: Floats | None = None
+        said: Floats | None = None
+        if outcome == "rating" and "tremor" in regressions:
+            tremor = _filled(table[:, 3] / 100.0)
+            said = _put(tremor, regressions["tremor"])
+        regressions[outcome] = fit(outcome, y, minutes, burden, tremor, sessions, size, draws, wider, rng, said)
     seen = (
         all(outcome in regressions or constants[column - 1] == 0 for outcome, column in COLUMN.items()),
         *(outcome in regressions for outcome in ("grasp", "rating", "tremor")),
     )
     unseen = np.array([float(np.nanmean(column)) if np.isfinite(column).any() else 0.0 for column in table.T])
-    skill, residual, left_out = _left_out(table, regressions, constants, seen)
+    by_session, by_visit = (_left_out(how, table, regressions, constants, seen, visit) for how in ("session", "visit"))
     share = np.full(4, np.nan)
     for outcome, r in regressions.items():
         share[COLUMN[outcome]] = r.day_share
-    return EndModel(constants, regressions, unseen, centre, spread, sessions, draws, seen, skill, residual, share, left_out)
+    return EndModel(constants, regressions, unseen, centre, spread, sessions, draws, seen, by_session, by_visit, share)
 
 
 def _constants(settings: MdpSettings) -> Floats:
@@ -187,21 +222,42 @@ def _filled(values: Floats) -> Floats:
     return np.where(np.isfinite(values), values, np.nanmean(values))
 
 
+def _put(values: Floats, r: Regression) -> Floats:
+    """Values of all sessions, [n], with what a regression says of left-out visits, where it says something."""
+    result, said = values.copy(), r.left_out["visit"]
+    result[r.sessions] = np.where(np.isfinite(said), said, values[r.sessions])
+    return result
+
+
 def _left_out(
-    table: Floats, regressions: dict[Outcome, Regression], constants: Floats, seen: tuple[bool, ...]
-) -> tuple[Floats, Floats, Floats]:
-    """Skill and root mean squared error of leave-one-session-out predictions, [4] each, and the predictions, [n, 4]."""
+    how: Left,
+    table: Floats,
+    regressions: Mapping[Outcome, Regression],
+    constants: Floats,
+    seen: tuple[bool, ...],
+    visit: NDArray[np.int64],
+) -> LeftOut:
     predicted = np.full(table.shape, np.nan)
     for outcome, r in regressions.items():
-        predicted[r.sessions, COLUMN[outcome]] = r.left_out * (100.0 if outcome == "tremor" else 1.0)
+        predicted[r.sessions, COLUMN[outcome]] = r.left_out[how] * (100.0 if outcome == "tremor" else 1.0)
     counted = np.flatnonzero(constants) + 1
     predicted[:, 0] = predicted[:, counted] @ constants[counted - 1]
-    skill, residual = np.full(4, np.nan), np.zeros(4)
+    rest = [visit != v if how == "visit" else np.ones(len(visit), dtype=bool) for v in visit]
+    mean = np.array([[_mean(column[others]) for column in table.T] for others in rest])
+    skill, residual = np.full(4, np.nan), np.zeros(4) if how == "session" else np.full(4, np.nan)
     for j in range(4):
-        both = np.isfinite(table[:, j]) & np.isfinite(predicted[:, j])
+        both = np.isfinite(table[:, j]) & np.isfinite(predicted[:, j]) & np.isfinite(mean[:, j])
         if not seen[j] or not both.any():
             continue
-        error = float(np.mean((table[both, j] - predicted[both, j]) ** 2))
-        variance = float(table[both, j].var())
-        residual[j], skill[j] = np.sqrt(error), 1 - error / variance if variance > 0 else 0.0
-    return skill, residual, predicted
+        error, without = (float(np.mean((table[both, j] - values[both, j]) ** 2)) for values in (predicted, mean))
+        residual[j], skill[j] = np.sqrt(error), 1 - error / without if without > 0 else 0.0
+    return LeftOut(predicted, mean, residual, skill)
+
+
+def _mean(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else float("nan")
+
+
+def _rounded(value: float) -> float | None:
+    return round(float(value), 4) if np.isfinite(value) else None

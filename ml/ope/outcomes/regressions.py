@@ -10,6 +10,7 @@ Priors are weak and say which way effects are expected to go; units are Hz, poin
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Final, Literal
@@ -22,6 +23,9 @@ from ml.ope.outcomes.minutes import ABOVE, BETA, DOSE, OVER, SHAPES, Minutes
 
 Floats = NDArray[np.float64]
 Outcome = Literal["tremor", "grasp", "rating"]
+
+Left = Literal["session", "visit"]
+"""What is left out at a time: a session, of whose visit the others are known, or a visit, as a day to come is predicted."""
 
 ORDER: Final[tuple[Outcome, ...]] = ("tremor", "grasp", "rating")
 """In which outcomes are predicted: the rating follows the tremor."""
@@ -83,7 +87,8 @@ class Regression:
 
     Attributes:
         outcome: which. columns: names of the fixed ones. members, weights: of the posterior mean. drawn: draws of the posterior.
-        left_out: prediction of each fitted session from all others, natural unit (a share for tremor), [n]. sessions: their indices.
+        left_out: prediction of each fitted session from others, natural unit (a share for tremor), [n] by what is `Left` out with it.
+        sessions: indices of the fitted sessions, [n].
         day_share: posterior mean of the visits' share in what sessions of one shape differ by; on the scale of the predictor.
     """
 
@@ -92,7 +97,7 @@ class Regression:
     members: tuple[Member, ...]
     weights: Floats
     drawn: tuple[Member, ...]
-    left_out: Floats
+    left_out: Mapping[Left, Floats]
     sessions: NDArray[np.int64]
     day_share: float
 
@@ -159,11 +164,13 @@ def fit(
     draws: int,
     wider: float,
     rng: np.random.Generator,
+    tremor_left_out: Floats | None = None,
 ) -> Regression:
     """Posterior of one outcome.
 
     Args:
         y: of every session, [n], NaN where not measured; a share for tremor. tremor: measured shares that the rating follows, [n].
+        tremor_left_out: the same as predicted of left-out visits, [n]: a day to come has not shown its tremor either.
         size: minutes of each session, [n]. draws, wider: of the posterior, see `WIDER`.
     """
     known = np.flatnonzero(np.isfinite(y))
@@ -202,7 +209,24 @@ def fit(
     drawn = tuple(member(k, theta, float(found.dispersion[k])) for k, theta in _drawn(found, weights, draws, wider, rng))
     noise = found.dispersion * (np.pi**2 / 3 / np.mean(size) if outcome == "tremor" else 1.0)
     share = float(weights @ (day**2 / (day**2 + noise)))
-    return Regression(outcome, names, members, weights[kept], drawn, found.left_out(problem, weights), known, share)
+    at = problem.design
+    if tremor_left_out is not None:
+        at = at.copy()
+        at[..., names.index("tremor")] = tremor_left_out[known, None]
+    left = _left_out(found, problem, weights, at, sessions.visit[known], day**2)
+    return Regression(outcome, names, members, weights[kept], drawn, left, known, share)
+
+
+def _left_out(found: Solved, problem: Problem, weights: Floats, at: Floats, visit: NDArray[np.int64], day: Floats) -> dict[Left, Floats]:
+    """`Regression.left_out` of n sessions of the visits [n]; NaN where only one visit is there to be left out.
+
+    Args:
+        weights: of the regressions, given all, [K]. at: their design with the tremor as predicted of left-out visits. day: variances, [K].
+    """
+    each = [np.array([i]) for i in range(len(visit))]
+    visits = [np.flatnonzero(visit == v) for v in np.unique(visit)]
+    by_visit = found.left_out(problem, at, visits, day) if len(visits) > 1 else np.full(len(visit), np.nan)
+    return {"session": found.left_out(problem, problem.design, each, 0.0 * day, weights), "visit": by_visit}
 
 
 def _drawn(found: Solved, weights: Floats, draws: int, wider: float, rng: np.random.Generator) -> list[tuple[int, Floats]]:

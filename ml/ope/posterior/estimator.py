@@ -142,6 +142,7 @@ class FittedPosterior:
         replays, supports, draws = self.joint(everyone, horizon, report)
         skill = ordering_skill(self.buffer, self.predictions, self.equal, self.ends, self.levels)
         common = {"skill": skill.to_json(), "return_noise": round(return_noise(self.buffer, horizon), 4)}
+        common["left_out_outcomes"] = self.ends.predictability()
         look, found = AmplitudeSupport(self.buffer), {}
         moved = self._moved_as_measured(chosen, replays, horizon)
         for i, name in enumerate(names[:-1]):

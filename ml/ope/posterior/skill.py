@@ -93,7 +93,7 @@ def _better(was: Floats, said: Floats, equal: Floats) -> bool:
 def _outcomes_told(buffer: ReplayBuffer, ends: EndModel) -> bool:
     """Whether an outcome of left-out sessions is predicted better than by the other sessions, however much those of its visit count."""
     table, visits = outcome_table(buffer), np.array([s.visit for s in buffer.sessions])
-    return any(_outcome_told(table[:, j], ends.left_out[:, j], visits) for j in COLUMN.values() if ends.seen[j])
+    return any(_outcome_told(table[:, j], ends.by_session.predicted[:, j], visits) for j in COLUMN.values() if ends.seen[j])
 
 
 def _outcome_told(found: Floats, predicted: Floats, visits: NDArray[np.int64]) -> bool:

@@ -83,9 +83,11 @@ def test_a_good_day_that_chanced_upon_low_amplitudes_is_not_taken_for_their_meri
     share = fit_end_reward(replace(data, sessions=tuple(moved)))
     assert share is not None
     assert told_at(share, 0.8) - told_at(share, 0.2) == pytest.approx(6.0, abs=3.0)
+    assert share.visit_skill < 0 < share.skill, "days that differ so much cannot be foretold"
     as_one_day = fit_end_reward(replace(data, sessions=tuple(replace(s, visit=1) for s in moved)))
     line = np.polyfit([s.amplitude.mean() for s in moved], [s.end_reward(SETTINGS) for s in moved], 1)
     assert as_one_day is not None
+    assert as_one_day.visit_skill is None
     hidden = told_at(as_one_day, 0.8) - told_at(as_one_day, 0.2)
     assert hidden == pytest.approx(0.6 * line[0], abs=1.0), "without days it tells what a line through all sessions tells"
     assert hidden < 0, "over all days together the good day turns round what the amplitude brings"
@@ -98,6 +100,16 @@ def test_a_noisy_rating_does_not_drown_what_the_grasp_tells():
     share = fit_end_reward(replace(data, sessions=noisy))
     assert share is not None
     assert told_at(share, 0.8) - told_at(share, 0.2) == pytest.approx(12.0, abs=4.0)
+
+
+def test_what_only_left_out_visits_show_is_shared_too():
+    rng = np.random.default_rng(24)
+    data = buffer(lambda a, beta: 1.5 + 0.4 * a.mean() + 0.25 * rng.standard_normal(), sessions=18, seed=24)
+    visits = rng.permutation(18) % 3
+    share = fit_end_reward(replace(data, sessions=tuple(replace(s, visit=int(v)) for s, v in zip(data.sessions, visits, strict=True))))
+    assert share is not None
+    assert share.skill < 0 < share.visit_skill
+    assert told_at(share, 0.8) > told_at(share, 0.2)
 
 
 def test_without_enough_sessions_or_without_any_relation_nothing_is_shared():

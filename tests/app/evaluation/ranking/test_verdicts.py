@@ -351,6 +351,18 @@ def test_the_fold_tells_statistical_error_from_what_structures_get_wrong(client:
     assert "4.56" not in above_fold(page)
 
 
+def test_the_fold_says_how_well_outcomes_of_a_day_to_come_are_predicted(client: TestClient, policies: list[int], judge: Judge) -> None:
+    told = judged(50.0)
+    grasp = {"session_error": 0.21, "session_skill": 0.9, "visit_error": 0.43, "visit_skill": 0.62}
+    told["details"]["left_out_outcomes"] = {"grasp_hz": grasp, "rating": dict.fromkeys(grasp)}
+    judge({policies[0]: told})
+    page = client.get(PAGE).text
+    (table,) = [part for part in page.split("<table")[1:] if "<caption>Errors of predicted outcomes" in part]
+    rows = re.findall(r'<tr><td>([^<]*)</td><td class="num">([^<]*)</td><td class="num">([^<]*)</td><td class="num">([^<]*)</td>', table)
+    assert rows == [("Grasp (Hz)", "0.21", "0.43", "0.62"), ("Rating (points)", "—", "—", "—")]
+    assert "0.43" not in above_fold(page)
+
+
 def test_a_serious_event_is_unsafe_without_a_posterior_and_of_a_retired_policy_too() -> None:
     given = Circumstances(1, datetime(2026, 1, 1, tzinfo=UTC), MarginsVersion(), MarginsVersion(), None, {}, Place(0.3), None)
     found = decide({}, {}, "dlsm", given, 7, adverse_event=True)

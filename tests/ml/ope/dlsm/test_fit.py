@@ -253,7 +253,7 @@ def test_more_stimulation_lowers_the_beta_that_a_free_running_model_draws(linear
 def test_outcomes_are_read_from_what_predicts_r_end_of_left_out_sessions_better(small_buffer):
     fitted = Dlsm(TINY).fit(small_buffer)
     latent = float(np.mean(np.concatenate([np.asarray(c.residual_end) for c in fitted.checks]) ** 2))
-    assert fitted.end_source == ("latent" if latent <= fitted.end.residual[0] ** 2 else "summaries")
+    assert fitted.end_source == ("latent" if latent <= fitted.end.by_session.residual[0] ** 2 else "summaries")
     exact = replace(fitted, end=replace(fitted.end, residual=np.zeros(4)))
     useless = replace(fitted, end=replace(fitted.end, residual=np.full(4, 1e6)))
     assert (exact.end_source, useless.end_source) == ("summaries", "latent")

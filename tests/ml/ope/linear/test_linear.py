@@ -124,7 +124,7 @@ def test_outcomes_that_follow_the_mean_amplitude_are_learnt_and_kept_in_their_ra
     assert predicted[1, 1] == pytest.approx(2.0, abs=0.12)
     assert predicted[:, 2] == pytest.approx(5.0, abs=0.3)
     assert (predicted[:, 3] <= 100).all()
-    assert model.skill[1] > 0.9
+    assert model.by_session.skill[1] > 0.9
 
 
 def test_a_buffer_without_outcomes_still_gives_a_step_return(small_buffer):
