@@ -2,6 +2,7 @@
 
     python benchmarks/population.py --quick              speed, and what part A holds in a tenth of its worlds
     python benchmarks/population.py --out FOLDER         speed, the whole part, designs on every tenth world; figure FOLDER/designs.svg
+    python benchmarks/population.py --part B --every 6   the same of part B, designs on every sixth world; each run is counted
 
 The designs are compared by what the linear model, which has no tuning, makes of their data: rank correlation with true returns over the
 candidates, after one, two and three visits of the same minutes. CPU seconds of one thread.
