@@ -6,12 +6,13 @@ from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime
 from typing import Any, NamedTuple
 
-from sqlalchemy import ColumnElement, and_, or_, select, text
+from sqlalchemy import ColumnElement, and_, func, or_, select, text
 from sqlalchemy.orm import Session, defer
 
 from app.evaluation.models import EstimateRow, Evaluation
 from app.learning.models import Policy
 from app.platform.audit import AuditEvent
+from app.study.models import Participant
 
 Rows = list[dict[str, Any]]
 
@@ -19,6 +20,21 @@ Rows = list[dict[str, Any]]
 def newest_evaluation(db: Session, participant_id: int) -> Evaluation | None:
     """The participant's last evaluation; its estimates, with all their draws, are read when something asks for them."""
     return db.scalar(select(Evaluation).where(Evaluation.participant_id == participant_id).order_by(Evaluation.id.desc()).limit(1))
+
+
+def diagnostics_of_others(db: Session, participant: Participant, member: str) -> dict[int, dict[str, Any]]:
+    """One member of the diagnostics of the newest evaluation of every other participant of the site who has not withdrawn, by its number.
+
+    Evaluations without that member are left out.
+    """
+    newest = (
+        select(func.max(Evaluation.id))
+        .join(Participant, Participant.id == Evaluation.participant_id)
+        .where(Participant.site_id == participant.site_id, Participant.id != participant.id, Participant.status != "withdrawn")
+        .group_by(Evaluation.participant_id)
+    )
+    query = select(Evaluation.id, Evaluation.diagnostics[member].label("said")).where(Evaluation.id.in_(newest)).order_by(Evaluation.id)
+    return {row.id: row.said for row in db.execute(query) if row.said}
 
 
 def lock_job(db: Session, job_id: str) -> None:

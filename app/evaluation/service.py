@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from app.evaluation import repository
 from app.evaluation.estimates import coverage as checks
-from app.evaluation.estimates import held_out
+from app.evaluation.estimates import dose_shapes, held_out
 from app.evaluation.estimates.held_out import combined, widened
 from app.evaluation.estimates.rows import row_of
 from app.evaluation.models import Evaluation
@@ -78,7 +78,7 @@ def store_evaluation(
         db: the session. job_id: the job. created_by: who asked for it.
         snapshot: what all estimates rest on. horizon_steps: H.
         candidates: ids of the policies that are ranked; the others are references.
-        results: by method `{"estimates": {policy id: Estimate.to_json()}}`, or `{"failed": reason}`.
+        results: by method `{"estimates": {policy id: Estimate.to_json()}}`, of the posterior with `dose_shapes`, or `{"failed": reason}`.
         config: how the methods ran; where its `methods` name the combination, that is computed here from the others.
         skill: what `choose_method` found out on left-out controllers: it widens the intervals of the single methods.
         coverage: what `check_coverage` found out; a policy that it refuses is not supported by the data, whatever a method says of it.
@@ -122,6 +122,7 @@ def store_evaluation(
             "candidates": list(candidates),
             held_out.STORED: held_out.stored(skill, able),
             checks.STORED: dict(coverage or {}),
+            dose_shapes.STORED: dict(results.get(POSTERIOR, {}).get(dose_shapes.STORED, {})),
         },
         code_version=jobs.code_version(),
         created_by=created_by,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from app.platform.web.charts import counted
 from ml.ope.flags import TEXT, Flag
@@ -62,6 +63,20 @@ def _thin(flag: Flag) -> str:
     span = dict(flag.facts)
     logged = f" (logged steps span {span['low']:.2f} to {span['high']:.2f})" if span else ""
     return f"{_refusal(flag)}in {percent(flag.value)} of steps the policy asks for amplitudes with hardly any logged step near them{logged}"
+
+
+def shape_pooling(outcome: str, told: Mapping[str, Any]) -> str:
+    """What came of pooling an outcome's dose shapes over participants (`ml.ope.outcomes.pooling.Proof.to_json`), for engineers."""
+    n, gain, error = told["participants"] - 1, told["gain"], told["standard_error"]
+    others, needed = counted(n, "other participant"), told["fewest"] - 1
+    if n < needed:
+        has = "has" if n == 1 else "have"
+        return f"{outcome}: not pooled, because {others} of the site {has} an evaluation that tells of it, and {needed} are needed"
+    size = f"{signed(gain, 2)} ± {error:.2f} nats"
+    if told["used"]:
+        own = signed(told["own_gain"], 2)
+        return f"{outcome}: dose shapes pooled with {others}: gain {size} for whoever is left out, {own} for this participant"
+    return f"{outcome}: not pooled with {others}, because it does not help whoever is left out: gain {size}"
 
 
 OUTCOME_NAMES = {"grasp_hz": "grasp", "rating": "rating", "tremor_percent": "tremor"}

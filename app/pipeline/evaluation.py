@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.evaluation import repository, service
-from app.evaluation.estimates import compute
+from app.evaluation.estimates import compute, dose_shapes
 from app.evaluation.ranking.results import driven_sessions, tests_of
 from app.evaluation.schemas import EvaluateParams
 from app.learning.models import BufferSnapshot
@@ -17,6 +17,7 @@ from app.learning.snapshots.buffers import read_buffer
 from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, acting, participant_of, plan_on_snapshot
 from app.platform import files
 from app.platform.jobs import JobContext
+from app.study.repository import settings_version
 from ml.ope.registry import AGGREGATE, POSTERIOR, shown
 
 FIT_WEIGHT = 15.0
@@ -81,7 +82,8 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
         row = db.get_one(BufferSnapshot, snapshot["id"])
         candidates = service.policies_to_rank(db, row.participant_id, params)
         buffer = read_buffer(row.file_sha256)
-        references = ensure_baselines(db, participant_of(db, job), row, buffer, job.created_by)
+        participant = participant_of(db, job)
+        references = ensure_baselines(db, participant, row, buffer, job.created_by)
         horizon = params.horizon_steps or row.median_steps
         everyone = (*candidates, *references)
         ran = driven_sessions(db, row, acting(job))
@@ -92,6 +94,7 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
             "policies": [{"id": p.id, "sha256": p.onnx_sha256} for p in everyone],
             "horizon_steps": horizon,
             "tests": tests_of(ran, buffer.settings, horizon, {p.id for p in everyone}),
+            "others": dose_shapes.of_others(db, participant, settings_version(db, row.settings_version_id)),
         }
 
     chosen = job.transact("choose-policies", choose)
@@ -103,7 +106,9 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
         "policies": chosen["policies"],
     }
     methods = _fitted(params)
-    own: dict[str, dict[str, Any]] = {"dlsm": models, POSTERIOR: {"tests": chosen["tests"]}}
+    others = chosen.get("others")  # a job that an earlier version began does not have it
+    pooled = {"others": others["evidence"]} if others else {}
+    own: dict[str, dict[str, Any]] = {"dlsm": models, POSTERIOR: {"tests": chosen["tests"]} | pooled}
     calls: list[ComputeStep] = [(COVERAGE_STEP, "check_coverage", common)]
     calls += [(f"estimate/{method}", "evaluate_method", common | {"method": method} | own.get(method, {})) for method in methods]
     calls.append((SKILL_STEP, "choose_method", common | {"methods": params.methods, "policies": chosen["ran"]}))
@@ -119,7 +124,9 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
             horizon_steps=chosen["horizon_steps"],
             candidates=chosen["candidates"],
             results=results,
-            config=params.model_dump(mode="json") | {"dlsm_members": models.get("members", [])},
+            config=params.model_dump(mode="json")
+            | {"dlsm_members": models.get("members", [])}
+            | ({"pooled_evaluations": others["evaluations"]} if others else {}),
             skill=skill,
             coverage=coverage,
         )

@@ -141,6 +141,7 @@ class SettingsVersion(Base):
     design_ladder: Mapped[bool] = mapped_column(server_default="false")
     early_visits: Mapped[int] = mapped_column(SmallInteger, server_default="3")
     pool_programmings: Mapped[bool] = mapped_column(server_default="false")
+    pool_shapes: Mapped[bool] = mapped_column(server_default="false")
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
@@ -212,9 +213,8 @@ _PLANS = sa.table("plan", *(sa.column(name) for name in ("visit_id", "status", "
 _BLINDED = (_PLANS.c.visit_id == Visit.id, _PLANS.c.status == "approved", _PLANS.c.blinded)
 # plans belong to a later phase, and of their table only the key is needed here; a column of the visit costs a list of visits no query
 Visit.sealed = column_property(sa.exists().where(*_BLINDED, _PLANS.c.key_opened_at.is_(None)).correlate(Visit.__table__))
-Visit.unsealed_at = column_property(
-    sa.select(func.max(_PLANS.c.key_opened_at)).where(*_BLINDED).correlate(Visit.__table__).scalar_subquery()
-)
+_OPENED = sa.select(func.max(_PLANS.c.key_opened_at)).where(*_BLINDED)
+Visit.unsealed_at = column_property(_OPENED.correlate(Visit.__table__).scalar_subquery())
 
 
 class VisitLock(Base):

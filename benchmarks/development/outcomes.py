@@ -2,10 +2,12 @@
 
     python -m benchmarks.development.outcomes                  every second world of part A, both designs
     python -m benchmarks.development.outcomes --participants   the four detailed participants: three visits, all visits of six data seeds
+    python -m benchmarks.development.outcomes --pooled --out FOLDER   dose shapes pooled over cohorts of part A; resumable
 
 A model that is fitted to the data sees beta and amplitudes of simulated sessions of the candidates on new days and predicts their mean
 outcomes, which are known. Left-out visits are sessions of the data; beside them stand the mean of the other visits and that of the very
-visit, which no method can know. Nothing is fitted or chosen by what is true. CPU seconds of one thread.
+visit, which no method can know. Nothing is fitted or chosen by what is true. What `--pooled` measures stands in
+`benchmarks/support/pooled_shapes.py`. CPU seconds of one thread.
 """
 
 from __future__ import annotations
@@ -13,13 +15,18 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+import torch
 
+from benchmarks.support.cells import Cells
 from benchmarks.support.ope_policies import fixed_policies
+from benchmarks.support.pooled_shapes import COHORTS, cohorts_pooled
 from benchmarks.support.simulators import VISITS
 from benchmarks.support.simulators import WORLDS as SIMULATORS
 from ml.mdp import MdpSettings
@@ -122,14 +129,28 @@ def left_out_visits(buffer: ReplayBuffer) -> np.ndarray:
     return np.sqrt(np.nanmean(np.concatenate(squares, axis=1), axis=1))
 
 
+def pooled(out: Path, cohorts: int, quick: bool) -> None:
+    """What pooling dose shapes does in cohorts of virtual patients; finished ones are kept in a folder."""
+    torch.set_num_threads(1)
+    out.mkdir(parents=True, exist_ok=True)
+    found = cohorts_pooled(Cells(out / f"pooled{'-quick' if quick else ''}.jsonl"), cohorts, quick)
+    sys.stdout.write(json.dumps({"name": "pooled_shapes", "figures": found, "ratios": {}, "baseline": "no pooling"}) + "\n")
+
+
 def main() -> None:
     """Print tables and, as the last line, one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--participants", action="store_true")
+    parser.add_argument("--pooled", action="store_true", help="cohorts in which dose shapes are pooled, instead")
+    parser.add_argument("--cohorts", type=int, default=COHORTS, help="with --pooled: cohorts of each kind")
+    parser.add_argument("--out", type=Path, help="with --pooled: folder of finished cohorts; a temporary one by default")
     parser.add_argument("--every", type=int, default=2, help="every n-th world")
     parser.add_argument("--sessions", type=int, help="true sessions of each policy; 80, or 40 of participants")
     parser.add_argument("--quick", action="store_true", help="three worlds, or few true sessions of participants")
     chosen = parser.parse_args()
+    if chosen.pooled:
+        pooled(chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-pooled-")), chosen.cohorts, chosen.quick)
+        return
     if chosen.quick:
         chosen.every, chosen.sessions = 20, chosen.sessions or 20
     cases = participants(chosen.sessions or 40) if chosen.participants else worlds(chosen.every, chosen.sessions or 80)

@@ -63,7 +63,9 @@ def policies(client: TestClient, upload: Upload, begin_with: Callable[[str, Call
 def judge(db: Session, policies: list[int]) -> Callable[..., int]:
     """Store an evaluation with the posterior of policies by id, and that of cDBS beside them."""
 
-    def store(posterior: dict[int, dict[str, Any]], reference: dict[str, Any] | None = None, **more: Any) -> int:
+    def store(
+        posterior: dict[int, dict[str, Any]], reference: dict[str, Any] | None = None, shapes: dict[str, Any] | None = None, **more: Any
+    ) -> int:
         db.rollback()
         participant = participant_by_code(db, "P1", SYSTEM)
         snapshot = take_snapshot(db, participant, SYSTEM)
@@ -77,7 +79,7 @@ def judge(db: Session, policies: list[int]) -> Callable[..., int]:
             snapshot=snapshot,
             horizon_steps=snapshot.median_steps,
             candidates=list(posterior),
-            results={"posterior": {"estimates": table}},
+            results={"posterior": {"estimates": table} | ({"dose_shapes": shapes} if shapes else {})},
             config={},
             **more,
         )

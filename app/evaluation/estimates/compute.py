@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from app.evaluation.estimates import dose_shapes
 from app.learning.snapshots.buffers import read_buffer
 from app.platform import files
 from app.platform.jobs import StepReport, write_atomically
@@ -18,7 +19,7 @@ from ml.ope.compare.skill import choose_default
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.posterior.further_sessions import session_noise
 from ml.ope.posterior.gaussian import TestedDifference
-from ml.ope.registry import AGGREGATE, Size, build, estimators, quick_estimators
+from ml.ope.registry import AGGREGATE, POSTERIOR, Size, build, estimators, quick_estimators
 from ml.ope.support.behaviour_map import behaviour_map
 from ml.ope.support.diagnostics import diagnose
 from ml.policies.onnx_policy import OnnxPolicy
@@ -27,7 +28,7 @@ from ml.trajectories import ReplayBuffer
 
 if TYPE_CHECKING:
     from ml.ope.dlsm.estimator import Dlsm
-    from ml.ope.posterior.estimator import Posterior
+    from ml.ope.posterior.estimator import FittedPosterior, Posterior
 
 FIT_SHARE = 0.5
 """Share of an evaluation step's progress that fitting takes."""
@@ -78,12 +79,14 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -
     Args:
         params: `snapshot_sha256`, `preset`, `seed`, `method`, `horizon_steps`, `policies` as [{`id`, `sha256`}], and for the DLSM
             `members`, the stored files of its ensemble; or `failed`, the reason why its ensemble could not be fitted; for the posterior
-            `tests`, tested sessions as the fields of `TestedDifference`.
+            `tests`, tested sessions as the fields of `TestedDifference`, and `others`, of every participant whose dose shapes are pooled
+            the log evidence by outcome; absent where none are to be.
         workdir: scratch.
         report: progress, and learning curves where the method trains a network.
 
     Returns:
-        `estimates` by policy id, or `failed` with the reason where the method cannot work on these data.
+        `estimates` by policy id, of the posterior `dose_shapes` too, or `failed` with the reason where the method cannot work on these
+        data.
     """
     if "failed" in params:
         return {"failed": params["failed"]}
@@ -91,6 +94,8 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -
     estimator = build(params["method"], params["seed"], _size(params))
     if params.get("tests"):
         estimator = cast("Posterior", estimator).with_tests([TestedDifference(**test) for test in params["tests"]])
+    if params.get("others") is not None:
+        estimator = cast("Posterior", estimator).with_others(params["others"])
     for k, sha256 in enumerate(params.get("members", [])):
         write_atomically(workdir / member_file(k), files.read(sha256))
     policies = _policies(params["policies"], buffer)
@@ -114,7 +119,10 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -
         estimates = fitted.evaluate(policies, params["horizon_steps"], rolling)
     except ValueError as error:
         return {"failed": said_of(error, report.log)}
-    return {"estimates": {policy_id: _finite(e.to_json()) for policy_id, e in estimates.items()}}
+    result: dict[str, Any] = {"estimates": {policy_id: _finite(e.to_json()) for policy_id, e in estimates.items()}}
+    if params["method"] == POSTERIOR:
+        result[dose_shapes.STORED] = dose_shapes.found(cast("FittedPosterior", fitted))
+    return result
 
 
 def check_coverage(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.evaluation import verdict_wording, wording
-from app.evaluation.estimates import coverage, held_out
+from app.evaluation.estimates import coverage, dose_shapes, held_out
 from app.evaluation.estimates.methods import names
 from app.evaluation.ranking import charts
 from app.evaluation.ranking import service as ranking
@@ -100,6 +100,7 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             picture=judged.picture(settings.lower_bound),
             next=what_next(judged, may_run=may_run),
             held=held_out.of_evaluation(judged.evaluation),
+            pooling=[wording.shape_pooling(o, told) for o, told in dose_shapes.pooling(judged.evaluation).items()],
             plainly=verdict_wording.plainly,
             signed=wording.signed,
             chance=wording.chance,

@@ -6,6 +6,7 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
+from app.evaluation.estimates import dose_shapes
 from app.evaluation.ranking.results import driven_sessions, tests_of
 from app.learning.models import BufferSnapshot, Policy
 from app.learning.snapshots.buffers import read_buffer
@@ -18,6 +19,7 @@ from app.pipeline.stages import PLAN, STORE_WEIGHT, acting, participant_of, plan
 from app.pipeline.training import declare_training, store_trained, tested_so_far, training_calls, training_starts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext, JobError
+from app.study.repository import settings_version
 from ml.ope.registry import POSTERIOR, shown
 
 CHOOSE = "choose-parents"
@@ -57,7 +59,8 @@ def _plan(db: Session, job: JobContext, snapshot: BufferSnapshot) -> dict[str, A
         return plan | {"posterior": {str(p.id): known[p.id] for p in tested}}
     settings = read_buffer(snapshot.file_sha256).settings
     tests = tests_of(driven_sessions(db, snapshot, acting(job)), settings, snapshot.median_steps, {p.id for p in tested})
-    return plan | {"posterior": None, "tests": tests, "horizon_steps": snapshot.median_steps}
+    others = dose_shapes.of_others(db, participant_of(db, job), settings_version(db, snapshot.settings_version_id))
+    return plan | {"posterior": None, "tests": tests, "others": others, "horizon_steps": snapshot.median_steps}
 
 
 def _starts(job: JobContext, params: NextGenerationParams, planned: dict[str, Any]) -> list[dict[str, Any]]:
@@ -79,6 +82,7 @@ def _starts(job: JobContext, params: NextGenerationParams, planned: dict[str, An
 
 def _judge(job: JobContext, params: NextGenerationParams, planned: dict[str, Any]) -> dict[str, float]:
     """The posterior returns of the tested policies with what their sessions showed."""
+    others = planned.get("others")  # a job that an earlier version began does not have it
     job.step(JUDGE, "Judge the tested policies with the sessions since the last ranking", weight=shown(POSTERIOR).weight)
     call = {
         "snapshot_sha256": planned["snapshot"]["sha256"],
@@ -88,7 +92,7 @@ def _judge(job: JobContext, params: NextGenerationParams, planned: dict[str, Any
         "horizon_steps": planned["horizon_steps"],
         "policies": [{"id": p["id"], "sha256": p["sha256"]} for p in planned["tested"]],
         "tests": planned["tests"],
-    }
+    } | ({"others": others["evidence"]} if others else {})
     found = job.compute(JUDGE, "evaluate_method", call)
     if "failed" in found:
         raise JobError(f"Which tested policy did best cannot be told: {found['failed']}. Start a 'pipeline' that names the policies.")

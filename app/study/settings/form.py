@@ -114,6 +114,11 @@ GROUPS = (
                 "tremor_as_fraction", "Tremor enters as", "As per cent, tremor would outweigh grasp a hundredfold.",
                 options=(("yes", "a fraction, 0 to 1"), ("no", "per cent, 0 to 100")),
             ),
+            SettingField(
+                "pool_shapes", "Shape of the answer to the dose",
+                "At which amplitudes an outcome begins to answer, never how much. Others count where that is shown to help.",
+                options=(("no", "from this participant alone"), ("yes", "from the site's others too")),
+            ),
         ),
     ),
     SettingGroup(

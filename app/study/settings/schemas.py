@@ -112,6 +112,11 @@ class SettingsFields(Model):
     pool_programmings: Bool = Field(
         False, description="Sessions under other contacts, pulse widths or rates than the newest enter buffers too, as another dose."
     )
+    pool_shapes: Bool = Field(
+        False,
+        description="Rankings take the shape of an outcome's answer to the dose from the site's other participants too, where leaving each "
+        "participant out shows that it helps; never its size, sign or level.",
+    )
 
 
 class SettingsIn(SettingsFields):

@@ -152,6 +152,11 @@ class EndModel:
             if self.seen[j] and (j > 0 or self.constants.any())
         }
 
+    @property
+    def shape_evidence(self) -> dict[Outcome, Floats]:
+        """Log evidence of the dose shapes of every outcome, [K], by these data alone."""
+        return {outcome: r.shape_evidence for outcome, r in self.regressions.items()}
+
     def ordered(self) -> list[tuple[Outcome, Regression]]:
         """The regressions in the order in which they are predicted."""
         return [(outcome, self.regressions[outcome]) for outcome in ORDER if outcome in self.regressions]
@@ -160,7 +165,14 @@ class EndModel:
         return np.broadcast_to(self.unseen, (*shape, 4)).copy()
 
 
-def fit_end_model(buffer: ReplayBuffer, draws: int = 0, seed: int = 0, severity: Floats | None = None, wider: float = WIDER) -> EndModel:
+def fit_end_model(
+    buffer: ReplayBuffer,
+    draws: int = 0,
+    seed: int = 0,
+    severity: Floats | None = None,
+    wider: float = WIDER,
+    shape_priors: Mapping[Outcome, Floats] | None = None,
+) -> EndModel:
     """Fit to all sessions.
 
     A controller that follows beta gives more in a bad hour, so that more stimulation seems to do worse. What it gives depends on beta
@@ -171,6 +183,7 @@ def fit_end_model(buffer: ReplayBuffer, draws: int = 0, seed: int = 0, severity:
         draws: D draws of the posterior besides its mean. seed: theirs.
         severity: that level of every session, [n], where the caller's model of beta knows it; it is adjusted for and no policy moves it.
         wider: factor on the spread of draws; 1 where the caller adds what models get wrong by itself.
+        shape_priors: log prior of the dose shapes of an outcome, [K] (`pooling`); flat of those that have none.
     """
     settings, table, minutes = buffer.settings, outcome_table(buffer), of_buffer(buffer)
     means = minutes.means[:, [BETA, ABOVE]]
@@ -193,7 +206,8 @@ def fit_end_model(buffer: ReplayBuffer, draws: int = 0, seed: int = 0, severity:
         if outcome == "rating" and "tremor" in regressions:
             tremor = _filled(table[:, 3] / 100.0)
             said = _put(tremor, regressions["tremor"])
-        regressions[outcome] = fit(outcome, y, minutes, burden, tremor, sessions, size, draws, wider, rng, said)
+        prior = (shape_priors or {}).get(outcome)
+        regressions[outcome] = fit(outcome, y, minutes, burden, tremor, sessions, size, draws, wider, rng, said, prior)
     seen = (
         all(outcome in regressions or constants[column - 1] == 0 for outcome, column in COLUMN.items()),
         *(outcome in regressions for outcome in ("grasp", "rating", "tremor")),

@@ -11,12 +11,13 @@ Priors are weak and say which way effects are expected to go; units are Hz, poin
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from ml.ope.outcomes.laplace import Kind, Problem, Solved, mean_of, solve
 from ml.ope.outcomes.minutes import ABOVE, BETA, DOSE, OVER, SHAPES, Minutes
@@ -90,6 +91,7 @@ class Regression:
         left_out: prediction of each fitted session from others, natural unit (a share for tremor), [n] by what is `Left` out with it.
         sessions: indices of the fitted sessions, [n].
         day_share: posterior mean of the visits' share in what sessions of one shape differ by; on the scale of the predictor.
+        shape_evidence: log evidence of each of `SHAPES`, [K], the likeliest 0; the data alone, whatever the prior of shapes.
     """
 
     outcome: Outcome
@@ -100,6 +102,7 @@ class Regression:
     left_out: Mapping[Left, Floats]
     sessions: NDArray[np.int64]
     day_share: float
+    shape_evidence: Floats
 
     def mean(self, member: Member, minutes: Minutes, burden: Floats, tremor: Floats | None, own: Sessions | None) -> Floats:
         """Expected outcome [...] of sessions, by one member; arguments as of `predictor`."""
@@ -165,6 +168,7 @@ def fit(
     wider: float,
     rng: np.random.Generator,
     tremor_left_out: Floats | None = None,
+    shape_prior: Floats | None = None,
 ) -> Regression:
     """Posterior of one outcome.
 
@@ -172,6 +176,7 @@ def fit(
         y: of every session, [n], NaN where not measured; a share for tremor. tremor: measured shares that the rating follows, [n].
         tremor_left_out: the same as predicted of left-out visits, [n]: a day to come has not shown its tremor either.
         size: minutes of each session, [n]. draws, wider: of the posterior, see `WIDER`.
+        shape_prior: log prior of `SHAPES`, [K]; flat where not given.
     """
     known = np.flatnonzero(np.isfinite(y))
     days = np.eye(int(sessions.visit.max()) + 1)[sessions.visit]
@@ -197,7 +202,9 @@ def fit(
         np.concatenate([np.tile(deviation**-2.0, (len(grid), 1)), np.repeat(day[:, None] ** -2.0, v, axis=1)], axis=1),
     )
     found = solve(problem)
-    weights = np.exp(found.log_evidence - found.log_evidence.max())
+    of_shapes = logsumexp(found.log_evidence.reshape(len(SHAPES), len(DAY_TIMES)), axis=1)
+    log_posterior = found.log_evidence if shape_prior is None else found.log_evidence + np.repeat(shape_prior, len(DAY_TIMES))
+    weights = np.exp(log_posterior - log_posterior.max())
     weights = np.where(weights < KEPT * weights.max(), 0.0, weights)
     weights /= weights.sum()
 
@@ -213,8 +220,9 @@ def fit(
     if tremor_left_out is not None:
         at = at.copy()
         at[..., names.index("tremor")] = tremor_left_out[known, None]
-    left = _left_out(found, problem, weights, at, sessions.visit[known], day**2)
-    return Regression(outcome, names, members, weights[kept], drawn, left, known, share)
+    left = _left_out(replace(found, log_evidence=log_posterior), problem, weights, at, sessions.visit[known], day**2)
+    evidence = np.asarray(of_shapes - of_shapes.max(), dtype=np.float64)
+    return Regression(outcome, names, members, weights[kept], drawn, left, known, share, evidence)
 
 
 def _left_out(found: Solved, problem: Problem, weights: Floats, at: Floats, visit: NDArray[np.int64], day: Floats) -> dict[Left, Floats]:

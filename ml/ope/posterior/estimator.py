@@ -20,6 +20,7 @@ from ml.ope.flags import FEW_END_REWARDS, Flag, distinct, stopped_sessions
 from ml.ope.lead import dose_before
 from ml.ope.linear.estimator import FittedLinear, LinearConfig, Replayed
 from ml.ope.outcomes.model import EndModel, fit_end_model
+from ml.ope.outcomes.pooling import Evidence, Pooled, gain, pool
 from ml.ope.posterior.constants import COMMON_SHARE, MODEL_ERRORS, VERSION, ModelError
 from ml.ope.posterior.draws import STATISTICAL, Draws, Replays, joint_draws
 from ml.ope.posterior.further_sessions import return_noise
@@ -74,15 +75,21 @@ class Posterior:
 
     Attributes:
         tests: tested sessions as differences to the same visit's cDBS; their policies must be among those that are evaluated.
+        others: what the data of other participants say of the outcomes' dose shapes; None: they are not asked.
     """
 
     config: PosteriorConfig = field(default_factory=PosteriorConfig)
     method: str = "posterior"
     tests: tuple[TestedDifference, ...] = ()
+    others: tuple[Evidence, ...] | None = None
 
     def with_tests(self, tests: Sequence[TestedDifference]) -> Posterior:
         """The same estimator knowing tested sessions as well; `evaluate` raises ValueError where a tested policy is not evaluated."""
         return replace(self, tests=tuple(tests))
+
+    def with_others(self, others: Sequence[Evidence]) -> Posterior:
+        """The same estimator with the dose shapes of outcomes pooled with other participants' where the proof holds."""
+        return replace(self, others=tuple(others))
 
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedPosterior:
         """Fit and weigh the structures; takes seconds, so nothing is kept in `checkpoint_dir`.
@@ -105,7 +112,8 @@ class Posterior:
         total = sum(shares.values())
         ends = fit_end_model(buffer, draws=total, seed=c.seed, severity=np.asarray(severity), wider=1.0)
         report(1.0, "fitting the outcomes")
-        return FittedPosterior(self.method, c, buffer, scale, tuple(fits), shares, predictions, equal, ends, self.tests)
+        fitted = FittedPosterior(self.method, c, buffer, scale, tuple(fits), shares, predictions, equal, ends, self.tests)
+        return fitted if self.others is None else fitted.with_pooled(pool(ends.shape_evidence, self.others))
 
 
 def shared_out(weights: Mapping[str, float], draws: int) -> dict[str, int]:
@@ -115,7 +123,8 @@ def shared_out(weights: Mapping[str, float], draws: int) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class FittedPosterior:
-    """Fitted structures with their weights, what is predicted of left-out sessions without any answer (`equal`), and the tests."""
+    """Fitted structures with their weights, what is predicted of left-out sessions without any answer (`equal`), the tests, and what other
+    participants say of dose shapes."""
 
     method: str
     config: PosteriorConfig
@@ -127,6 +136,16 @@ class FittedPosterior:
     equal: Floats
     ends: EndModel
     tests: tuple[TestedDifference, ...]
+    pooled: Pooled | None = None
+
+    def with_pooled(self, pooled: Pooled) -> FittedPosterior:
+        """The same structures with outcomes whose dose shapes have the priors of other participants."""
+        ends = self._outcomes(self.buffer, pooled) if pooled.priors else self.ends
+        return replace(self, ends=ends, pooled=pooled)
+
+    def _outcomes(self, buffer: ReplayBuffer, pooled: Pooled | None) -> EndModel:
+        priors, draws = pooled.priors if pooled else None, self.ends.draws
+        return fit_end_model(buffer, draws=draws, seed=self.config.seed, severity=self.levels, wider=1.0, shape_priors=priors)
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
         """Posterior of every policy.
@@ -141,8 +160,9 @@ class FittedPosterior:
         names, chosen = list(everyone), list(everyone.values())
         replays, supports, draws = self.joint(everyone, horizon, report)
         skill = ordering_skill(self.buffer, self.predictions, self.equal, self.ends, self.levels)
-        common = {"skill": skill.to_json(), "return_noise": round(return_noise(self.buffer, horizon), 4)}
+        common: dict[str, Any] = {"skill": skill.to_json(), "return_noise": round(return_noise(self.buffer, horizon), 4)}
         common["left_out_outcomes"] = self.ends.predictability()
+        common |= {"shape_pooling": self.shape_pooling} if self.pooled is not None else {}
         look, found = AmplitudeSupport(self.buffer), {}
         moved = self._moved_as_measured(chosen, replays, horizon)
         for i, name in enumerate(names[:-1]):
@@ -152,6 +172,16 @@ class FittedPosterior:
                 flags.append(stopped_sessions(sum(s.stopped for s in self.buffer.sessions), counted, counted + float(moved[i])))
             found[name] = self._estimate(i, replays, draws, supports[i], common, flags, horizon)
         return found
+
+    @property
+    def shape_pooling(self) -> dict[str, Any]:
+        """By outcome what was found of pooling its dose shapes (`Proof.to_json`) and, where they are pooled, how much better the others'
+        prior predicts these very data than the flat one, `own_gain`, nats; empty where other participants were not asked."""
+        if self.pooled is None:
+            return {}
+        own, priors = self.ends.shape_evidence, self.pooled.priors
+        gains = {o: {"own_gain": gain(own[o], priors[o])} for o in own if o in priors}
+        return {o: proof.to_json() | gains.get(o, {}) for o, proof in self.pooled.proofs.items()}
 
     def joint(self, policies: Mapping[str, Policy], horizon: int, report: Report = silent) -> tuple[Replays, list[Support], Draws]:
         """Replays, support and joint draws of all policies, cDBS last: what their estimates are made of."""
@@ -165,7 +195,7 @@ class FittedPosterior:
         if not self.ends.seen[0] or not any(s.stopped for s in self.buffer.sessions):
             return None
         buffer = replace(self.buffer, sessions=tuple(replace(s, stopped=False) for s in self.buffer.sessions))
-        ends = fit_end_model(buffer, draws=self.ends.draws, seed=self.config.seed, severity=self.levels, wider=1.0)
+        ends = self._outcomes(buffer, self.pooled)
         other = replace(self, buffer=buffer, ends=ends)._replays(policies, horizon, silent)
         measured, counted = (np.einsum("pdn,d->p", r.outcomes[..., 0], r.weights) / len(buffer.sessions) for r in (other, replays))
         return np.asarray(measured - counted, dtype=np.float64)

@@ -98,10 +98,10 @@ def test_an_evaluation_gives_the_numbers_that_the_estimators_give(
 @pytest.mark.slow
 @pytest.mark.usefixtures("worker", "sessions")
 def test_sessions_of_any_design_a_foreign_policy_and_no_end_reward_go_through_the_same_door(
-    client: TestClient, upload: Upload, ended: Ended
+    client: TestClient, upload: Upload, ended: Ended, db: Session
 ) -> None:
-    weights = {"c2": 0.0, "c3": 0.0, "c4": 0.0}
-    assert client.put("/api/v1/participants/P1/settings", json={"settings": weights}).status_code == 200
+    changed = {"c2": 0.0, "c3": 0.0, "c4": 0.0, "pool_shapes": True}
+    assert client.put("/api/v1/participants/P1/settings", json={"settings": changed}).status_code == 200
     for k, design in enumerate(("stratified", "paper", "ladder")):
         designed = upload("random", steps=60, visit=1)
         stated = client.put(f"/api/v1/sessions/{designed}/conditions", json={"design": design, "seed": k, "reason": "as planned"})
@@ -121,6 +121,11 @@ def test_sessions_of_any_design_a_foreign_policy_and_no_end_reward_go_through_th
         assert told["end_reward"] == pytest.approx(0.0, abs=1e-9), method
         assert all(abs(flag["value"]) < 1e4 for flag in told["flags"] if flag["value"] is not None), (method, told["flags"])
     assert policy["predicted"]["grasp_hz"] == pytest.approx(2.0, abs=1.0), "outcomes are predicted where they earn nothing"
+    stored = db.get_one(Evaluation, done["result"]["evaluation_id"])
+    assert set(stored.diagnostics["dose_shapes"]["evidence"]) == {"grasp", "rating", "tremor"}
+    assert {o: p["participants"] for o, p in stored.diagnostics["dose_shapes"]["pooling"].items()} == {"grasp": 1, "rating": 1, "tremor": 1}
+    assert stored.config["pooled_evaluations"] == []
+    assert "grasp: not pooled, because 0 other participants" in client.get("/participants/P1/ranking").text
 
 
 @pytest.mark.slow
