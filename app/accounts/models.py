@@ -169,7 +169,7 @@ class ApiToken(Base):
 
 
 class SignInAttempt(Base):
-    """A failed sign-in; too many of one address in a while are refused, whichever web process answers."""
+    """A try to sign in that was not right; too many of one address in a while are refused, whichever web process answers."""
 
     __tablename__ = "sign_in_attempt"
     __table_args__ = (Index("ix_sign_in_attempt_email_at", "email", "at"),)
@@ -177,3 +177,5 @@ class SignInAttempt(Base):
     id: Mapped[int] = mapped_column(primary_key=True)
     email: Mapped[str] = mapped_column(String(254))
     at: Mapped[datetime] = mapped_column(server_default=func.now())
+    failed: Mapped[bool] = mapped_column(server_default=text("true"))
+    """False while it is undecided: it was counted, and its verdict is not written yet."""

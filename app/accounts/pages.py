@@ -7,6 +7,7 @@ from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 from starlette.datastructures import FormData
 
@@ -56,6 +57,9 @@ async def sign_in(request: Request, values: FormValues) -> Response:
         answer = await _passwords.run(_sign_in, request, values)
     except TooMany as error:
         return _sign_in_refused(request, values, error)
+    except DBAPIError:
+        failed_sign_ins.give_back(source)  # no verdict was told
+        raise
     if answer.status_code == 303:
         failed_sign_ins.give_back(source)
     return answer

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import datetime, timedelta
 
-from sqlalchemy import delete, func, select, text
+from sqlalchemy import delete, func, select, text, update
 from sqlalchemy.orm import Session, selectinload
 
 from app.accounts.addresses import normal_address
@@ -82,10 +82,18 @@ def sign_on_links(db: Session, user_id: int) -> Sequence[SignOnLink]:
     return db.scalars(select(SignOnLink).where(SignOnLink.user_id == user_id).order_by(SignOnLink.id)).all()
 
 
-def recent_failures(db: Session, email: str, within: timedelta) -> int:
-    """Failed sign-ins of an address within a span."""
-    recent = (SignInAttempt.email == email) & (SignInAttempt.at > now() - within)
-    return db.scalar(select(func.count()).select_from(SignInAttempt).where(recent)) or 0
+def recent_tries(db: Session, email: str, failed_within: timedelta, undecided_within: timedelta) -> tuple[int, int]:
+    """Tries of an address: how many failed within a span, and how many of a shorter one are undecided."""
+    moment = now()
+    failed = func.count().filter(SignInAttempt.failed, SignInAttempt.at > moment - failed_within)
+    undecided = func.count().filter(~SignInAttempt.failed, SignInAttempt.at > moment - undecided_within)
+    counted = db.execute(select(failed, undecided).where(SignInAttempt.email == email)).one()
+    return counted[0], counted[1]
+
+
+def mark_failed(db: Session, attempt: SignInAttempt) -> None:
+    """Decide that a try was wrong; nothing is left to decide where a right one has dropped it meanwhile."""
+    db.execute(update(SignInAttempt).where(SignInAttempt.id == attempt.id).values(failed=True))
 
 
 def lock_address(db: Session, email: str) -> None:

@@ -20,11 +20,16 @@ from app.accounts.permissions import MANAGE_ACCOUNTS, READ_AUDIT, Caller, Grant
 from app.platform.audit import record, record_once
 from app.platform.database import new_session, now, set_actor
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized, about
+from app.platform.sources import in_words
 from app.settings import get_settings
 
 FAILURES_ALLOWED = 5
 FAILURE_WINDOW = timedelta(minutes=15)
+UNDECIDED_WINDOW = timedelta(minutes=1)
+"""For so long a try counts whose verdict is not written. One whose verdict could not be written (the disk of the database is full) told its
+sender nothing; a check and its wait for others take seconds."""
 LOCKED_OUT = {"why": "too many failed tries"}
+AT_ONCE = {"why": "too many tries at once"}
 TOKEN_DAYS, MOST_TOKEN_DAYS = 90, 730
 _SEEN_RESOLUTION = timedelta(minutes=1)
 _TOKEN_PREFIX = "blp_"  # noqa: S105 - no secret
@@ -113,6 +118,7 @@ def confirm_password(user_id: int, password: str, code: str = "") -> None:
         elif not second_factor.accepts(db, user.id, code):
             wrong = "The code of the second factor is wrong or missing.", "Nothing was changed; give the one of now."
         if wrong is not None:
+            repository.mark_failed(db, attempt)
             record(db, "refuse", "confirmation", user.email, {"why": wrong[0]})
             db.commit()
             raise Forbidden(*wrong)
@@ -148,8 +154,9 @@ def set_active(db: Session, user: User, active: bool, caller: Caller) -> None:
 def sign_in(db: Session, email: str, password: str, code: str = "") -> str:
     """Check a password and open a browser session; returns the cookie's token.
 
-    Every try is counted, and committed, before its password is looked at, and taken back when it was right: however many come at once,
-    no more than FAILURES_ALLOWED of an address are judged within FAILURE_WINDOW. The caller commits the session.
+    Every try is counted as undecided, and committed, before its password is looked at; taken back when it was right, and committed as
+    failed before a wrong one is told: however many come at once, no more than FAILURES_ALLOWED of an address are told a verdict within
+    FAILURE_WINDOW. The caller commits the session.
 
     Args:
         code: of the second factor, where the user has one.
@@ -165,6 +172,8 @@ def sign_in(db: Session, email: str, password: str, code: str = "") -> str:
     stand_in = repository.some_password_hash(db, address or "") or _decoy()
     ok = _hasher.verify(password, user.password_hash if user else stand_in)
     if not (ok and user and user.active and attempt and second_factor.accepts(db, user.id, code)):
+        if attempt:
+            repository.mark_failed(db, attempt)
         # what was typed as an unknown address may be a password
         record(db, "refuse", "sign_in", user.email if user else "unknown address")
         db.commit()
@@ -184,22 +193,25 @@ def open_session(db: Session, user: User, issuer: str | None = None) -> str:
 
 
 def _count_attempt(db: Session, address: str, known: bool) -> SignInAttempt:
-    """Count a try of an address, and commit. Raises TooMany where it has used up its tries; such a try is not counted.
+    """Count a try of an address as undecided, and commit.
 
     A lock-out is one row of the trail, however often it is tried meanwhile: whoever guesses must not be able to fill it.
+
+    Raises:
+        TooMany: it has used up its tries, by those that failed alone or with the undecided ones; this one is not counted.
     """
     repository.lock_address(db, address)
     repository.prune_failures(db, FAILURE_WINDOW)
-    if repository.recent_failures(db, address, FAILURE_WINDOW) >= FAILURES_ALLOWED:
+    failed, undecided = repository.recent_tries(db, address, FAILURE_WINDOW, UNDECIDED_WINDOW)
+    if failed + undecided >= FAILURES_ALLOWED:
+        locked = failed >= FAILURES_ALLOWED
         # what was typed as an unknown address may be a password
-        record_once(db, "refuse", "sign_in", address if known else "unknown address", LOCKED_OUT, FAILURE_WINDOW)
+        record_once(db, "refuse", "sign_in", address if known else "unknown address", LOCKED_OUT if locked else AT_ONCE, FAILURE_WINDOW)
         db.commit()
-        raise TooMany(
-            f"Too many failed sign-ins for {address}.",
-            f"Wait {FAILURE_WINDOW.seconds // 60} minutes and try again.",
-            FAILURE_WINDOW.seconds,
-        )
-    attempt = SignInAttempt(email=address)
+        wait_s = (FAILURE_WINDOW if locked else UNDECIDED_WINDOW).seconds
+        said = "failed sign-ins for {}" if locked else "sign-ins for {} are waiting for an answer"
+        raise TooMany(f"Too many {said.format(address)}.", f"Wait {in_words(wait_s)} and try again.", wait_s)
+    attempt = SignInAttempt(email=address, failed=False)
     db.add(attempt)
     db.commit()
     return attempt

@@ -218,15 +218,15 @@ def test_what_no_address_can_be_fails_like_a_wrong_password(db: Session, ada: st
 
 
 def test_guesses_at_the_same_moment_are_judged_no_more_often_than_allowed(db: Session, ada: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    tries, count = 24, repository.recent_failures
+    tries, count = 24, repository.recent_tries
     start = Barrier(tries)
 
-    def slowly(*asked: Any) -> int:
+    def slowly(*asked: Any) -> tuple[int, int]:
         found = count(*asked)
         time.sleep(0.05)  # as a busy database: who does not wait for the others counts none of their tries
         return found
 
-    monkeypatch.setattr(repository, "recent_failures", slowly)
+    monkeypatch.setattr(repository, "recent_tries", slowly)
 
     def guess(number: int) -> str:
         with new_session() as own:
