@@ -12,6 +12,7 @@ from app.accounts.permissions import Caller
 from app.ingest import repository
 from app.ingest.quarantine import service as quarantine
 from app.ingest.quarantine.serializers import original, problem_of
+from app.ingest.uploads.interrupted import why_left
 from app.ingest.wording import KIND_NAMES
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
@@ -68,6 +69,7 @@ def _page(
         held=[(f, problem_of(f)) for f in rows if f.quarantine_sha256 is not None],
         kind_names=KIND_NAMES,
         decided=[f for f in rows if f.quarantine_sha256 is None],
+        left=why_left(participant),
         may_decide=caller.may(can.DECIDE_QUARANTINE, participant.site.study_id, participant.site_id),
         typed=typed or {},
         remarks=field_notes(error, {"reason": ""}),

@@ -54,7 +54,8 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
     """Release a file to the present decoder; where all of it can be read now, the encrypted original goes.
 
     Raises:
-        Conflict: not in quarantine, or the same bytes were decoded meanwhile. Invalid: still unreadable, and why.
+        Conflict: not in quarantine, the same bytes were decoded meanwhile, the participant has withdrawn, or the site or study has ended.
+        Invalid: still unreadable, and why.
     """
     file, participant = _held(db, file_id, caller)
     return read_held(db, file, participant, reason, caller)
@@ -62,6 +63,9 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
 
 def read_held(db: Session, file: UploadFile, participant: Participant, reason: str, caller: Caller) -> UploadOutcome:
     """Read a quarantined file, as `read_again` does, for whoever may decide that it can be read."""
+    # what is read of it is new data, although its bytes came before the end
+    study_service.refuse_withdrawn(participant)
+    study_service.refuse_ended(participant.site)
     if file.status == "failed" and (known := repository.decoded_file(db, participant.id, file.original_sha256)) is not None:
         raise Conflict(f"The same bytes were read as file {known.id} of upload {known.upload_id}.", "Discard this copy.")
     upload = repository.upload(db, file.upload_id, caller)[0]

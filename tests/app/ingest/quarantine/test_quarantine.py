@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import zipfile
 from typing import Any
 
@@ -112,6 +113,30 @@ def test_a_better_decoder_reads_what_was_held(
     again = send(("s.zip", content)).json()
     assert again["duplicate"] is True
     assert [p["session"]["id"] for p in again["proposals"]] == [proposals()[0]["session"]["id"]]
+
+
+@pytest.mark.parametrize("over", ["site", "study", "withdrawn"])
+def test_nothing_new_is_read_for_whom_it_is_over(
+    send: Any, client: TestClient, monkeypatch: pytest.MonkeyPatch, proposals: Any, over: str
+) -> None:
+    """Bytes that came before are discarded or stored as they came where a site has ended, or somebody has withdrawn."""
+    real = reading.clean
+    monkeypatch.setattr(reading, "clean", lambda *_: Cleaned("unreadable", problem=UndecodableFile("too new", "file", "Wait.")))
+    send(("s.zip", device_zip()))
+    monkeypatch.setattr(reading, "clean", real)
+    (held,) = client.get("/api/v1/participants/P1/quarantine").json()
+    why = {"reason": "the last visit was held"}
+    ends = {"site": "/api/v1/studies/main/sites/main/end", "study": "/api/v1/studies/main/end"}
+    if over == "withdrawn":
+        assert client.patch("/api/v1/participants/P1", json={"status": "withdrawn", **why}).status_code == 200
+    else:
+        assert client.post(ends[over], json=why).status_code == 200
+    answer = decide(client, held, "release", how="read", reason="decoder of version 3")
+    assert (answer.status_code, proposals()) == (403 if over == "study" else 409, [])
+    assert re.search("has ended|has withdrawn", answer.text)
+    page = client.get("/participants/P1/quarantine").text
+    assert ('value="read"' in page, 'value="discard"' in page) == (False, over != "study")
+    assert decide(client, held, "discard", reason="not needed").status_code == (403 if over == "study" else 200)
 
 
 def test_bytes_that_were_read_meanwhile_are_not_read_twice(send: Any, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
