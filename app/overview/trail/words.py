@@ -35,7 +35,7 @@ def headline(events: Sequence[AuditEvent]) -> AuditEvent:
 
 
 def _recorded(event: AuditEvent, names: Names) -> str:
-    """What changed no row: looks, exports, refusals."""
+    """What changed no row: looks, exports, refusals, false times that were looked into."""
     number = int(event.entity_id) if event.entity_id.isdecimal() else 0
     said: Mapping[tuple[str, str], Callable[[], str]] = {
         ("view", "results"): lambda: f"looked at the results of {_which(event.entity_id, names)}",
@@ -50,6 +50,7 @@ def _recorded(event: AuditEvent, names: Names) -> str:
         ("download", "plan"): lambda: f"printed {names.plan(number)}",
         ("refuse", "sign_in"): lambda: f"refused a sign-in of {event.entity_id}",
         ("refuse", "confirmation"): lambda: f"refused {event.entity_id} a signature or a new password",
+        ("accept", "audit_event"): lambda: f"accepted that row {number} of the trail has a false time",
         ("refuse", "sign_on"): lambda: f"refused a sign-on of {event.entity_id}",
     }
     known = said.get((event.action, event.entity))

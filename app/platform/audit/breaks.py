@@ -64,7 +64,7 @@ def sentence(b: Break) -> str:
         BreakKind.FUNCTION_CHANGED: f"function {b.name}, on which the trail rests, is missing or not the one that betaloop made",
         BreakKind.DEFAULT_CHANGED: f"table {b.table}: what stands in column {', '.join(b.columns)} by default is not what betaloop made",
         BreakKind.BACKDATED: f"link {b.position}: the time of row {b.event_id} lies more than a day before that of an earlier one: "
-        "it was changed, or the clock of the database was set back",
+        "the clock of the database was fast until then, or this row was given a false time",
         BreakKind.SIGNATURE_CHANGED: f"signature {b.row}: its content is not what was signed",
         BreakKind.ROW_ALTERED: f"{where}: {', '.join(b.columns)} changed past the trail, whose row {b.event_id} tells otherwise",
         BreakKind.ROW_REMOVED: f"{where} is gone, and the trail tells of no deletion: its row {b.event_id} is the last that tells of it",

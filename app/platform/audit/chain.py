@@ -25,6 +25,7 @@ from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
+from app.platform.audit.accepted import Accepted, acceptances
 from app.platform.audit.breaks import MOST_BREAKS, Break, BreakKind
 from app.platform.audit.guards import what_writes
 from app.platform.audit.rows import past_the_trail
@@ -69,13 +70,14 @@ class Verified:
 
     Attributes:
         links: how long the chain is. seals: how many seals were held against it. sealed_to: the last sealed place; 0 where there is none.
-        breaks: in the order of their places, at most MOST_BREAKS.
+        breaks: in the order of their places, at most MOST_BREAKS. accepted: false times that somebody has looked into; they are no breaks.
     """
 
     links: int
     seals: int
     sealed_to: int
     breaks: tuple[Break, ...]
+    accepted: tuple[Accepted, ...] = ()
 
     @property
     def whole(self) -> bool:
@@ -127,6 +129,7 @@ def verify(db: Session) -> Verified:
     wanted = [*_seals_of_database(db), *_seals_of_file()]
     places = {place for place, _, _ in wanted}
     breaks, links, before, latest = [], 0, GENESIS, 0
+    known, accepted = acceptances(db), []
     for position, event_id, stored, fields in _links(db):
         links += 1
         if position != links:
@@ -138,7 +141,11 @@ def verify(db: Session) -> Verified:
             breaks.append(Break(BreakKind.EDITED, position, event_id))
         moment = latest if fields is None else int(fields[1] or 0)
         if moment < latest - _A_DAY_US:
-            breaks.append(Break(BreakKind.BACKDATED, position, event_id))
+            found = Break(BreakKind.BACKDATED, position, event_id)
+            if (looked_into := known.get(event_id)) is None:
+                breaks.append(found)
+            else:
+                accepted.append(Accepted(found, looked_into.actor, looked_into.at, looked_into.reason or ""))
             latest = moment  # those that follow at the same time are not named again: the rest of the chain is looked at
         latest = max(latest, moment)
         before = stored
@@ -152,7 +159,7 @@ def verify(db: Session) -> Verified:
         breaks += what_writes(db)
         breaks += [Break(BreakKind.SIGNATURE_CHANGED, table="signature", row=str(i)) for i in changed_records(db)]
         breaks += islice(past_the_trail(db), MOST_BREAKS)
-    return Verified(links, len(places), max(places, default=0), tuple(breaks[:MOST_BREAKS]))
+    return Verified(links, len(places), max(places, default=0), tuple(breaks[:MOST_BREAKS]), tuple(accepted))
 
 
 def _against_seals(wanted: Sequence[tuple[int, bytes, bytes]], digests: dict[int, bytes], links: int) -> list[Break]:

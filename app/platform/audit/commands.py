@@ -1,15 +1,17 @@
-"""Commands of the audit trail: `betaloop audit verify` and `betaloop audit seal`."""
+"""Commands of the audit trail: `betaloop audit verify`, `betaloop audit accept` and `betaloop audit seal`."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Annotated
 
 import typer
 
-from app.platform.audit.breaks import sentence
+from app.platform.audit.accepted import accept
+from app.platform.audit.breaks import BreakKind, sentence
 from app.platform.audit.chain import Verified, seal, verify
 from app.platform.database import new_session, transaction
-from app.platform.terminal import ACTOR, AsJson, print_line, show
+from app.platform.terminal import ACTOR, AsJson, Why, bad_call, print_line, show
 
 app = typer.Typer(no_args_is_help=True, help="The audit trail.")
 
@@ -24,6 +26,19 @@ def verify_(as_json: AsJson = False) -> None:
         raise typer.Exit(1)
 
 
+@app.command("accept", epilog="Example: betaloop audit accept 4711 --reason 'the clock was a week ahead until it was set by NTP'")
+def accept_(row: Annotated[int, typer.Argument(help="Number of the row of the trail, as `audit verify` names it.")], why: Why) -> None:
+    """Say that a false time was looked into: `audit verify` lists it with this reason, and calls it a break no more.
+
+    Nothing else that `audit verify` names can be accepted.
+    """
+    with transaction(ACTOR) as db:
+        if not any(b.kind is BreakKind.BACKDATED and b.event_id == row for b in verify(db).breaks):
+            raise bad_call(f"`betaloop audit verify` names no false time of row {row}; nothing else is accepted.")
+        accept(db, row, why)
+    print_line(f"The time of row {row} is accepted; the reason stands in the trail.")
+
+
 @app.command("seal", epilog="Example: betaloop audit seal")
 def seal_() -> None:
     """Seal the chain at its end now; the service does so once a minute."""
@@ -34,7 +49,8 @@ def seal_() -> None:
 
 def sentences(found: Verified) -> list[str]:
     """What was found, a line each."""
-    if found.whole:
-        sealed = f"sealed up to link {found.sealed_to}" if found.sealed_to else "not sealed yet"
-        return [f"The audit trail is whole: {found.links} links, {sealed}."]
-    return [f"The audit trail is broken at {len(found.breaks)} places:", *(f"  {sentence(b)}" for b in found.breaks)]
+    sealed = f"sealed up to link {found.sealed_to}" if found.sealed_to else "not sealed yet"
+    said = [f"The audit trail is whole: {found.links} links, {sealed}."]
+    if not found.whole:
+        said = [f"The audit trail is broken at {len(found.breaks)} places:", *(f"  {sentence(b)}" for b in found.breaks)]
+    return said + [f"Accepted on {a.at:%Y-%m-%d} by {a.by}: {a.reason}\n  {sentence(a.found)}" for a in found.accepted]

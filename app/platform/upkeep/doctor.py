@@ -21,6 +21,7 @@ from app.platform.jobs import repository as jobs
 from app.platform.jobs.service import STALE_S
 from app.platform.service_role import excess
 from app.platform.tables import load_tables
+from app.platform.web.charts import counted
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -87,7 +88,8 @@ def _role(db: Session) -> Finding:
 def _trail(db: Session) -> Finding:
     found = verify(db)
     hint = "" if found.whole else "See `betaloop audit verify`; somebody changed the trail past the service."
-    detail = f"{found.links} links, sealed up to {found.sealed_to}" if found.whole else f"broken at {len(found.breaks)} places"
+    accepted = f", {counted(len(found.accepted), 'false time')} looked into" if found.accepted else ""
+    detail = f"{found.links} links, sealed up to {found.sealed_to}{accepted}" if found.whole else f"broken at {len(found.breaks)} places"
     return Finding("audit trail", found.whole, detail, hint)
 
 

@@ -78,6 +78,7 @@ SESSION = {"id": 7, "visit_id": 4, "ordinal": 3, "status": "confirmed", "exclude
         (recorded("download", "plan", "9"), "printed plan 9 for visit 2 of P1"),
         (recorded("refuse", "sign_in", "ada@clinic.example"), "refused a sign-in of ada@clinic.example"),
         (recorded("seize", "thing", "3"), "seize: thing 3"),
+        (recorded("accept", "audit_event", "17"), "accepted that row 17 of the trail has a false time"),
         (recorded("refuse", "sign_on", "eve@clinic.example"), "refused a sign-on of eve@clinic.example"),
         (recorded("view", "visit", "4"), "looked at the sessions and results of visit 2 of P1"),
         (recorded("view", "session", "7"), "looked at the results of session 3 of visit 2 of P1"),

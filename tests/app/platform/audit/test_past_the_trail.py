@@ -6,11 +6,12 @@ import time
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import text
+from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
 from app import cli
+from app.platform.audit import AuditEvent
 from app.platform.audit.breaks import BreakKind
 from app.platform.audit.chain import verify
 from app.platform.database import new_session
@@ -164,6 +165,36 @@ def test_what_was_written_at_a_false_time_stays_named_once_the_clock_is_right_ag
     with new_session() as db:
         (named,) = verify(db).breaks
     assert (named.kind.value, (named.event_id or 0) > (last or 0)) == ("backdated", True)
+
+
+def test_a_clock_that_was_fast_is_accepted_with_a_reason_and_stays_listed(client: TestClient, enrolled: str, owner_db: Session) -> None:
+    owner_db.execute(text("alter table audit_event alter column at set default clock_timestamp() + interval '8 days'"))
+    owner_db.commit()
+    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 7}).status_code == 201
+    owner_db.execute(text("alter table audit_event alter column at set default clock_timestamp()"))
+    owner_db.commit()
+    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 8}).status_code == 201
+    with new_session() as db:
+        (named,) = verify(db).breaks
+    why, row = "the clock was 8 days ahead until it was set by NTP", str(named.event_id)
+    for other in (str((named.event_id or 0) - 1), "0"):
+        assert "names no false time" in CliRunner().invoke(cli.app, ["audit", "accept", other, "--reason", why]).stderr
+    assert CliRunner().invoke(cli.app, ["audit", "accept", row]).exit_code == 2, "a reason is asked for"
+    assert CliRunner().invoke(cli.app, ["audit", "verify"]).exit_code == 1
+    assert CliRunner().invoke(cli.app, ["audit", "accept", row, "--reason", why]).exit_code == 0
+    said = CliRunner().invoke(cli.app, ["audit", "verify"])
+    assert (said.exit_code, f"by command line: {why}" in said.stdout, f"row {row} lies more than" in said.stdout) == (0, True, True)
+    with new_session() as db:
+        found = verify(db)
+        assert (found.breaks, [a.found for a in found.accepted]) == ((), [named])
+        event = db.scalars(select(AuditEvent).where(AuditEvent.action == "accept")).one()
+    assert (event.entity, event.entity_id, event.reason) == ("audit_event", row, why)
+    # what else is wrong with that row is a break all the same
+    owner_db.execute(text("alter table audit_event disable trigger user"))
+    owner_db.execute(text(f"update audit_event set reason = 'another' where id = {row}"))
+    owner_db.commit()
+    with new_session() as db:
+        assert "edited" in {b.kind.value for b in verify(db).breaks}
 
 
 def test_what_a_function_that_writes_nothing_let_through_stays_named_when_it_is_put_back(
