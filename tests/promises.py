@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from tests.promised.contents import CONTENTS
 from tests.promised.faults import FAULTS
 from tests.promised.people import PEOPLE
 from tests.promised.promise import Promise
 from tests.promised.promise import of as _of
 from tests.promised.records import RECORDS
 from tests.promised.trail import TRAIL
+from tests.promised.wide import WIDE
 
 CHAIN = "tests/app/platform/test_audit_chain.py"
 ROLE = "tests/app/platform/test_service_role.py"
@@ -30,6 +32,7 @@ SCOPE, HEADERS = "tests/app/overview/test_audit_scope.py", "tests/app/platform/w
 MALFORMED, HASHES = "tests/app/platform/test_malformed_bodies.py", "tests/app/accounts/test_few_hashes_at_once.py"
 PASSWORDS, NUMBERS = "tests/app/accounts/test_passwords.py", "tests/app/platform/web/test_schemas.py"
 LIMITS, BODIES = "tests/app/platform/web/test_source_limits.py", "tests/app/platform/web/test_body_limit.py"
+UNDECIDED = "tests/app/accounts/test_undecided_tries.py"
 OWNED, FIGURES = "tests/app/test_ids_belong_together.py", "tests/app/platform/web/test_figures.py"
 
 PROMISES = [
@@ -119,10 +122,17 @@ PROMISES = [
         ("a closed account signs nothing", "_hasher.verify(password, user.password_hash) and user.active)",
          "_hasher.verify(password, user.password_hash))",
          f"{SIGNATURES}::test_a_closed_account_and_the_system_sign_nothing"),
-        ("guessing ends", "if repository.recent_failures(db, address, FAILURE_WINDOW) >= FAILURES_ALLOWED:", "if False:",
+        ("guessing ends", "    if failed + undecided >= FAILURES_ALLOWED:\n", "    if False:\n",
          f"{ACCOUNTS}::test_five_failures_lock_the_address_and_a_pause_unlocks_it"),
         ("guesses at one moment count", "    repository.lock_address(db, address)\n", "",
          f"{ACCOUNTS}::test_guesses_at_the_same_moment_are_judged_no_more_often_than_allowed"),
+        ("undecided tries count", "    if failed + undecided >= FAILURES_ALLOWED:\n", "    if failed >= FAILURES_ALLOWED:\n",
+         f"{ACCOUNTS}::test_guesses_at_the_same_moment_are_judged_no_more_often_than_allowed"),
+        ("a wrong try counts for the whole window", "        if attempt:\n            repository.mark_failed",
+         "        if False:\n            repository.mark_failed",
+         f"{UNDECIDED}::test_wrong_ones_after_them_lock_the_address_as_ever"),
+        ("a try that was told no verdict counts for a minute", "FAILURE_WINDOW, UNDECIDED_WINDOW)", "FAILURE_WINDOW, FAILURE_WINDOW)",
+         f"{UNDECIDED}::test_tries_that_were_told_no_verdict_count_for_a_minute_alone"),
         ("failed sign-ins are pruned", "    repository.prune_failures(db, FAILURE_WINDOW)\n", "",
          f"{ACCOUNTS}::test_tries_that_count_no_more_are_removed"),
         ("refused sign-ins are in the trail", 'record(db, "refuse", "sign_in", user.email if user else "unknown address")', "pass",
@@ -380,4 +390,6 @@ PROMISES = [
     *RECORDS,
     *PEOPLE,
     *TRAIL,
+    *CONTENTS,
+    *WIDE,
 ]  # fmt: skip

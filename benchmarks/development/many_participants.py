@@ -46,6 +46,8 @@ PAGES = {
     "queue": "/jobs",
     "audit": "/audit",
     "audit of one row": "/audit?entity=qoc&entity_id=1",
+    "audit of one": "/audit?participant={code}",
+    "audit, rare word": "/audit?words=zebra",
     "all participants": "/analyses",
 }
 TRAIL_ROWS = 400

@@ -69,7 +69,8 @@ RECORDS = [
     *_of(
         "accounts/service",
         ("lock-outs are in the trail",
-         '        record_once(db, "refuse", "sign_in", address if known else "unknown address", LOCKED_OUT, FAILURE_WINDOW)\n', "",
+         '        record_once(db, "refuse", "sign_in", address if known else "unknown address", '
+         'LOCKED_OUT if locked else AT_ONCE, FAILURE_WINDOW)\n', "",
          f"{REFUSALS}::test_a_lock_out_is_one_row_however_often_it_is_tried"),
         ("wrong passwords at signatures are in the trail", 'record(db, "refuse", "confirmation", user.email, {"why": wrong[0]})', "pass",
          f"{REFUSALS}::test_a_wrong_password_at_a_signature_is_in_the_trail"),
