@@ -28,7 +28,7 @@ from app.platform.files import prune_copies_beside, remove_abandoned
 from app.platform.tables import load_tables
 from app.platform.upkeep.doctor import newest_revision, revision
 from app.platform.web import middleware as web
-from app.platform.web.compressed import CompressedFiles
+from app.platform.web.compression import CompressedFiles
 from app.platform.web.schemas import problems
 from app.platform.web.templates import STATIC
 from app.study.deps import ResultsViewed

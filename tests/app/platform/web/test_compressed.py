@@ -10,7 +10,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from app.platform.web.compressed import CompressedFiles
+from app.platform.web.compression import CompressedFiles
 from app.settings import get_settings
 
 ORIGINAL = Path(plotly.__file__).parent / "package_data" / "plotly.min.js"
