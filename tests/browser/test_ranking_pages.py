@@ -98,7 +98,7 @@ def test_a_comparison_is_moved_along_its_session(window: Callable, policies: lis
         page.keyboard.press("ArrowRight")
     # of the table: beta before the step is that of row 32, the amplitude that of row 33
     expect(time).to_have_text("1 min 04 s")
-    expect(cells).to_have_text(["2", "1.59 mA", "2.22 mA", "1.65 mA"])
+    expect(cells).to_have_text(["2.00", "1.59 mA", "2.22 mA", "1.65 mA"])
     expect(slider).to_have_attribute("aria-valuetext", "1 min 04 s")
     along = float(page.get_attribute("[data-cursor]", "x1"))
     assert along == float(page.get_attribute("[data-cursor]", "x2")) > begin

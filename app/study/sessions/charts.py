@@ -151,9 +151,11 @@ def control_chart(data: SessionData) -> Chart:
         },
         *_amplitude_traces(data, minutes, grid),
     ]  # fmt: skip
+    # from the first row to the last, without the air that markers get: the samples below have the same span
+    span = {"minallowed": float(minutes[0]), "maxallowed": float(minutes[-1])}
     layout: dict[str, Any] = {
         "grid": {"rows": 2, "columns": 1},
-        "xaxis": axis("Time in session", "min", anchor="y2", zeroline=False, range=[float(minutes[0]), float(minutes[-1])]),
+        "xaxis": axis("Time in session", "min", anchor="y2", zeroline=False, autorangeoptions=span),
         "yaxis": axis(name, unit, domain=[0.47, 1.0], zeroline=False, rangemode="tozero", fixedrange=True),
         "yaxis2": axis(
             "Amplitude", "mA" if _has(table.amplitude_ma) else "fraction", domain=[0.0, 0.38], rangemode="nonnegative", zeroline=False,

@@ -95,7 +95,7 @@ def test_a_visit_is_added_by_form_with_the_amplitude_of_each_side(browser: TestC
     done = browser.post(f"/participants/{enrolled}/visits", data=fields)
     assert done.status_code == 303
     page = browser.get(done.headers["location"]).text
-    assert "left 2.50 mA" in page
+    assert "left 2.5 mA" in page
     assert "<script>alert(1)" not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     again = browser.post(f"/participants/{enrolled}/visits", data=fields)

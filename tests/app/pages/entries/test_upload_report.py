@@ -1,4 +1,4 @@
-"""The report of an upload: one line for each file, with what was understood, sessions and problems; open only where there is a problem."""
+"""The report of an upload: one line for each file, with what was understood, sessions and problems; problems and a single file are open."""
 
 from __future__ import annotations
 
@@ -35,11 +35,12 @@ def test_every_file_is_a_line_and_only_a_problem_stands_open(browser: TestClient
     assert sorted(opened for opened, _ in stored.values()) == [False, True, True]
 
 
-def test_the_files_of_an_archive_are_lines_within_its_line(browser: TestClient, enrolled: str) -> None:
-    given = {"file": ("device.zip", device_zip())}
+def test_the_files_of_an_archive_are_lines_within_its_line(browser: TestClient, enrolled: str, table: bytes) -> None:
+    given = [("file", ("device.zip", device_zip())), ("file", ("steps.csv", table))]
     page = browser.post(f"/participants/{enrolled}/upload", data={"visit": "1", "controller": "cdbs"}, files=given).text
     told = lines(page)
     opened, line = told.pop("device.zip")
+    assert told.pop("steps.csv")[0] is False
     assert not opened
     assert re.search(r"\d+ files in it", line)
     assert "1 session" in line
@@ -47,3 +48,12 @@ def test_the_files_of_an_archive_are_lines_within_its_line(browser: TestClient, 
     assert not any(opened for opened, _ in told.values())
     assert not any(name in above_fold(page) for name in told), "inner files are seen once their archive is opened"
     assert "<h3>" not in page
+
+
+def test_a_single_file_stands_open_and_what_is_in_it_does_not(browser: TestClient, enrolled: str) -> None:
+    given = {"file": ("device.zip", device_zip())}
+    page = browser.post(f"/participants/{enrolled}/upload", data={"visit": "1", "controller": "cdbs"}, files=given).text
+    told = lines(page)
+    assert told.pop("device.zip")[0] is True
+    assert len(told) >= 3
+    assert not any(opened for opened, _ in told.values())
