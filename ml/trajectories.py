@@ -91,6 +91,7 @@ class SessionTrajectory:
         lead_amplitude: amplitude fraction in force just before step 0, where it is known; else None.
         stopped: ended for the participant's sake (they asked for it, an adverse event), which is a failure of what ran: see `counted_qoc`.
         most_imputed: how many imputed beta amplitudes a window may hold; 0 as in sessions of 0.1.0.
+        medication_h: hours from the last dose to the session's start, where they are known; else None.
 
     Raises:
         ValueError: arrays of unequal length, a session without a step, as many imputed values as the window has, or holds that leave out
@@ -110,6 +111,7 @@ class SessionTrajectory:
     stopped: bool = False
     most_imputed: int = 0
     holds: tuple[Hold, ...] = ()
+    medication_h: float | None = None
 
     def __post_init__(self) -> None:
         if self.beta.shape != self.amplitude.shape or self.beta.ndim != 1:
@@ -352,6 +354,7 @@ def from_parquet(content: bytes) -> ReplayBuffer:
                 stopped=m.get("stopped", False),
                 most_imputed=m.get("most_imputed", 0),
                 holds=tuple(Hold(*h) for h in m.get("holds", ())),
+                medication_h=m.get("medication_h"),
             )
         )
     return ReplayBuffer(MdpSettings(**meta["settings"]), tuple(sessions), meta["beta_unit"], meta["beta_source"])
@@ -368,6 +371,7 @@ def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
     later |= {"lead_amplitude": s.lead_amplitude} if s.lead_amplitude is not None else {}
     later |= {"holds": [[h.start, h.steps, h.log_density] for h in s.holds]} if s.holds else {}
     later |= {"stopped": True} if s.stopped else {}
+    later |= {"medication_h": s.medication_h} if s.medication_h is not None else {}
     return later | {
         "session_id": s.session_id,
         "visit": s.visit,

@@ -17,6 +17,7 @@ import numpy as np
 from ml.mdp import MdpSettings, end_reward, step_reward
 from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.population import PARTICIPANTS, true_return
+from ml.population.physiology.medication import since_dose
 from ml.population.sessions import run_sessions
 from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory
@@ -102,7 +103,8 @@ class CohortWorld:
             )
             run = batch.session(0)
             bound = lower if planned.controller == "random" else None
-            sessions.append(_session(i, planned, run.lead_beta, run.beta, run.amplitude, run.outcomes.qoc, bound))
+            since = since_dose(PARTICIPANTS[self.code].regimen, _hour(i))
+            sessions.append(_session(i, planned, run.lead_beta, run.beta, run.amplitude, run.outcomes.qoc, bound, since))
         return ReplayBuffer(self.settings, tuple(sessions), "uV", "table")
 
     def truth(self, policy: Policy, sessions: int) -> Truth:
@@ -230,7 +232,14 @@ class SwitchingWorld(OtherWorld):
 
 
 def _session(
-    i: int, planned: Planned, lead: Floats, beta: Floats, amplitude: Floats, qoc: Qoc, lower_bound: float | None
+    i: int,
+    planned: Planned,
+    lead: Floats,
+    beta: Floats,
+    amplitude: Floats,
+    qoc: Qoc,
+    lower_bound: float | None,
+    medication_h: float | None = None,
 ) -> SessionTrajectory:
     return SessionTrajectory(
         session_id=i + 1,
@@ -242,6 +251,7 @@ def _session(
         qoc=qoc,
         policy_id=planned.policy_id,
         random_lower_bound=lower_bound,
+        medication_h=medication_h,
     )
 
 

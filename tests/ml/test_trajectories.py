@@ -175,6 +175,12 @@ def test_the_stored_form_keeps_everything_and_its_hash() -> None:
         )
 
 
+def test_the_time_since_a_dose_survives_storing_and_a_buffer_without_it_keeps_its_bytes() -> None:
+    known = ReplayBuffer(SETTINGS, (session(1, medication_h=1.5), session(2)), "uV", "table")
+    assert [s.medication_h for s in from_parquet(to_parquet(known)).sessions] == [1.5, None]
+    assert b"medication_h" not in to_parquet(ReplayBuffer(SETTINGS, (session(1),), "uV", "table"))
+
+
 def test_held_draws_survive_storing_and_a_buffer_without_them_keeps_its_bytes() -> None:
     holds = (Hold(0, 3, -0.25), Hold(3, 1, None))
     held = ReplayBuffer(SETTINGS, (session(1, holds=holds),), "uV", "table")

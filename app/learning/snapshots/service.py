@@ -10,7 +10,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -249,7 +249,7 @@ def _read(db: Session, session: StudySession, version: SettingsVersion, traces: 
         return Member(session, table, None, trajectory)
     if not trajectory.usable().any():
         return Member(session, table, None, _why_unusable(trajectory, table))
-    return Member(session, table, trajectory, None)
+    return Member(session, table, replace(trajectory, medication_h=hours_since_dose(session)), None)
 
 
 def _why_unusable(trajectory: SessionTrajectory, table: StepTable) -> str:

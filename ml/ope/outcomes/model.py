@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings
 from ml.ope.estimate import OUTCOMES
+from ml.ope.outcomes.medication import worn_off
 from ml.ope.outcomes.minutes import ABOVE, BETA, Minutes, of_buffer
 from ml.ope.outcomes.regressions import ORDER, WIDER, Left, Outcome, Regression, Sessions, burden_of, fit
 from ml.ope.scale import FEWEST_OUTCOMES, outcome_table
@@ -190,7 +191,8 @@ def fit_end_model(
     centre, spread = means.mean(0), means.std(0)
     spread = np.where(spread > 1e-9, spread, 1.0)
     _, visit = np.unique([s.visit for s in buffer.sessions], return_inverse=True)
-    sessions = Sessions(visit.astype(np.int64), _standardised(severity))
+    adjusted = {} if severity is None else {"severity": _standardised(severity)}
+    sessions = Sessions(visit.astype(np.int64), adjusted | worn_off(buffer))
     burden, rng = burden_of(minutes, centre, spread), np.random.default_rng([seed, 0xE2D])
     size = np.array([max(1.0, s.steps * settings.period_s / 60.0) for s in buffer.sessions])
     constants = _constants(settings)
@@ -225,9 +227,7 @@ def _constants(settings: MdpSettings) -> Floats:
     return np.array([settings.c2, settings.c3, -settings.c4 / (100.0 if settings.tremor_as_fraction else 1.0)])
 
 
-def _standardised(severity: Floats | None) -> Floats | None:
-    if severity is None:
-        return None
+def _standardised(severity: Floats) -> Floats:
     level = severity - severity.mean()
     return np.asarray(level / max(float(level.std()), 1e-9), dtype=np.float64)
 

@@ -1,8 +1,10 @@
 """One regression per outcome: what it follows, what is known beforehand, and its posterior over dose shapes and levels of days.
 
-    grasp    N( one + dose + late dose + burden + severity + visit, s^2 )
-    rating   round( one + dose + over-stimulation + burden + tremor + severity + visit + noise ), cut to 1 to 10
-    tremor   minutes of n, p = mean over minutes of logistic( one + dose + burden + severity + visit ), overdispersed
+    grasp    N( one + dose + late dose + burden + covariates + visit, s^2 )
+    rating   round( one + dose + over-stimulation + burden + tremor + covariates + visit + noise ), cut to 1 to 10
+    tremor   minutes of n, p = mean over minutes of logistic( one + dose + burden + covariates + visit ), overdispersed
+
+Covariates are the severity of the session and how far medication has worn off, where they are known; no policy moves them.
 
 The dose of a step passes one of `SHAPES` before it is averaged: an effect that saturates is saturated at every moment, not on average.
 Priors are weak and say which way effects are expected to go; units are Hz, points of the rating, and logits of a minute.
@@ -11,7 +13,7 @@ Priors are weak and say which way effects are expected to go; units are Hz, poin
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Final, Literal
 
@@ -34,7 +36,15 @@ ORDER: Final[tuple[Outcome, ...]] = ("tremor", "grasp", "rating")
 KINDS: Final[dict[Outcome, Kind]] = {"grasp": "gaussian", "rating": "rounded", "tremor": "binomial"}
 
 PRIORS: Final[dict[Outcome, dict[str, tuple[float, float]]]] = {
-    "grasp": {"one": (-0.4, 1.0), "dose": (0.6, 0.8), "late": (0.3, 0.4), "burden": (-0.05, 0.1), "severity": (-0.1, 0.2)},
+    "grasp": {
+        "one": (-0.4, 1.0),
+        "dose": (0.6, 0.8),
+        "late": (0.3, 0.4),
+        "burden": (-0.05, 0.1),
+        "severity": (-0.1, 0.2),
+        "worn early": (-0.1, 0.2),
+        "worn late": (-0.1, 0.2),
+    },
     "rating": {
         "one": (-2.0, 3.0),
         "dose": (3.0, 3.0),
@@ -42,11 +52,21 @@ PRIORS: Final[dict[Outcome, dict[str, tuple[float, float]]]] = {
         "burden": (-0.25, 0.35),
         "tremor": (-2.0, 2.0),
         "severity": (-0.3, 0.5),
+        "worn early": (-0.3, 0.6),
+        "worn late": (-0.3, 0.6),
     },
-    "tremor": {"one": (-1.0, 6.0), "dose": (-5.0, 5.0), "burden": (0.25, 0.25), "severity": (0.3, 0.5)},
+    "tremor": {
+        "one": (-1.0, 6.0),
+        "dose": (-5.0, 5.0),
+        "burden": (0.25, 0.25),
+        "severity": (0.3, 0.5),
+        "worn early": (0.4, 0.8),
+        "worn late": (0.4, 0.8),
+    },
 }
 """Mean and standard deviation. `one` of grasp and rating is relative to the mean of the sessions. Dose is the change from no stimulation to
-cDBS, burden and severity that of one standard deviation between sessions, tremor that from none to all minutes. Chosen on part A of the
+cDBS, burden and severity that of one standard deviation between sessions, tremor that from none to all minutes, the worn ones that of
+medication that has worn off altogether. Chosen on part A of the
 virtual population, by the error of r_end given true sessions."""
 
 DAYS: Final[dict[Outcome, float]] = {"grasp": 0.15, "rating": 0.5, "tremor": 0.4}
@@ -65,10 +85,14 @@ KEPT: Final = 0.01
 
 @dataclass(frozen=True)
 class Sessions:
-    """What is known of n sessions besides their steps: index of the visit, [n], and severity (standardised), [n] or None."""
+    """What is known of n sessions besides their steps.
+
+    Attributes:
+        visit: index of it, [n]. covariates: by their name in `PRIORS`, [n] each, 0 for a session that is like the mean or not known.
+    """
 
     visit: NDArray[np.int64]
-    severity: Floats | None = None
+    covariates: Mapping[str, Floats] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -117,10 +141,10 @@ class Regression:
 
         Args:
             burden: [..., M]. tremor: predicted share of minutes, [...], where the rating follows it.
-            own: the sessions, along the last leading axis, whose visit and severity are to count; without them a new day's.
+            own: the sessions, along the last leading axis, whose visit and covariates are to count; without them a new day's.
         """
-        severity = own.severity if own is not None else None
-        columns, parts = design(self.outcome, member.shape, minutes, burden, tremor, severity)
+        covariates = own.covariates if own is not None else {}
+        columns, parts = design(self.outcome, member.shape, minutes, burden, tremor, covariates)
         eta = sum((columns[name] * w for name, w in zip(self.columns, member.fixed, strict=True) if name in columns), np.zeros(1))
         if own is not None:
             eta = eta + member.levels[own.visit][:, None]
@@ -128,15 +152,14 @@ class Regression:
 
 
 def design(
-    outcome: Outcome, shape: int, minutes: Minutes, burden: Floats, tremor: Floats | None, severity: Floats | None
+    outcome: Outcome, shape: int, minutes: Minutes, burden: Floats, tremor: Floats | None, covariates: Mapping[str, Floats]
 ) -> tuple[dict[str, Floats], Floats]:
     """Fixed columns [..., M'] by name and weights of the parts [..., M']; M' is 1 but for tremor, which is of minutes."""
     dose = minutes.features[..., DOSE + shape]
     if outcome == "tremor":
         columns = {"one": np.ones_like(dose), "dose": dose, "burden": burden}
-        if severity is not None:
-            columns["severity"] = np.broadcast_to(severity[..., None], dose.shape)
-        return columns, minutes.share
+        of_minutes = {name: np.broadcast_to(values[..., None], dose.shape) for name, values in covariates.items()}
+        return columns | of_minutes, minutes.share
     mean = (minutes.share * dose).sum(-1)
     whole = {"one": np.ones_like(mean), "dose": mean, "burden": (minutes.share * burden).sum(-1)}
     if outcome == "grasp":
@@ -145,8 +168,7 @@ def design(
         whole["over"] = (minutes.share * minutes.features[..., OVER]).sum(-1)
         if tremor is not None:
             whole["tremor"] = np.broadcast_to(tremor, mean.shape)
-    if severity is not None:
-        whole["severity"] = np.broadcast_to(severity, mean.shape)
+    whole |= {name: np.broadcast_to(values, mean.shape) for name, values in covariates.items()}
     return {name: values[..., None] for name, values in whole.items()}, np.ones((*mean.shape, 1))
 
 
@@ -180,7 +202,7 @@ def fit(
     """
     known = np.flatnonzero(np.isfinite(y))
     days = np.eye(int(sessions.visit.max()) + 1)[sessions.visit]
-    built = [design(outcome, k, minutes, burden, tremor, sessions.severity) for k in range(len(SHAPES))]
+    built = [design(outcome, k, minutes, burden, tremor, sessions.covariates) for k in range(len(SHAPES))]
     names = tuple(built[0][0])
     designs = []
     for columns, _ in built:

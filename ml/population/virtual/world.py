@@ -148,9 +148,17 @@ class World:
                     qoc=qoc,
                     random_lower_bound=bound,
                     holds=row.holds,
+                    medication_h=self.medication_h(row.hour),
                 )
             )
         return ReplayBuffer(self.settings, tuple(sessions), "uV", "table")
+
+    def medication_h(self, hour: float) -> float | None:
+        """Hours since the last dose at an hour of a visit; None of a patient who takes none. A dose works for two to four hours."""
+        if self.patient.med_need == 0:
+            return None
+        works = float(np.random.default_rng([self.key, 0x3ED1]).uniform(2.0, 4.0))
+        return hour - self.patient.med_off_h + works
 
     def data_days(self, rows: list[DataSession], seed: int) -> Days:
         """Days of planned sessions."""

@@ -35,6 +35,18 @@ FIELDS = ("lead", "beta", "amplitude", "brady", "tremor", "overload", "grasp_hz"
 FOLLOWING = ProportionalPolicy(0.6, 1.8, 0.2, 3)
 
 
+def test_sessions_say_the_time_since_a_dose_that_wears_off_two_to_four_hours_after_it():
+    told = [world("A", index) for index in range(WORLDS_PER_PART)]
+    taking = [w for w in told if w.patient.med_need > 0]
+    assert 0 < len(taking) < len(told)
+    assert all(w.medication_h(0.0) is None for w in told if w not in taking)
+    for w in taking:
+        assert 2.0 <= w.medication_h(w.patient.med_off_h) <= 4.0
+        assert w.medication_h(1.5) - w.medication_h(0.5) == pytest.approx(1.0)
+    hours = [s.medication_h for s in taking[0].data("paper").sessions]
+    assert hours[:2] == [taking[0].medication_h(0.0), taking[0].medication_h(1 / 3)]
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("kind", range(len(MECHANISMS)))
 def test_the_kernel_gives_the_numbers_of_the_equations(kind, seed):

@@ -10,9 +10,13 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.learning.models import BufferSnapshot
+from app.platform import files
+from app.platform.database import new_session
 from app.study import service as study
 from app.study.doses import service
 from app.study.doses.drugs import DRUGS, Drug, levodopa_equivalent_mg
@@ -21,6 +25,7 @@ from app.study.doses.since import disagreement_h, since_last_dose
 from app.study.models import StudySession
 from app.study.schemas import SessionChange
 from app.study.sessions.contradictions import Kind, contradictions
+from ml.trajectories import from_parquet
 from tests.app.study.conftest import START
 from tests.conftest import PASSWORD
 
@@ -133,6 +138,9 @@ def test_the_visit_page_the_snapshot_and_the_package_carry_them(client: TestClie
     assert snapshot["id"] != bare["id"]
     assert (bare["characteristics_version"], snapshot["characteristics_version"]) == (None, 1)
     assert [m["hours_since_dose"] for m in snapshot["members"]] == [pytest.approx(1.5)]
+    with new_session() as db:
+        stored = db.scalars(select(BufferSnapshot).order_by(BufferSnapshot.id)).all()
+        assert [from_parquet(files.read(s.file_sha256)).sessions[0].medication_h for s in stored] == [None, pytest.approx(1.5)]
     package = zipfile.ZipFile(io.BytesIO(client.get(f"/participants/{enrolled}/export.zip").content))
     rows = {n: list(csv.DictReader(io.StringIO(package.read(f"{enrolled}/{n}.csv").decode()))) for n in ("sessions", "doses")}
     assert float(rows["sessions"][0]["hours_since_dose"]) == pytest.approx(1.5)
