@@ -118,6 +118,7 @@ def _sessions_changed(flag: Flag) -> str:
         "included": "newly included",
         "decoded": "decoded anew",
         "cdbs": "with another cDBS amplitude",
+        "doses": "with other doses of medication at their visit",
         "moved": "whose times, control channel, controller or stop were corrected",
     }
     return f"{counted(int(number(flag)), 'session')} {what[flag.fact('change')]}"

@@ -85,7 +85,7 @@ def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot, se
     added = [s for s in sessions if s.id not in before]
     both = [(before[i], now[i]) for i in sorted(before.keys() & now.keys())]
     heads = study_repository.trace_heads(db, {g.recording_id for s in sessions for g in s.segments})
-    moved, readmitted = _edited(db, [s for _, s in both], snapshot.created_at)
+    moved, readmitted, redosed = _edited(db, [s for _, s in both], snapshot.created_at)
     barrier = gate(db, participant, sessions)
     opened = barrier.is_open and barrier.decision is not None and barrier.decision.created_at > snapshot.created_at
     found = Counter({"newer": len(added), "unconfirmed": len(before.keys() - now.keys())})
@@ -103,7 +103,7 @@ def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot, se
             old = (pinned.beta_trace_id, pinned.amplitude_trace_id)
             found["decoded"] += (present.beta_trace_id, present.amplitude_trace_id) != old
             found["cdbs"] += present.cdbs_ma != pinned.cdbs_amplitude_ma
-    found["moved"] = len(moved)
+    found["moved"], found["doses"] = len(moved), len(redosed)
     visits = tuple(str(n) for n in sorted({s.visit.number for s in added}))
     return [Flag.of("sessions_changed", float(n), None, "sessions", change=change, visits=visits) for change, n in found.items() if n]
 
@@ -123,10 +123,12 @@ def _was_read(pinned: SnapshotSession) -> bool:
     )
 
 
-def _edited(db: Session, sessions: Sequence[StudySession], moment: datetime) -> tuple[set[int], set[int]]:
-    """Sessions whose steps are other ones since a moment, and those that a person had excluded then and not any more."""
+def _edited(db: Session, sessions: Sequence[StudySession], moment: datetime) -> tuple[set[int], set[int], set[int]]:
+    """Sessions whose steps are other ones since a moment, those that a person had excluded then and not any more, and those whose time
+    since medication, as the visit's doses give it, may be another.
+    """
     ids, visits = [s.id for s in sessions], {s.visit_id for s in sessions}
-    wanted = {"session": ("id", ids), "session_segment": ("session_id", ids), "visit": ("id", visits)}
+    wanted = {"session": ("id", ids), "session_segment": ("session_id", ids), "visit": ("id", visits), "dose": ("visit_id", visits)}
     changed = repository.changed_since(db, moment, wanted)
     moved, readmitted = set(), set()
     for before, after in _pairs(*changed["session"]):
@@ -138,7 +140,9 @@ def _edited(db: Session, sessions: Sequence[StudySession], moment: datetime) -> 
     then, now = changed["session_segment"]
     moved |= {int(row["session_id"]) for row in (*(r for r in then if r not in now), *(r for r in now if r not in then))}
     renumbered = {int(after["id"]) for before, after in _pairs(*changed["visit"]) if before["number"] != after["number"]}
-    return moved | {s.id for s in sessions if s.visit_id in renumbered}, readmitted
+    dosed = {int(row["visit_id"]) for rows in changed["dose"] for row in rows}
+    redosed = {s.id for s in sessions if s.visit_id in dosed and s.medication_h is None}
+    return moved | {s.id for s in sessions if s.visit_id in renumbered}, readmitted, redosed
 
 
 def _pairs(then: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 
 import pytest
 from fastapi.testclient import TestClient
@@ -13,6 +14,9 @@ from app.evaluation import repository, wording
 from app.evaluation.ranking.staleness import stale_reasons
 from app.learning.gate.service import decide
 from app.learning.models import GateChoice
+from app.platform.web.charts import counted
+from app.study.doses.drugs import Drug
+from app.study.doses.models import Dose
 from app.study.models import CdbsAmplitude, Hemisphere, StudySession, Trace
 from app.study.repository import participant_by_code, sessions_of_participant
 from app.study.sessions.models import SessionConditions
@@ -137,13 +141,18 @@ def another_channel(_: Session, session: StudySession) -> None:
     session.control_channel = "no such channel"
 
 
+def medicated(db: Session, session: StudySession) -> None:
+    taken = (session.started_at or datetime(2026, 1, 1, 8, tzinfo=UTC)) - timedelta(hours=1)
+    db.add(Dose(visit_id=session.visit_id, drug=Drug.LEVODOPA, mg=100, taken_at=taken, entered_by="test"))
+
+
 def proposed_again(_: Session, session: StudySession) -> None:
     session.status = "proposed"
 
 
 @pytest.mark.parametrize(
     "change",
-    [decoded_again, stated_anew, amplitude_stated, renumbered, another_controller, another_channel, proposed_again],
+    [decoded_again, stated_anew, amplitude_stated, renumbered, another_controller, another_channel, medicated, proposed_again],
 )
 def test_a_reading_that_was_kept_gives_way_to_every_kind_of_change(
     change: Callable[[Session, StudySession], None], evaluated: int, db: Session
@@ -154,6 +163,16 @@ def test_a_reading_that_was_kept_gives_way_to_every_kind_of_change(
     change(db, sessions_of_participant(db, participant_by_code(db, "P1", SYSTEM).id)[0])
     db.commit()
     assert stale(db) != [], change.__name__
+
+
+def test_doses_of_a_visit_change_what_is_adjusted_for_and_make_it_stale_but_where_a_person_has_stated_the_time(
+    evaluated: int, db: Session
+) -> None:
+    first, *others = sessions_of_participant(db, participant_by_code(db, "P1", SYSTEM).id)
+    together = [s for s in (first, *others) if s.visit_id == first.visit_id and s.medication_h is None]
+    medicated(db, first)
+    db.commit()
+    assert stale(db) == [f"{counted(len(together), 'session')} with other doses of medication at their visit"]
 
 
 def test_what_a_transaction_read_before_a_change_does_not_hide_it(client: TestClient, evaluated: int, db: Session) -> None:
