@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from ml.faults import BROKE
 from ml.ope.compare.aggregate import combine, convex_weights, error_matrix
 from ml.ope.compare.skill import Prediction, choose_default, lead, skills, with_held_out_error
-from ml.ope.estimate import Estimate
+from ml.ope.estimate import Estimate, checked_horizon
 from ml.ope.fqe.estimator import Fqe, FqeConfig
 from ml.ope.importance import ImportanceSampling
 from ml.ope.linear.estimator import LinearConfig, LinearModel
@@ -181,15 +182,23 @@ def test_too_few_controllers_leave_the_choice_to_the_usual_order(linear_simulato
 
 
 def test_a_method_that_cannot_work_is_named_with_its_reason(small_buffer):
-    class Broken:
+    class Refusing:
         method = "dlsm"
 
         def fit(self, buffer, report=None, checkpoint_dir=None):
-            raise ValueError("needs more sessions")
+            checked_horizon(buffer, 0)
+
+    class Broken:
+        method = "fqe"
+
+        def fit(self, buffer, report=None, checkpoint_dir=None):
+            np.linalg.cholesky(-np.eye(2))
 
     bare = replace(small_buffer, sessions=tuple(replace(s, qoc=Qoc()) for s in small_buffer.sessions))
-    choice = choose_default(bare, {"dlsm": Broken(), "linear": LinearModel(LinearConfig(draws=20))})
-    assert choice.failed == {"dlsm": "needs more sessions"}
+    choice = choose_default(bare, {"dlsm": Refusing(), "fqe": Broken(), "linear": LinearModel(LinearConfig(draws=20))})
+    with pytest.raises(ValueError) as refused:
+        checked_horizon(small_buffer, 0)
+    assert choice.failed == {"dlsm": str(refused.value), "fqe": BROKE}, "what a library says of its arrays is nobody's reason"
     assert choice.method == "linear"
 
 

@@ -254,8 +254,8 @@ def test_outcomes_are_read_from_what_predicts_r_end_of_left_out_sessions_better(
     fitted = Dlsm(TINY).fit(small_buffer)
     latent = float(np.mean(np.concatenate([np.asarray(c.residual_end) for c in fitted.checks]) ** 2))
     assert fitted.end_source == ("latent" if latent <= fitted.end.by_session.residual[0] ** 2 else "summaries")
-    exact = replace(fitted, end=replace(fitted.end, residual=np.zeros(4)))
-    useless = replace(fitted, end=replace(fitted.end, residual=np.full(4, 1e6)))
+    ends = (replace(fitted.end, by_session=replace(fitted.end.by_session, residual=np.full(4, error))) for error in (0.0, 1e6))
+    exact, useless = (replace(fitted, end=end) for end in ends)
     assert (exact.end_source, useless.end_source) == ("summaries", "latent")
 
 
