@@ -160,8 +160,8 @@ def apart_where_equal(points: Sequence[tuple[float, float]], step: float) -> lis
 
 def written(text: str) -> str:
     """A text with units and contacts as people write them: device formats have `uV2` where a reader expects \u00b5V\u00b2, and `key 0 +2-0`
-    or `ONE_THREE_RIGHT` for the channel between two contacts."""
-    text = _CONTACTS.sub("contacts +\\1\u2212\\2", text) if "key " in text else text
+    or `ONE_THREE_RIGHT` for the channel between two contacts. Two channels may lie between the same ones, so that the number stays."""
+    text = _CONTACTS.sub("contacts +\\2\u2212\\3 (channel \\1)", text) if "key " in text else text
     text = _PAIR.sub(_pair, text) if "_" in text else text
     return _SQUARED.sub("\u00b5V\u00b2", _MICRO.sub("\u00b5\\1", text)) if "u" in text else text
 
@@ -212,7 +212,7 @@ def _pair(found: re.Match[str]) -> str:
     return f"contacts {_NUMBERS[found[1]]}\u2013{_NUMBERS[found[2]]} {found[3].lower()}"
 
 
-_CONTACTS = re.compile(r"\bkey \d+ \+(\w+)-(\w+)\b")
+_CONTACTS = re.compile(r"\bkey (\d+) \+(\w+)-(\w+)\b")
 _SQUARED = re.compile("\u00b5V2\\b")
 
 _DIGITS = 7

@@ -82,7 +82,9 @@ def test_a_montage_shows_its_five_configurations_its_loss_and_its_gaps(page_of: 
     assert sum(v is None for v in beta["y"]) > 50
     assert trace(page, "no valid window")
     spectrum = next(f for f in figures(page) if f["layout"]["yaxis"].get("type") == "log")
-    stn = next(t for t in spectrum["data"] if t["name"] == "key 0 +2-0")
+    names = [t["name"] for t in spectrum["data"]]
+    assert len(set(names)) == len(names), "channels between the same contacts are told apart"
+    stn = next(t for t in spectrum["data"] if t["name"] == "contacts +2\N{MINUS SIGN}0 (channel 0)")
     inside = [(y, x) for x, y in zip(stn["x"], stn["y"], strict=True) if 20 <= x <= 35]
     assert 24 <= max(inside)[1] <= 29
 
