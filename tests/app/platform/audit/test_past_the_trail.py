@@ -152,28 +152,26 @@ def test_a_default_that_would_write_other_times_or_words_is_named(
     owner_db.commit()
 
 
+def written_at_a_false_time(client: TestClient, enrolled: str, owner_db: Session, clock: str) -> None:
+    """One visit is written while the trail's clock says `clock`, the next when it is right again."""
+    for number, default in ((7, clock), (8, "clock_timestamp()")):
+        owner_db.execute(text(f"alter table audit_event alter column at set default {default}"))
+        owner_db.commit()
+        assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": number}).status_code == 201
+
+
 def test_what_was_written_at_a_false_time_stays_named_once_the_clock_is_right_again(
     client: TestClient, enrolled: str, owner_db: Session
 ) -> None:
     last = owner_db.scalar(text("select max(id) from audit_event"))
-    owner_db.execute(text("alter table audit_event alter column at set default '2020-01-01'"))
-    owner_db.commit()
-    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 7}).status_code == 201
-    owner_db.execute(text("alter table audit_event alter column at set default clock_timestamp()"))
-    owner_db.commit()
-    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 8}).status_code == 201
+    written_at_a_false_time(client, enrolled, owner_db, "'2020-01-01'")
     with new_session() as db:
         (named,) = verify(db).breaks
     assert (named.kind.value, (named.event_id or 0) > (last or 0)) == ("backdated", True)
 
 
 def test_a_clock_that_was_fast_is_accepted_with_a_reason_and_stays_listed(client: TestClient, enrolled: str, owner_db: Session) -> None:
-    owner_db.execute(text("alter table audit_event alter column at set default clock_timestamp() + interval '8 days'"))
-    owner_db.commit()
-    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 7}).status_code == 201
-    owner_db.execute(text("alter table audit_event alter column at set default clock_timestamp()"))
-    owner_db.commit()
-    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 8}).status_code == 201
+    written_at_a_false_time(client, enrolled, owner_db, "clock_timestamp() + interval '8 days'")
     with new_session() as db:
         (named,) = verify(db).breaks
     why, row = "the clock was 8 days ahead until it was set by NTP", str(named.event_id)
