@@ -115,6 +115,7 @@ class Writers:
         self.said = Acknowledged()
         self._installed, self._token, self._study, self._pause_s = installed, token, study, pause_s
         self._no_more, self._no_more_jobs, self._give_up = threading.Event(), threading.Event(), threading.Event()
+        self._begins_a_job = threading.Lock()
         self._faults: list[BaseException] = []
         works = (self._uploads, self._qocs, self._entries, self._jobs)
         self._threads = [threading.Thread(target=self._work, args=(work,), name=work.__name__, daemon=True) for work in works]
@@ -124,9 +125,12 @@ class Writers:
         for thread in self._threads:
             thread.start()
 
-    def stop_jobs(self) -> None:
-        """Begin no further job."""
+    def stop_jobs(self, seconds: float = 2 * ANSWER_S) -> None:
+        """Begin no further job; a request for one that is on its way is answered first. Raises RuntimeError where it is not."""
         self._no_more_jobs.set()
+        if not self._begins_a_job.acquire(timeout=seconds):
+            raise RuntimeError(f"a request for a job was not answered within {seconds:.0f} s: {self.said.answers}")
+        self._begins_a_job.release()
 
     def stop(self, seconds: float = 2 * ANSWER_S) -> None:
         """Let every thread bring its present write through, and end. Raises RuntimeError where one cannot."""
@@ -185,8 +189,11 @@ class Writers:
             self.said.entries.append(entry["uuid"])
 
     def _jobs(self, caller: httpx.Client) -> None:
-        if self._no_more_jobs.is_set():
-            return
+        with self._begins_a_job:
+            if not self._no_more_jobs.is_set():
+                self._begin_a_job(caller)
+
+    def _begin_a_job(self, caller: httpx.Client) -> None:
         listed = self._once(lambda: caller.get("/participants/S2/jobs", params={"limit": 20}))
         if listed is None or listed.status_code != 200:
             return

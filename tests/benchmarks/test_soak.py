@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,34 @@ def test_a_server_error_but_503_and_507_fails_a_run(
     callers._once(lambda: httpx.Response(status, text="what it says", request=asked))
     found = writers.what_is_wrong(Installed(), callers.said, study)
     assert found == [f"a request was answered with a server error: PUT /api/v1/sessions/1/qoc: {status} what it says"] * is_a_fault
+
+
+def test_a_request_for_a_job_that_is_on_its_way_is_answered_before_no_more_are_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What begins after the last jobs were counted would be running when the installation is stopped, and look lost."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    writers = importlib.import_module("installed.writers")
+    callers = writers.Writers(Installed(), "a token", writers.Study(1, 1, 1, 1))
+    sent, answered = threading.Event(), threading.Event()
+
+    def service(request: httpx.Request) -> httpx.Response:
+        if request.method == "GET":
+            return httpx.Response(200, json={"items": []})
+        sent.set()
+        answered.wait(60)
+        return httpx.Response(202, json={"id": "a job"})
+
+    with httpx.Client(transport=httpx.MockTransport(service), base_url="http://betaloop") as caller:
+        work = threading.Thread(target=callers._jobs, args=(caller,))
+        work.start()
+        assert sent.wait(60)
+        with pytest.raises(RuntimeError, match="a request for a job was not answered within 0 s"):
+            callers.stop_jobs(0.1)
+        answered.set()
+        callers.stop_jobs()
+        assert callers.said.jobs == ["a job"]
+        callers._jobs(caller)
+        assert callers.said.jobs == ["a job"]
+        work.join()
 
 
 @pytest.mark.parametrize(
