@@ -45,7 +45,8 @@ Anchor = Literal["logged", "cdbs", "best", "both", "all"]
 DEFAULT_SWEEP: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "all", "critic_memory": True}
 """What the pipeline trains where nothing else is asked for: the paper's algorithm, and one held near what was logged, near the best
 constant amplitude or near cDBS, with and without a share of r_end. DDPG alone went below cDBS in all participants of the demo. The three
-anchors span the energies, so that a visit has something to choose from. The critics see past amplitudes."""
+anchors span the energies, so that a visit has something to choose from; near the best constant amplitude policies are held twice, closely
+and with more room, because there most patients who respond have one that succeeds. The critics see past amplitudes."""
 
 
 class SweepParams(Model):
@@ -65,8 +66,8 @@ class SweepParams(Model):
         description="What TD3+BC and ReBRAC hold the policy near: the logged amplitudes, as published; the cDBS amplitude, so that it "
         "leaves the standard of care only where the values speak for it; `best`, the constant amplitude with the largest expected saving "
         "(energy saved times the probability that all QoCs keep within the margins) of those that sessions support and that probably "
-        "keep them; `both`, by turns logged and cDBS; or `all` three by turns. The others have no such bond. Where policies are "
-        "fine-tuned, by turns means what each was held near.",
+        "keep them, by turns closely and with more room; `both`, by turns logged and cDBS; or `all` by turns. The others have no such "
+        "bond. Where policies are fine-tuned, by turns means what each was held near, and as firmly.",
     )
     critic_memory: bool = Field(
         False,

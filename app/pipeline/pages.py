@@ -56,7 +56,7 @@ VALUE_NAMES = {
             "both": "by turns step rewards alone, and with the end-of-session reward"},
     "anchor": {"logged": "the logged amplitudes", "cdbs": "the cDBS amplitude", "best": "the best constant amplitude",
                "both": "by turns the logged and the cDBS amplitude",
-               "all": "by turns the logged amplitudes, the best constant one and the cDBS amplitude"},
+               "all": "by turns the best constant amplitude, the logged ones and the cDBS amplitude"},
     "preset": {"full": "full: for a study", "quick": "quick: for a first look"},
 }  # fmt: skip
 

@@ -16,7 +16,7 @@ from app.learning.schemas import ALGORITHM_NAMES, TrainParams
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.sweeps import service as sweeps
 from app.learning.sweeps.service import Group
-from app.learning.training.configs import training_groups
+from app.learning.training.configs import HELD_BY, training_groups
 from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, acting, plan_on_snapshot, policy_facts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
@@ -75,7 +75,7 @@ def training_starts(db: Session, participant_id: int, params: TrainParams) -> li
         known = {"checkpoint_sha256": policy.checkpoint_sha256} if policy.checkpoint_sha256 else {"onnx_sha256": policy.onnx_sha256}
         # a student has no critic: the sweep's own algorithm goes on from it
         algorithm = policy.algorithm if policy.checkpoint_sha256 else params.algorithms[0]
-        own = {name: policy.config[name] for name in ("aim", "anchor", "anchor_amplitude") if name in policy.config}
+        own = {name: policy.config[name] for name in ("aim", *HELD_BY) if name in policy.config}
         starts.append({"policy_id": policy.id, "algorithm": algorithm, "trained_with": own, **known})
     return starts
 

@@ -34,7 +34,10 @@ from ml.trajectories import ReplayBuffer
 FEWEST_TO_HOLD_OUT = 5
 """Sessions below which none is held out of a training."""
 
-CONSTANT_GRID = tuple(round(0.1 * k, 2) for k in range(1, 11))
+CONSTANT_GRID = tuple(round(0.05 * k, 2) for k in range(4, 21))
+"""Constant amplitudes that are asked for the best: twentieths from where stimulation is nearly off. Tenths lack the dose between one that
+saves a fifth of the energy and one that keeps the margins."""
+
 CLONE_UPDATES = 2000
 _CURVE_POINTS = 200
 
@@ -158,7 +161,7 @@ def known_tests(tested: Mapping[str, Any] | None, buffer: ReplayBuffer) -> Tests
 
 
 def supported_best(buffer: ReplayBuffer, margins: Mapping[str, float] | None, tests: Tests | None = None) -> float | None:
-    """`best_supported` of tenths that are probably within the margins; `margins` as `_judged_by` takes them."""
+    """`best_supported` of twentieths that are probably within the margins; `margins` as `_judged_by` takes them."""
     limits, levels = _judged_by(margins)
     constants = _gains(buffer, {f"{a:.2f}": ConstantPolicy(a) for a in CONSTANT_GRID}, limits, tests)
     return best_supported(constants, 1 - levels.unsafe_beyond)

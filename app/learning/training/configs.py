@@ -24,6 +24,16 @@ ANCHORED = ("td3_bc", "rebrac")
 BEST = "best"
 """As `anchor` of a configuration: near the best constant amplitude, which the child process finds before it trains."""
 
+CLOSE: dict[str, dict[str, Any]] = {"td3_bc": {"alpha": 1.25}, "rebrac": {"actor_penalty": 0.8}}
+"""How firmly policies are held near the best constant amplitude: at the published strength the critic, whose rewards miss most of what a
+dose does to symptoms, took them to doses that no session supports (docs/learning.md)."""
+
+LOOSE: dict[str, dict[str, Any]] = {"td3_bc": {"alpha": 2.5}, "rebrac": {"actor_penalty": 0.2}}
+"""The same with more room for what the values say; still firmer than ReBRAC's published 0.05."""
+
+HELD_BY = ("anchor", "anchor_amplitude", "alpha", "actor_penalty")
+"""Members of a configuration that say what a policy is held near, and how firmly."""
+
 FINE_TUNING = {"low": 1e-7, "high": 1e-5}
 """The paper's learning rates when going on from a tested policy."""
 
@@ -98,8 +108,8 @@ def _fine_tuning(params: TrainParams, k: int, start: dict[str, Any]) -> dict[str
     config = _config(params, start["algorithm"], actor_lr=rate, seed=params.seed + k)
     asked: dict[str, Any] = {"aim": "return" if params.aim == "return" else "steps"} | _anchors(params, start["algorithm"])[0]
     # By turns means what the parent had: its critics sum that aim, and another anchor would undo what was tested.
-    turns = {name for name, by_turns in (("aim", params.aim == "both"), ("anchor", params.anchor in ("both", "all"))) if by_turns}
-    kept = {name: value for name, value in start.get("trained_with", {}).items() if name.removesuffix("_amplitude") in turns}
+    turns = (("aim",) if params.aim == "both" else ()) + (HELD_BY if params.anchor in ("both", "all") else ())
+    kept = {name: value for name, value in start.get("trained_with", {}).items() if name in turns}
     config |= asked | kept
     return {"key": f"train/{k}", "algorithm": start["algorithm"], "configs": [config], "start": start}
 
@@ -111,13 +121,19 @@ def _variants(aims: Sequence[str], anchors: Sequence[dict[str, Any]]) -> list[di
 
 
 def _anchors(params: TrainParams, algorithm: str) -> list[dict[str, Any]]:
-    """What the policies of an algorithm are held near, as members of its configuration; the logged amplitudes first."""
-    logged: dict[str, Any] = {"anchor": "logged"}
-    cdbs: dict[str, Any] = {"anchor": "constant", "anchor_amplitude": 1.0}
-    best: dict[str, Any] = {"anchor": BEST}
+    """What the policies of an algorithm are held near, as members of its configuration; the best constant amplitude first, and twice."""
     if algorithm not in ANCHORED:
         return [{}]
-    return {"logged": [logged], "cdbs": [cdbs], "best": [best], "both": [logged, cdbs], "all": [logged, best, cdbs]}[params.anchor]
+    logged: dict[str, Any] = {"anchor": "logged"}
+    cdbs: dict[str, Any] = {"anchor": "constant", "anchor_amplitude": 1.0}
+    close, loose = ({"anchor": BEST} | strength[algorithm] for strength in (CLOSE, LOOSE))
+    return {
+        "logged": [logged],
+        "cdbs": [cdbs],
+        "best": [close, loose],
+        "both": [logged, cdbs],
+        "all": [close, logged, cdbs, loose],
+    }[params.anchor]
 
 
 def _rates(params: TrainParams, algorithm: str) -> tuple[float, float]:

@@ -13,12 +13,14 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.evaluation.models import Evaluation
 from app.learning.models import Policy
-from app.learning.schemas import TrainParams
+from app.learning.schemas import DEFAULT_SWEEP, TrainParams
 from app.learning.snapshots.service import take_snapshot
-from app.learning.training.configs import generation_groups
+from app.learning.training.configs import generation_groups, training_groups
 from app.pipeline.next_generation.parents import best
+from app.pipeline.training import training_starts
 from app.platform.jobs.models import Job
 from app.study.repository import participant_by_code
+from ml.rl.algorithms.rebrac import RebracConfig
 from tests.app.evaluations import judged
 
 Upload = Callable[..., int]
@@ -64,6 +66,21 @@ def policies_tested(client: TestClient, db: Session, policies: list[int], upload
     for policy_id in policies[:2]:
         upload("rl", visit=2, policy=str(policy_id))
     return policies
+
+
+def test_a_parent_is_trained_further_as_firmly_bound_as_it_was(db: Session, policies_tested: list[int]) -> None:
+    held = RebracConfig(aim="return", anchor="constant", anchor_amplitude=0.6, actor_penalty=0.3)
+    parent = db.get_one(Policy, policies_tested[0])
+    # a checkpoint says that its own algorithm goes on; its bytes are not read to plan a training
+    parent.algorithm, parent.config, parent.checkpoint_sha256 = "rebrac", held.to_json(), parent.onnx_sha256
+    db.commit()
+    params = TrainParams(policies=[parent.id], **DEFAULT_SWEEP)
+    (group,) = training_groups(params, training_starts(db, parent.participant_id, params))
+    (config,) = group["configs"]
+    assert {name: config[name] for name in ("aim", "anchor", "anchor_amplitude", "actor_penalty")} == {
+        "aim": "return", "anchor": "constant", "anchor_amplitude": 0.6, "actor_penalty": 0.3,
+    }  # fmt: skip
+    assert RebracConfig.from_json(config).actor_penalty == 0.3
 
 
 def press(client: TestClient) -> str:
