@@ -243,16 +243,23 @@ def hold_steps(rng: np.random.Generator, period_s: float) -> int:
 
 
 def ladder_session(settings: DesignSettings, visit: int, number: int) -> DesignedSession:
-    """The titration ladder: 1, 0.8, 0.6, ... for two minutes each, down to B at the lowest and within the safety limit."""
+    """The titration ladder: 1, 0.8, 0.6, ... for two minutes each, down to B at the lowest and within the safety limit.
+
+    It ends with the session, so that outcomes meet the lowest rung and anything low lies in the last minutes; before it stands cDBS. A
+    session too short for all rungs has the first ones.
+    """
     length = max(1, int(LADDER_SECONDS / settings.period_s))
-    decisions: list[Decision] = []
+    rungs: list[float] = []
     low_s = 0.0
-    for rung in range(round(1 / LADDER_STEP) + 1):
+    for rung in range(min(round(1 / LADDER_STEP) + 1, max(1, settings.steps // length))):
         amplitude = round(1.0 - LADDER_STEP * rung, 6)
         low_s += length * settings.period_s * (amplitude < LOW_AMPLITUDE)
         if amplitude < settings.lower_bound or low_s > LOW_SECONDS:
             break
-        decisions.append(Decision(rung * length, length, amplitude, None))
+        rungs.append(amplitude)
+    first = settings.steps - (len(rungs) - 1) * length
+    decisions = [Decision(0, first, rungs[0], None)]
+    decisions += [Decision(first + k * length, length, amplitude, None) for k, amplitude in enumerate(rungs[1:])]
     return DesignedSession("ladder", visit, number, None, settings.seed, tuple(decisions))
 
 

@@ -46,8 +46,9 @@ def test_no_step_is_below_the_bound_and_low_ones_end_after_five_minutes(seed, bo
         assert a.max() <= 1
         assert 2.0 * np.sum(a < LOW_AMPLITUDE) <= LOW_SECONDS
         assert session.level is None or bound <= session.level <= 1
-        if session.design == "stratified":
-            assert a.size == steps
+        assert a.size == steps
+        if session.design in ("stratified", "ladder"):
+            assert np.all(np.flatnonzero(a < LOW_AMPLITUDE) >= steps - LOW_SECONDS / 2.0), "low ones at the end alone"
 
 
 @given(seed=seeds, bound=bounds, visits=st.integers(1, 6), sessions=st.integers(1, 6), ladder=st.booleans())
@@ -134,7 +135,15 @@ def test_the_ladder_goes_down_by_fifths_to_the_bound_or_the_limit(bound, rungs):
     session = lay_out(stratified(lower_bound=bound, ladder=True))[0]
     assert session.design == "ladder"
     assert [d.amplitude for d in session.decisions] == pytest.approx(rungs)
-    assert all(d.steps == 60 and d.log_density is None for d in session.decisions)
+    assert all(d.log_density is None for d in session.decisions)
+    assert [d.steps for d in session.decisions] == [300 - 60 * (len(rungs) - 1), *[60] * (len(rungs) - 1)], "it ends with the session"
+
+
+@pytest.mark.parametrize(("minutes", "rungs"), [(1, [1]), (5, [1, 0.8]), (7, [1, 0.8, 0.6]), (20, [1, 0.8, 0.6, 0.4])])
+def test_a_ladder_takes_the_rungs_that_a_session_has_time_for(minutes, rungs):
+    session = lay_out(stratified(ladder=True, steps=30 * minutes))[0]
+    assert [d.amplitude for d in session.decisions] == pytest.approx(rungs)
+    assert session.amplitudes.size == 30 * minutes
 
 
 def test_the_same_seed_gives_the_same_design_and_another_one_another():

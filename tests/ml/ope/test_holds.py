@@ -11,6 +11,7 @@ from ml.ope.behaviour import clones
 from ml.ope.doubly_robust import DoublyRobust
 from ml.ope.fqe.estimator import FqeConfig
 from ml.ope.fqe.steps import TargetActions
+from ml.ope.holds import abstention
 from ml.ope.importance import ImportanceSampling, kernel_log_density
 from ml.policies.logged_range import random_bound
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
@@ -65,6 +66,16 @@ def test_importance_sampling_abstains_by_name_for_a_policy_that_acts_within_a_ho
     assert not found["follows"].supported
     assert np.isfinite(found["follows"].value)
     assert "acts_within_hold" not in {f.code for f in found["fixed"].flags}
+
+
+@pytest.mark.parametrize(("apart", "acts"), [(0.9 * WIDTH, False), (1.1 * WIDTH, True)])
+def test_what_moves_by_less_than_the_kernel_can_tell_is_one_decision(apart, acts):
+    session = held_buffer().sessions[0]
+    steps = np.arange(300)
+    moving = np.where(steps % 10 < 5, 0.6, 0.6 + apart)
+    assert abstention(session, steps, moving, WIDTH) == ("acts_within_hold" if acts else None)
+    between = np.where(steps // 10 % 2 == 0, 0.6, 0.6 + 3 * WIDTH)
+    assert abstention(session, steps, between, WIDTH) is None, "what changes where a new draw was made acts within none"
 
 
 def test_held_draws_of_no_stated_design_have_no_weight():
