@@ -103,7 +103,8 @@ def all_jobs_page(request: Request, db: Db, caller: CurrentCaller, paging: Pagin
         withdrawn=withdrawn_codes(participants),
         stoppable={p.id for p in participants if may(caller, can.RUN_JOBS, p)},
         startable=[p.code for p in participants if may(caller, can.RUN_JOBS, p)][:MOST_NAMED],
-        live=live,
+        # those at work, then those that wait, in the order in which they will begin
+        live=sorted(live, key=lambda job: (job.status != JobStatus.RUNNING, job.created_at)),
         ended=ended,
         total=total,
         paging=paging,

@@ -116,6 +116,24 @@ def test_all_jobs_stand_in_one_page_with_their_participant(browser: TestClient, 
     assert "100 %" not in page
 
 
+def test_jobs_at_work_stand_before_those_that_wait_in_the_order_in_which_they_begin(
+    browser: TestClient, enrolled: str, db: Session
+) -> None:
+    waits = [_job(db, JobStatus.QUEUED, k) for k in (1, 2)]
+    works = _job(db, JobStatus.RUNNING, 3)
+    for minutes, job in zip((30, 20, 40), (*waits, works), strict=True):
+        job.created_at = datetime.now(UTC) - timedelta(minutes=minutes)
+    db.commit()
+    page = browser.get("/jobs").text
+    places = [page.index(f'action="/jobs/{job.id}/cancel"') for job in (works, *waits)]
+    assert places == sorted(places)
+    works.created_at = datetime.now(UTC)
+    db.commit()
+    page = browser.get("/jobs").text
+    places = [page.index(f'action="/jobs/{job.id}/cancel"') for job in (works, *waits)]
+    assert places == sorted(places), "whenever it was asked for"
+
+
 def test_a_job_is_stopped_from_the_list_by_those_who_may_and_says_so(
     browser: TestClient, sign_in: Callable[[str], TestClient], enrolled: str, db: Session
 ) -> None:
@@ -161,12 +179,12 @@ def test_energy_saved_is_weighted_by_minutes() -> None:
     assert overall([]) is None
 
 
-def _job(db: Session, status: JobStatus) -> Job:
+def _job(db: Session, status: JobStatus, number: int = 0) -> Job:
     participant = db.query(Participant).filter_by(code="P1").one()
     now = datetime.now(UTC)
     ended = now if status == JobStatus.SUCCEEDED else None
     row = Job(
-        id="4f00aaaa-0000-4000-8000-000000000000", participant_id=participant.id, kind="train", status=status, progress=0.996, params={},
+        id=f"4f00aaaa-0000-4000-8000-{number:012d}", participant_id=participant.id, kind="train", status=status, progress=0.996, params={},
         code_version=jobs.code_version(), created_by="test", started_at=now - timedelta(minutes=5), finished_at=ended,
     )  # fmt: skip
     db.add(row)
