@@ -151,19 +151,20 @@ def session_noise(buffer: ReplayBuffer) -> dict[str, float]:
 
 
 def return_noise(buffer: ReplayBuffer, horizon_steps: int) -> float:
-    """Standard deviation of a session's return from session to session under one steady controller at one visit, reward units.
+    """Standard deviation of a session's return from session to session under one controller at one visit, reward units.
 
-    0 where fewer than three degrees of freedom speak about it. A missing r_end leaves the session out where others have one; where no
-    session has one, a return is its steps' part.
+    Random sessions count only where the others have too few, as in `session_noise`; 0 where fewer than three degrees of freedom speak about
+    it all the same. A missing r_end leaves the session out where others have one; where no session has one, a return is its steps' part.
     """
-    found = [(s, actual_return(s, buffer.settings, horizon_steps)) for s in buffer.sessions if s.controller != "random"]
+    found = [(s, actual_return(s, buffer.settings, horizon_steps)) for s in buffer.sessions]
     with_end = any(value.end_reward is not None for _, value in found)
     groups: dict[tuple[object, ...], list[float | None]] = {}
     for s, value in found:
         end = value.end_reward if with_end else 0.0
         whole = None if value.step_return is None or end is None else value.step_return + end
         groups.setdefault((s.visit, s.controller, s.policy_id), []).append(whole)
-    return _within_groups(list(groups.values()))
+    steady = [values for key, values in groups.items() if key[1] != "random"]
+    return _within_groups(steady) or _within_groups(list(groups.values()))
 
 
 def _within_groups(groups: Sequence[Sequence[float | None]]) -> float:

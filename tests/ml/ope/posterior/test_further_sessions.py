@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -13,6 +16,7 @@ from ml.ope.posterior.further_sessions import (
     Needed,
     Place,
     reachable,
+    return_noise,
     session_noise,
     sessions_to_tell,
     worth_exploring,
@@ -20,7 +24,9 @@ from ml.ope.posterior.further_sessions import (
 )
 from ml.ope.posterior.support import LATE_STEPS, NEAR
 from ml.ope.posterior.verdict import Levels
+from ml.population.virtual import world
 from ml.qoc import Qoc
+from ml.returns import actual_return
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 from tests.ml.ope.posterior.draws import RANKS
 
@@ -142,6 +148,21 @@ def test_random_sessions_count_only_where_the_others_are_too_few() -> None:
     assert session_noise(buffer_of(*random, (1, "cdbs", 7))) == {"rating": pytest.approx(np.sqrt(64 / 3))}
     steady = [(1, "cdbs", 7), (1, "cdbs", 7), (2, "cdbs", 7), (2, "cdbs", 8), (2, "cdbs", 8)]
     assert session_noise(buffer_of(*random, *steady))["rating"] < 1
+
+
+def test_the_noise_of_a_return_is_never_taken_as_none_because_cdbs_ran_too_seldom() -> None:
+    """One cDBS session a visit, as a plan with one or two policies has: the random sessions, wider by their doses, speak instead."""
+    buffer = world("A", 2).data("stratified")
+    cdbs = [s for s in buffer.sessions if s.controller == "cdbs"]
+    first = [next(s for s in cdbs if s.visit == visit) for visit in {s.visit for s in cdbs}]
+    random = [s for s in buffer.sessions if s.controller == "random"]
+    seldom = replace(buffer, sessions=(*random, *first))
+    groups = defaultdict(list)
+    for s in random:
+        groups[s.visit].append(actual_return(s, buffer.settings, 300).value)
+    expected = np.sqrt(sum(np.sum((np.array(g) - np.mean(g)) ** 2) for g in groups.values()) / sum(len(g) - 1 for g in groups.values()))
+    assert return_noise(seldom, 300) == pytest.approx(float(expected))
+    assert 0 < return_noise(replace(buffer, sessions=tuple(cdbs)), 300) == return_noise(buffer, 300), "cDBS alone where it ran often"
 
 
 def test_too_few_sessions_tell_no_noise() -> None:
