@@ -142,6 +142,16 @@ def _cdbs_above(flag: Flag) -> str:
     )
 
 
+def _tests_not_counted(flag: Flag) -> str:
+    why = {
+        "without_cdbs": "at a visit without cDBS",
+        "of_unknown_noise": "with outcomes of which nothing tells yet how far sessions differ by chance",
+        "without_policy": "of a policy that cannot be replayed, because its file is gone or it takes other windows",
+    }
+    parts = [f"{flag.fact(name):.0f} {text}" for name, text in why.items() if flag.fact(name)]
+    return f"{counted(int(number(flag)), 'session')} of tested policies not counted in full: {', '.join(parts)}"
+
+
 _SENTENCES: dict[str, Callable[[Flag], str]] = {
     TEXT: lambda f: str(f.fact("text")),
     # of estimates and of what the data cover
@@ -197,6 +207,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         f"{counted(int(number(f)), 'session')} stopped for the participant's sake: counted as failures with the worst outcomes. "
         f"Counted as measured, the end-of-session reward would be {f.fact('measured'):.1f} instead of {f.fact('counted'):.1f}"
     ),
+    "tests_not_counted": _tests_not_counted,
     "no_better_than_mean": lambda f: (
         f"left-out sessions are predicted no better than by the mean of the others (error {number(f):.2f} of that one's)"
     ),

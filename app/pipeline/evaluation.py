@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from app.evaluation import repository, service
 from app.evaluation.estimates import compute, dose_shapes
-from app.evaluation.ranking.results import driven_sessions, tests_of
+from app.evaluation.ranking.tested import replayable, tested
 from app.evaluation.schemas import EvaluateParams
 from app.learning.models import BufferSnapshot
 from app.learning.policies.baselines import ensure_baselines
@@ -86,14 +86,16 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
         references = ensure_baselines(db, participant, row, buffer, job.created_by)
         horizon = params.horizon_steps or row.median_steps
         everyone = (*candidates, *references)
-        ran = driven_sessions(db, row, acting(job))
+        shown_by = tested(db, row, buffer, horizon, acting(job))
         driven = repository.policies_by_id(db, sorted({s.policy_id for s in buffer.sessions if s.policy_id is not None}))
         return {
             "candidates": [p.id for p in candidates],
-            "ran": [{"id": p.id, "sha256": p.onnx_sha256} for p in driven.values()],
+            "ran": [{"id": p.id, "sha256": p.onnx_sha256} for p in driven.values() if replayable(p, buffer.settings.window)],
             "policies": [{"id": p.id, "sha256": p.onnx_sha256} for p in everyone],
             "horizon_steps": horizon,
-            "tests": tests_of(ran, buffer.settings, horizon, {p.id for p in everyone}),
+            "tests": shown_by.tests,
+            "tested": shown_by.beside({p.id for p in everyone}),
+            "tests_left_out": shown_by.left_out,
             "others": dose_shapes.of_others(db, participant, settings_version(db, row.settings_version_id)),
         }
 
@@ -108,7 +110,9 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
     methods = _fitted(params)
     others = chosen.get("others")  # a job that an earlier version began does not have it
     pooled = {"others": others["evidence"]} if others else {}
-    own: dict[str, dict[str, Any]] = {"dlsm": models, POSTERIOR: {"tests": chosen["tests"]} | pooled}
+    # nor the policies that are tested and not evaluated, of which its tests are not
+    shown_by = {name: chosen[name] for name in ("tests", "tested", "tests_left_out") if name in chosen}
+    own: dict[str, dict[str, Any]] = {"dlsm": models, POSTERIOR: shown_by | pooled}
     calls: list[ComputeStep] = [(COVERAGE_STEP, "check_coverage", common)]
     calls += [(f"estimate/{method}", "evaluate_method", common | {"method": method} | own.get(method, {})) for method in methods]
     calls.append((SKILL_STEP, "choose_method", common | {"methods": params.methods, "policies": chosen["ran"]}))

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.evaluation.ranking.results import driven_sessions, tests_of
+from app.evaluation.ranking.tested import tested
 from app.learning import repository
 from app.learning.models import BufferSnapshot
 from app.learning.policies import service
@@ -47,14 +47,10 @@ def tested_so_far(db: Session, snapshot: BufferSnapshot, caller: Caller) -> dict
     """What sessions of policies showed, as the evaluation of the same snapshot would know it; sweeps go by it too.
 
     Returns:
-        `tests`, as `tests_of` makes them, and `policies` that they are of as [{`id`, `sha256`}].
+        `tests`, as `Tested` has them, and `policies` that they are of, retired ones too, as [{`id`, `sha256`}].
     """
-    ran, settings = driven_sessions(db, snapshot, caller), read_buffer(snapshot.file_sha256).settings
-    driven = {s.policy_id for s in ran}
-    usable = [p for p in repository.candidates(db, snapshot.participant_id) if p.id in driven and service.window_of(p) == settings.window]
-    tests = tests_of(ran, settings, snapshot.median_steps, {p.id for p in usable})
-    named = {test["policy_name"] for test in tests}
-    return {"tests": tests, "policies": [{"id": p.id, "sha256": p.onnx_sha256} for p in usable if str(p.id) in named]}
+    found = tested(db, snapshot, read_buffer(snapshot.file_sha256), snapshot.median_steps, caller)
+    return {"tests": found.tests, "policies": found.beside(())}
 
 
 def training_starts(db: Session, participant_id: int, params: TrainParams) -> list[dict[str, Any] | None]:

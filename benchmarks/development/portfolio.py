@@ -48,7 +48,7 @@ from ml.ope.estimate import Estimate
 from ml.ope.posterior.estimator import FittedPosterior, build
 from ml.ope.posterior.further_sessions import MOST_HELD, Further, Place, further_sessions, session_noise, worth_exploring, worth_holding
 from ml.ope.posterior.portfolio import portfolio
-from ml.ope.posterior.tested import TestSession, differences_to_cdbs
+from ml.ope.posterior.tested import TestSession, differences_to_cdbs, spread_of_random
 from ml.ope.posterior.verdict import SETTLED_BY_SESSIONS, Levels, verdict
 from ml.ope.registry import estimators
 from ml.policies.policy import ConstantPolicy, Policy
@@ -179,7 +179,8 @@ def by_posterior(clinic: Clinic, fitted: FittedPosterior, *, respecting: bool, h
             b = fitted.buffer
             more = clinic.held(number, levels, TEST_PLACES[len(names) : len(names) + len(levels)])
             fitted = build("posterior", 0, "demo").fit(replace(b, sessions=b.sessions + more))
-        estimates = replace(fitted, tests=tuple(differences_to_cdbs(sessions))).evaluate(everyone, STEPS)
+        shown = differences_to_cdbs(sessions, spread_of_random(fitted.buffer, STEPS)).tests
+        estimates = replace(fitted, tests=shown).evaluate(everyone, STEPS)
         tested.append(names)
         held.append(len(levels))
         kept.append(max([CDBS, *sorted(had.union(names))], key=lambda name: estimates[name].value))

@@ -97,6 +97,19 @@ def stopped_sessions(stopped: int, counted: float, measured: float) -> Flag:
     return Flag.of("stopped_sessions", float(stopped), None, "sessions", counted=counted, measured=measured)
 
 
+def not_counted_tests(without_cdbs: int = 0, of_unknown_noise: int = 0, without_policy: int = 0) -> Flag | None:
+    """Sessions of tested policies that the posterior does not know of; None where it knows of all.
+
+    Args:
+        without_cdbs: at visits without a cDBS session. of_unknown_noise: with a quantity of which nothing tells how far sessions differ by
+            chance. without_policy: of policies that cannot be replayed: their file is gone, or they take other windows.
+    """
+    number = without_cdbs + of_unknown_noise + without_policy
+    why = {"without_cdbs": without_cdbs, "of_unknown_noise": of_unknown_noise, "without_policy": without_policy}
+    flag = Flag("tests_not_counted", float(number), None, "sessions", facts=tuple((name, float(n)) for name, n in why.items()))
+    return flag if number else None
+
+
 def distinct(flags: Iterable[Flag]) -> tuple[Flag, ...]:
     """The flags in their order, each once; two that nobody could tell apart when shown are one."""
     seen: dict[tuple[object, ...], Flag] = {}

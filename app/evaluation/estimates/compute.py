@@ -17,6 +17,7 @@ from ml.faults import said_of
 from ml.loading import load_libraries
 from ml.ope.compare.skill import choose_default
 from ml.ope.dlsm.config import DlsmConfig
+from ml.ope.flags import not_counted_tests
 from ml.ope.posterior.further_sessions import session_noise
 from ml.ope.posterior.gaussian import TestedDifference
 from ml.ope.registry import AGGREGATE, POSTERIOR, Size, build, estimators, quick_estimators
@@ -79,8 +80,9 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -
     Args:
         params: `snapshot_sha256`, `preset`, `seed`, `method`, `horizon_steps`, `policies` as [{`id`, `sha256`}], and for the DLSM
             `members`, the stored files of its ensemble; or `failed`, the reason why its ensemble could not be fitted; for the posterior
-            `tests`, tested sessions as the fields of `TestedDifference`, and `others`, of every participant whose dose shapes are pooled
-            the log evidence by outcome; absent where none are to be.
+            `tests`, tested sessions as the fields of `TestedDifference`; `tested`, policies beside these that tests are of, which get no
+            estimate; `tests_left_out`, how many sessions are not among the tests, as arguments of `not_counted_tests`; and `others`, of
+            every participant whose dose shapes are pooled the log evidence by outcome; each absent where there is none.
         workdir: scratch.
         report: progress, and learning curves where the method trains a network.
 
@@ -92,13 +94,14 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -
         return {"failed": params["failed"]}
     buffer = read_buffer(params["snapshot_sha256"])
     estimator = build(params["method"], params["seed"], _size(params))
-    if params.get("tests"):
-        estimator = cast("Posterior", estimator).with_tests([TestedDifference(**test) for test in params["tests"]])
+    tests, left_out = params.get("tests"), not_counted_tests(**params.get("tests_left_out", {}))
+    if tests or left_out is not None:
+        estimator = cast("Posterior", estimator).with_tests([TestedDifference(**test) for test in tests or ()], left_out)
     if params.get("others") is not None:
         estimator = cast("Posterior", estimator).with_others(params["others"])
     for k, sha256 in enumerate(params.get("members", [])):
         write_atomically(workdir / member_file(k), files.read(sha256))
-    policies = _policies(params["policies"], buffer)
+    policies = _policies([*params["policies"], *params.get("tested", [])], buffer)
     # curves of members that learn one after the other; those of DualDICE learn side by side
     members: int = getattr(estimator, "successive_members", 1)
 
@@ -119,7 +122,8 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -
         estimates = fitted.evaluate(policies, params["horizon_steps"], rolling)
     except ValueError as error:
         return {"failed": said_of(error, report.log)}
-    result: dict[str, Any] = {"estimates": {policy_id: _finite(e.to_json()) for policy_id, e in estimates.items()}}
+    asked = [str(p["id"]) for p in params["policies"]]
+    result: dict[str, Any] = {"estimates": {policy_id: _finite(estimates[policy_id].to_json()) for policy_id in asked}}
     if params["method"] == POSTERIOR:
         result[dose_shapes.STORED] = dose_shapes.found(cast("FittedPosterior", fitted))
     return result

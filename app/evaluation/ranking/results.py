@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from statistics import fmean, median
-from typing import Any
 
 from sqlalchemy.orm import Session
 
@@ -28,7 +27,6 @@ from app.study.threshold import mdp_settings
 from app.study.traces import TracesOf, laid_out, traces_of
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
 from ml.mdp import MdpSettings
-from ml.ope.posterior.tested import TestSession, differences_to_cdbs
 from ml.trajectories import SessionTrajectory
 
 WORST = {"grasp_hz": min, "rating": min, "tremor_percent": max}
@@ -119,27 +117,6 @@ def tested_before(
         return results_by_policy(ran, settings, evaluation.horizon_steps, cdbs)
 
     return kept(key, read)
-
-
-def tests_of(ran: Sequence[DrivenSession], settings: MdpSettings, horizon_steps: int, policy_ids: Collection[int]) -> list[dict[str, Any]]:
-    """Sessions of policies as differences to the same visit's cDBS, for the posterior: fields of `TestedDifference`, JSON-able.
-
-    Args:
-        ran: sessions of policies and of cDBS. settings, horizon_steps: of the estimates.
-        policy_ids: what is evaluated; a session of another policy says nothing here.
-    """
-    sessions = []
-    for session in ran:
-        if session.trajectory is None or (session.policy_id is not None and session.policy_id not in policy_ids):
-            continue
-        result = actual(session.trajectory, settings, horizon_steps)
-        # a session that was stopped is a failure here as it is in buffers, whatever was measured
-        counted = {name: v for name, v in asdict(session.trajectory.counted_qoc).items() if v is not None}
-        values = {name: v for name, v in result.shown.items() if name != "mean_beta"} | counted
-        if result.value is not None:
-            values["return"] = result.value
-        sessions.append(TestSession(None if session.policy_id is None else str(session.policy_id), session.visit, values))
-    return [asdict(test) for test in differences_to_cdbs(sessions)]
 
 
 def _read(session: StudySession, traces: TracesOf, arm: Arm, version: SettingsVersion, snapshot: BufferSnapshot) -> SessionTrajectory | str:

@@ -7,9 +7,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.evaluation.estimates import dose_shapes
-from app.evaluation.ranking.results import driven_sessions, tests_of
 from app.learning.models import BufferSnapshot, Policy
-from app.learning.snapshots.buffers import read_buffer
 from app.learning.training.configs import generation_groups
 from app.pipeline.distillation import declare_distillation, distil_all
 from app.pipeline.evaluation import declare_evaluation, declare_fit, evaluate_all, fit_calls, store_members
@@ -57,10 +55,8 @@ def _plan(db: Session, job: JobContext, snapshot: BufferSnapshot) -> dict[str, A
     known = posterior_on(db, snapshot.participant_id, snapshot.id)
     if all(p.id in known for p in tested):
         return plan | {"posterior": {str(p.id): known[p.id] for p in tested}}
-    settings = read_buffer(snapshot.file_sha256).settings
-    tests = tests_of(driven_sessions(db, snapshot, acting(job)), settings, snapshot.median_steps, {p.id for p in tested})
     others = dose_shapes.of_others(db, participant_of(db, job), settings_version(db, snapshot.settings_version_id))
-    return plan | {"posterior": None, "tests": tests, "others": others, "horizon_steps": snapshot.median_steps}
+    return plan | {"posterior": None, "others": others, "horizon_steps": snapshot.median_steps}
 
 
 def _starts(job: JobContext, params: NextGenerationParams, planned: dict[str, Any]) -> list[dict[str, Any]]:
@@ -82,18 +78,26 @@ def _starts(job: JobContext, params: NextGenerationParams, planned: dict[str, An
 
 def _judge(job: JobContext, params: NextGenerationParams, planned: dict[str, Any]) -> dict[str, float]:
     """The posterior returns of the tested policies with what their sessions showed."""
-    others = planned.get("others")  # a job that an earlier version began does not have it
     job.step(JUDGE, "Judge the tested policies with the sessions since the last ranking", weight=shown(POSTERIOR).weight)
-    call = {
+    found = job.compute(JUDGE, "evaluate_method", judging_call(params, planned))
+    if "failed" in found:
+        raise JobError(f"Which tested policy did best cannot be told: {found['failed']}. Start a 'pipeline' that names the policies.")
+    return {policy_id: float(estimate["value"]) for policy_id, estimate in found["estimates"].items()}
+
+
+def judging_call(params: NextGenerationParams, planned: dict[str, Any]) -> dict[str, Any]:
+    """Params by which `evaluate_method` judges the tested policies; a plan that an earlier version made has `tests` of these alone."""
+    others = planned.get("others")
+    known = {"tests": planned["tests"]} if "tests" in planned else planned["tested_so_far"]
+    judged = {p["id"] for p in planned["tested"]}
+    return {
         "snapshot_sha256": planned["snapshot"]["sha256"],
         "preset": params.preset,
         "seed": params.seed,
         "method": POSTERIOR,
         "horizon_steps": planned["horizon_steps"],
         "policies": [{"id": p["id"], "sha256": p["sha256"]} for p in planned["tested"]],
-        "tests": planned["tests"],
+        "tests": known["tests"],
+        # what cannot be a parent, as a retired policy, informs those that can
+        "tested": [p for p in known.get("policies", []) if p["id"] not in judged],
     } | ({"others": others["evidence"]} if others else {})
-    found = job.compute(JUDGE, "evaluate_method", call)
-    if "failed" in found:
-        raise JobError(f"Which tested policy did best cannot be told: {found['failed']}. Start a 'pipeline' that names the policies.")
-    return {policy_id: float(estimate["value"]) for policy_id, estimate in found["estimates"].items()}

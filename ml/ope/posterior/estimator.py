@@ -75,17 +75,19 @@ class Posterior:
 
     Attributes:
         tests: tested sessions as differences to the same visit's cDBS; their policies must be among those that are evaluated.
+        not_counted: a flag where some of the tested sessions are not among the tests, for every estimate.
         others: what the data of other participants say of the outcomes' dose shapes; None: they are not asked.
     """
 
     config: PosteriorConfig = field(default_factory=PosteriorConfig)
     method: str = "posterior"
     tests: tuple[TestedDifference, ...] = ()
+    not_counted: Flag | None = None
     others: tuple[Evidence, ...] | None = None
 
-    def with_tests(self, tests: Sequence[TestedDifference]) -> Posterior:
+    def with_tests(self, tests: Sequence[TestedDifference], not_counted: Flag | None = None) -> Posterior:
         """The same estimator knowing tested sessions as well; `evaluate` raises ValueError where a tested policy is not evaluated."""
-        return replace(self, tests=tuple(tests))
+        return replace(self, tests=tuple(tests), not_counted=not_counted)
 
     def with_others(self, others: Sequence[Evidence]) -> Posterior:
         """The same estimator with the dose shapes of outcomes pooled with other participants' where the proof holds."""
@@ -112,7 +114,7 @@ class Posterior:
         total = sum(shares.values())
         ends = fit_end_model(buffer, draws=total, seed=c.seed, severity=np.asarray(severity), wider=1.0)
         report(1.0, "fitting the outcomes")
-        fitted = FittedPosterior(self.method, c, buffer, scale, tuple(fits), shares, predictions, equal, ends, self.tests)
+        fitted = FittedPosterior(self.method, c, buffer, scale, tuple(fits), shares, predictions, equal, ends, self.tests, self.not_counted)
         return fitted if self.others is None else fitted.with_pooled(pool(ends.shape_evidence, self.others))
 
 
@@ -136,6 +138,7 @@ class FittedPosterior:
     equal: Floats
     ends: EndModel
     tests: tuple[TestedDifference, ...]
+    not_counted: Flag | None = None
     pooled: Pooled | None = None
 
     def with_pooled(self, pooled: Pooled) -> FittedPosterior:
@@ -166,7 +169,7 @@ class FittedPosterior:
         look, found = AmplitudeSupport(self.buffer), {}
         moved = self._moved_as_measured(chosen, replays, horizon)
         for i, name in enumerate(names[:-1]):
-            flags = list(look.of_policy(chosen[i]).flags())
+            flags = [*look.of_policy(chosen[i]).flags(), *((self.not_counted,) if self.not_counted else ())]
             if moved is not None:
                 counted = float(draws.values["r_end"][i].mean())
                 flags.append(stopped_sessions(sum(s.stopped for s in self.buffer.sessions), counted, counted + float(moved[i])))

@@ -1,25 +1,40 @@
 """Tested sessions as differences to the same visit's cDBS, with their standard errors.
 
-A day moves policy and cDBS alike, so that their difference at one visit says more than either. The noise of a session is pooled within
-policy (or cDBS) and visit over all tests; where no policy or cDBS ran twice at a visit it is the spread of all sessions of a kind around
-their mean, which holds the differences between days too and therefore claims less.
+A day moves policy and cDBS alike, so that their difference at one visit says more than either. The variance of a session is pooled over
+tests, within policy (or cDBS) and visit, with a prior: the spread of the random sessions around their visits and their dose, as a scaled
+inverse chi-square distribution of `PRIOR_FREEDOM` degrees of freedom (Gelman et al. 2013, section 2.6). Where both together have fewer than
+`FEWEST` degrees of freedom, the spread of a policy (or of cDBS) between visits takes the place of those that are missing; it holds the
+differences between days too and therefore claims less. A variance that rests on few degrees of freedom is itself uncertain, so that a
+standard error is the half-width of the central 68.3 % of Student's t, with Satterthwaite's (1946) degrees of freedom, not of the normal.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
 
 from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference
+from ml.returns import actual_return
+from ml.trajectories import ReplayBuffer, SessionTrajectory
+
+Floats = NDArray[np.float64]
 
 LEAST_ERROR = {"return": 0.1, "energy": 0.005, "grasp_hz": 0.02, "rating": 0.25, "tremor_percent": 0.5}
 """Smallest standard deviation of a session, by quantity: what its measurement resolves. Sessions that happen to agree prove no more."""
 
+PRIOR_FREEDOM = 3
+"""Weight of the random sessions' spread beside that of the tests, degrees of freedom; it is a little too wide, as a dose acts in curves."""
+
 FEWEST = 3
-"""Degrees of freedom from which the noise of a session is known."""
+"""Degrees of freedom below which the spread between visits is asked as well."""
+
+_WITHIN_ONE = float(stats.norm.cdf(1.0))
 
 
 @dataclass(frozen=True)
@@ -38,46 +53,120 @@ class TestSession:
     values: Mapping[str, float]
 
 
-def differences_to_cdbs(sessions: Sequence[TestSession]) -> list[TestedDifference]:
-    """One difference per policy and visit with sessions of both the policy and cDBS, in order of visit and name.
+@dataclass(frozen=True)
+class Spread:
+    """Variance of a quantity between sessions, in its unit squared, and the degrees of freedom that it rests on."""
 
-    A quantity is left out where the noise of a session is not known: fewer than three degrees of freedom in all.
+    variance: float
+    freedom: int
+
+
+@dataclass(frozen=True)
+class Differences:
+    """What tested sessions show, and how many of them show nothing.
+
+    Attributes:
+        tests: one per policy and visit with sessions of both the policy and cDBS, in order of visit and name.
+        without_cdbs: sessions of policies at visits without a cDBS session.
+        of_unknown_noise: sessions with a quantity that is left out, because nothing tells how far sessions differ by chance.
+    """
+
+    tests: tuple[TestedDifference, ...]
+    without_cdbs: int = 0
+    of_unknown_noise: int = 0
+
+
+def differences_to_cdbs(sessions: Sequence[TestSession], prior: Mapping[str, Spread] | None = None) -> Differences:
+    """Every policy's difference to cDBS at every visit.
+
+    Args:
+        sessions: of policies and of cDBS. prior: of the noise by quantity, as `spread_of_random` has it; none where None.
     """
     groups: dict[tuple[str | None, int], list[TestSession]] = defaultdict(list)
     for session in sessions:
         groups[session.policy, session.visit].append(session)
-    noise = {name: _noise(name, groups) for name in QUANTITIES}
-    found = []
-    for policy, visit in sorted((p, v) for p, v in groups if p is not None and (None, v) in groups):
-        ours, theirs = groups[policy, visit], groups[None, visit]
+    noise = {name: _noise(name, groups, (prior or {}).get(name)) for name in QUANTITIES}
+    found, without_cdbs, of_unknown_noise = [], 0, 0
+    for (policy, visit), ours in groups.items():
+        if policy is None:
+            continue
+        theirs = groups.get((None, visit))
+        if not theirs:
+            without_cdbs += len(ours)
+            continue
+        both = {name: (_known(name, ours), _known(name, theirs)) for name in QUANTITIES}
+        measured = {name: pair for name, pair in both.items() if pair[0].size and pair[1].size}
+        of_unknown_noise += len(ours) if any(noise[name] is None for name in measured) else 0
         differences, errors = {}, {}
-        for name, sd in noise.items():
-            a, b = _known(name, ours), _known(name, theirs)
-            if sd is not None and a.size and b.size:
+        for name, (a, b) in measured.items():
+            if (sd := noise[name]) is not None:
                 differences[name] = float(a.mean() - b.mean())
                 errors[name] = float(sd * np.sqrt(1 / a.size + 1 / b.size))
         if differences:
             found.append(TestedDifference(policy, visit, len(ours), differences, errors, len(theirs)))
-    return sorted(found, key=lambda test: (test.visit, test.policy_name))
+    return Differences(tuple(sorted(found, key=lambda test: (test.visit, test.policy_name))), without_cdbs, of_unknown_noise)
 
 
-def _known(name: str, sessions: Sequence[TestSession]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def spread_of_random(buffer: ReplayBuffer, horizon_steps: int) -> dict[str, Spread]:
+    """How far random sessions lie from their visit's mean and a straight line over their energy, by quantity.
+
+    What does not follow such a line counts as noise. A quantity is absent where no degree of freedom is left; energy always is, because it
+    is the dose. Sessions that were stopped are left out.
+
+    Args:
+        buffer: the sessions. horizon_steps: of the returns.
+    """
+    drawn = [s for s in buffer.sessions if s.controller == "random" and not s.stopped]
+    values = list(map(partial(_values, buffer=buffer, horizon_steps=horizon_steps), drawn))
+    found = {}
+    for name in QUANTITIES:
+        known = [(s.visit, v["energy"], v[name]) for s, v in zip(drawn, values, strict=True) if name in v and "energy" in v]
+        if name != "energy" and known:
+            visits, energy, y = (np.array(column, dtype=np.float64) for column in zip(*known, strict=True))
+            x = np.column_stack([visits[:, None] == np.unique(visits), energy]).astype(np.float64)
+            coefficients, _, rank, _ = np.linalg.lstsq(x, y)
+            if (freedom := y.size - int(rank)) > 0:
+                found[name] = Spread(float(((y - x @ coefficients) ** 2).sum()) / freedom, freedom)
+    return found
+
+
+def _values(session: SessionTrajectory, buffer: ReplayBuffer, horizon_steps: int) -> dict[str, float]:
+    amplitude = session.amplitude[~np.isnan(session.amplitude)]
+    energy = float(np.mean(amplitude**2)) if amplitude.size else None
+    whole = actual_return(session, buffer.settings, horizon_steps).value
+    return {name: float(v) for name, v in {**asdict(session.qoc), "energy": energy, "return": whole}.items() if v is not None}
+
+
+def _known(name: str, sessions: Sequence[TestSession]) -> Floats:
     return np.array([s.values[name] for s in sessions if name in s.values], dtype=np.float64)
 
 
-def _noise(name: str, groups: Mapping[tuple[str | None, int], Sequence[TestSession]]) -> float | None:
-    """Standard deviation of a session of one policy at one visit, or an upper bound of it; None where neither is known."""
-    within = _pooled([_known(name, rows) for rows in groups.values()])
-    if within is None:
-        of_policy: dict[str | None, list[TestSession]] = defaultdict(list)
-        for (policy, _), rows in groups.items():
-            of_policy[policy] += rows
-        within = _pooled([_known(name, rows) for rows in of_policy.values()])
-    return None if within is None else max(within, LEAST_ERROR[name])
-
-
-def _pooled(groups: Sequence[np.ndarray[tuple[int], np.dtype[np.float64]]]) -> float | None:
-    freedom = sum(max(g.size - 1, 0) for g in groups)
-    if freedom < FEWEST:
+def _noise(name: str, groups: Mapping[tuple[str | None, int], Sequence[TestSession]], prior: Spread | None) -> float | None:
+    """Standard deviation of a session of one policy at one visit, as the docstring of the module has it; None where nothing tells it."""
+    of_policy: dict[str | None, list[TestSession]] = defaultdict(list)
+    for (policy, _), rows in groups.items():
+        of_policy[policy] += rows
+    squares, freedom = _squares([_known(name, rows) for rows in groups.values()])
+    with_visits, more = _squares([_known(name, rows) for rows in of_policy.values()])
+    # (sum of squares that counts, its weight, the degrees of freedom that it rests on)
+    parts = [(squares, freedom, freedom)]
+    if prior is not None:
+        weight = min(prior.freedom, PRIOR_FREEDOM)
+        parts.append((weight * prior.variance, weight, prior.freedom))
+    between, missing = more - freedom, FEWEST - sum(weight for _, weight, _ in parts)
+    if between > 0 and missing > 0:
+        weight = min(between, missing)
+        parts.append((weight * (with_visits - squares) / between, weight, between))
+    total = sum(part for part, _, _ in parts)
+    weights = sum(weight for _, weight, _ in parts)
+    if not weights:
         return None
-    return float(np.sqrt(sum(float(((g - g.mean()) ** 2).sum()) for g in groups if g.size) / freedom))
+    if not total:
+        return LEAST_ERROR[name]
+    rests_on = total**2 / sum(part**2 / of for part, _, of in parts if of)
+    return max(float(np.sqrt(total / weights) * stats.t.ppf(_WITHIN_ONE, rests_on)), LEAST_ERROR[name])
+
+
+def _squares(groups: Sequence[Floats]) -> tuple[float, int]:
+    """Sum of squares around the groups' means, and its degrees of freedom."""
+    return sum(float(((g - g.mean()) ** 2).sum()) for g in groups if g.size), sum(max(g.size - 1, 0) for g in groups)

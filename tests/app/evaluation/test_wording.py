@@ -17,7 +17,7 @@ from app.evaluation.estimates.rows import row_of
 from app.evaluation.models import EstimateRow, Evaluation
 from app.platform.kept import forget
 from ml.ope.estimate import Estimate
-from ml.ope.flags import Flag, distinct
+from ml.ope.flags import Flag, distinct, not_counted_tests
 from ml.ope.posterior.verdict import Levels, verdict
 from ml.ope.support.coverage import thin
 from ml.qoc import Margins
@@ -177,4 +177,14 @@ def test_the_strongest_reason_stands_first() -> None:
     without = verdict(own, cdbs(), Margins(0.1, 1.0, 10.0), Levels())
     assert verdict_wording.plainly(without.hazards) == (
         "nearly off 42 % of the time; > 99 % likely that grasp, rating or tremor is worse by more than its margin, most often tremor"
+    )
+
+
+def test_tests_that_do_not_count_are_told_with_their_reasons() -> None:
+    assert not_counted_tests() is None
+    flag = not_counted_tests(without_cdbs=2, without_policy=1)
+    assert flag is not None
+    assert wording.sentence(flag) == (
+        "3 sessions of tested policies not counted in full: 2 at a visit without cDBS, "
+        "1 of a policy that cannot be replayed, because its file is gone or it takes other windows"
     )

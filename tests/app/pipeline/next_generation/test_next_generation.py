@@ -16,7 +16,9 @@ from app.learning.models import Policy
 from app.learning.schemas import DEFAULT_SWEEP, TrainParams
 from app.learning.snapshots.service import take_snapshot
 from app.learning.training.configs import generation_groups, training_groups
+from app.pipeline.next_generation.job import judging_call
 from app.pipeline.next_generation.parents import best
+from app.pipeline.params import NextGenerationParams
 from app.pipeline.training import training_starts
 from app.platform.jobs.models import Job
 from app.study.repository import participant_by_code
@@ -54,6 +56,15 @@ def test_each_parent_gets_slow_and_fast_rates_of_the_paper_and_fresh_policies_th
     seeds = [c["seed"] for g in groups for c in g["configs"]]
     assert sorted(seeds) == list(range(10, 18)), "no seed twice"
     assert len({g["key"] for g in groups}) == len(groups)
+
+
+def test_parents_are_judged_by_what_every_policy_showed_and_a_plan_of_before_by_its_own_tests() -> None:
+    a, b = ({"id": i, "sha256": str(i)} for i in (1, 2))
+    plan = {"snapshot": {"sha256": "s"}, "tested": [a | {"name": "a"}], "horizon_steps": 300}
+    new = judging_call(NextGenerationParams(), plan | {"tested_so_far": {"tests": ["of 1", "of 2"], "policies": [a, b]}})
+    assert (new["policies"], new["tests"], new["tested"]) == ([a], ["of 1", "of 2"], [b])
+    old = judging_call(NextGenerationParams(), plan | {"tested_so_far": {"tests": ["of 1"], "policies": [a]}, "tests": ["of 1"]})
+    assert (old["policies"], old["tests"], old["tested"]) == ([a], ["of 1"], [])
 
 
 @pytest.fixture
