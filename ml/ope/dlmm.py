@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from ml.mdp import step_reward
 from ml.ope.dlsm.batches import Batch, make_batch
 from ml.ope.dlsm.heads import GaussianHead, gaussian_kl, gaussian_log_prob
-from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon, require_two_sessions
 from ml.ope.flags import FEW_END_REWARDS
 from ml.ope.outcomes.minutes import by_minute
 from ml.ope.outcomes.model import EndModel, fit_end_model
@@ -130,11 +130,10 @@ class Dlmm:
         """Train the members; seconds each, so nothing is kept in `checkpoint_dir`.
 
         Raises:
-            ValueError: fewer than two sessions, or no usable step.
+            ValueError: fewer than two sessions with usable steps.
         """
-        c, n = self.config, len(buffer.sessions)
-        if n < 2:
-            raise ValueError(f"the DLMM needs at least two sessions, of which it holds some out; the buffer has {n}")
+        require_two_sessions("the DLMM", sum(bool(s.usable().any()) for s in buffer.sessions))
+        c = self.config
         scale = learn_scale(buffer)
         rows = _transitions(make_batch(buffer, scale))
         folds = session_folds(buffer.sessions, max(2, round(1 / c.held_out)), c.seed)

@@ -65,7 +65,7 @@ class DoublyRobust:
         """Features, penalties and behaviour densities; seconds, so nothing is kept in `checkpoint_dir`.
 
         Raises:
-            ValueError: no usable step, or no session with a complete s_0.
+            ValueError: fewer than two sessions with usable steps, or no session with a complete s_0.
         """
         fitted = replace(Fqe(self.value).fit(buffer, report, checkpoint_dir), method=self.method)
         densities, bandwidth = behaviour_densities(buffer, self.bandwidth, self.value.seed)

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ml.ope.estimate import Estimate, checked_horizon
+from ml.ope.estimate import Estimate, checked_horizon, require_two_sessions
 from ml.ope.flags import Flag
 from ml.ope.fqe.estimator import value_estimate, within_reach
 from ml.ope.fqe.steps import TargetActions, UsableSteps, ValueFeatures, usable_steps
@@ -171,9 +171,10 @@ class DualDice:
         """Prepare the inputs; the networks belong to policies and are trained in `evaluate`.
 
         Raises:
-            ValueError: no usable step, or no session with a complete s_0.
+            ValueError: fewer than two sessions with usable steps, or no session with a complete s_0.
         """
         table, c = usable_steps(buffer, otherwise=dose_before(buffer)), self.config
+        require_two_sessions("DualDICE", len(np.unique(table.session)))
         draws = resamples(table.sessions, c.refits, c.seed)
         inputs = ValueFeatures(table, 0, c.seed)
         report(1.0, "inputs of the density ratios")

@@ -99,6 +99,19 @@ class Estimator(Protocol):
         """Learn from the buffer; with a `checkpoint_dir` an interrupted fit goes on where it stopped."""
 
 
+def require_two_sessions(what: str, with_steps: int) -> None:
+    """Refuse to fit where nothing tells how sessions differ.
+
+    Args:
+        what: is fitted, as a sentence begins with it. with_steps: sessions with usable steps.
+
+    Raises:
+        ValueError: there are fewer than two.
+    """
+    if with_steps < 2:
+        raise ValueError(f"{what} needs at least two sessions with usable steps; the buffer has {with_steps}")
+
+
 def checked_horizon(buffer: ReplayBuffer, horizon_steps: int | None) -> int:
     """H, defaulting to the median session length. Raises ValueError when it is not a positive number of steps."""
     horizon = buffer.median_steps() if horizon_steps is None else horizon_steps

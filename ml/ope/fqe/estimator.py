@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.mdp import MdpSettings
-from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon, require_two_sessions
 from ml.ope.flags import FEW_END_REWARDS
 from ml.ope.fqe.steps import RATES, TargetActions, UsableSteps, ValueFeatures, usable_steps
 from ml.ope.lead import dose_before
@@ -223,9 +223,10 @@ class Fqe:
         """Features and penalties; takes seconds, so nothing is kept in `checkpoint_dir`.
 
         Raises:
-            ValueError: no usable step, or no session with a complete s_0.
+            ValueError: fewer than two sessions with usable steps, or no session with a complete s_0.
         """
         table, c = usable_steps(buffer, otherwise=dose_before(buffer)), self.config
+        require_two_sessions("fitted Q evaluation", len(np.unique(table.session)))
         folds = session_folds(buffer.sessions, c.folds, c.seed)
         members = []
         for m in range(c.members):

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.ope.estimate import require_two_sessions
 from ml.ope.fqe.steps import after_doses, fresh_memory, held_amplitude, lead_dose, lead_doses, memories, remember
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedModel, Sums
@@ -142,9 +143,7 @@ def fit_dynamics(
     Raises:
         ValueError: fewer than two sessions with usable steps.
     """
-    with_steps = sum(bool(t.usable.any()) for t in tables)
-    if with_steps < 2:
-        raise ValueError(f"the linear model needs at least two sessions with usable steps; the buffer has {with_steps}")
+    require_two_sessions("the linear model", sum(bool(t.usable.any()) for t in tables))
     window, visits = buffer.settings.window, np.array([s.visit for s in buffer.sessions])
     own = (visits[:, None] == np.unique(visits)).astype(np.float64)
     phi = np.zeros(window)

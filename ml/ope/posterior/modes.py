@@ -23,6 +23,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ml.ope.estimate import require_two_sessions
 from ml.ope.fqe.steps import after_doses, held_amplitude, lead_dose, lead_doses
 from ml.ope.linear.dynamics import autoregression, innovations_of, level_model, level_sums, log_noise_weights, split_coefficients
 from ml.ope.scale import Scale
@@ -210,9 +211,7 @@ def fit_modes(buffer: ReplayBuffer, tables: Sequence[ModeTable], otherwise: floa
     Raises:
         ValueError: fewer than two sessions with usable steps.
     """
-    with_steps = sum(bool(t.usable.any()) for t in tables)
-    if with_steps < 2:
-        raise ValueError(f"a model of beta's answer needs at least two sessions with usable steps; the buffer has {with_steps}")
+    require_two_sessions("a model of beta's answer", sum(bool(t.usable.any()) for t in tables))
     window, visits = buffer.settings.window, np.array([s.visit for s in buffer.sessions])
     own = (visits[:, None] == np.unique(visits)).astype(np.float64)
     usable = [t.usable for t in tables]

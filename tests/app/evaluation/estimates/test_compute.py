@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +74,17 @@ def test_a_method_that_cannot_work_on_the_data_says_why(method: str, db: Session
     result = evaluate_method(call(db, buffer_of(sessions(lead=float("nan"))), method=method), tmp_path, StepReport(lambda _: None))
     assert "no session has a complete window of beta before its first step" in result["failed"]
     assert "estimates" not in result
+
+
+@pytest.mark.parametrize("method", ["posterior", "linear", "impulse", "fqe", "wdr", "dual_dice", "dlmm"])
+@pytest.mark.filterwarnings("error")
+def test_one_session_is_refused_in_the_same_words_by_every_method_that_fits(method: str, db: Session, tmp_path: Path) -> None:
+    first, second, *_ = sessions()
+    blank = replace(second, beta=np.full(second.steps, np.nan))
+    for made in ((first,), (first, blank)):
+        result = evaluate_method(call(db, buffer_of(made), method=method), tmp_path, StepReport(lambda _: None))
+        assert re.search(r"needs at least two sessions with usable steps; the buffer has 1$", result["failed"])
+        assert "estimates" not in result
 
 
 def test_the_choice_names_its_table_or_why_there_is_none(db: Session, tmp_path: Path) -> None:
