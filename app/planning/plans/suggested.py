@@ -13,12 +13,10 @@ from app.evaluation.ranking.answer import answer
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.judged import Judged
 from app.evaluation.repository import PolicyHead
+from app.planning.protocol.schedule import cdbs_sessions
 from ml.ope.posterior.further_sessions import Hold, Place, worth_exploring, worth_holding
 from ml.ope.posterior.portfolio import Suggestion, portfolio
 from ml.ope.posterior.verdict import FEWEST_DRAWS
-
-CDBS_SESSIONS = 2
-"""Sessions of cDBS that a visit's policies are held against, at least."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,11 @@ def _portfolio(found: Assessment, slots: int) -> tuple[Suggested, ...]:
             policies[str(row.one.policy.id)] = row.one.policy
             if any(own.one.tested is not None for own in (row, *row.twins)):
                 tested.add(str(row.one.policy.id))
-    # of a session's difference to the visit's cDBS, of which a plan holds two sessions or more; evaluations of before do not say it
-    noise = float(found.cdbs.posterior.details.get("return_noise") or 0.0) * math.sqrt(1 + 1 / CDBS_SESSIONS)
-    chosen = portfolio(differences, slots, careful, tested, noise)
-    return tuple(Suggested(policies[s.name], s) for s in chosen)
+    # of one session; evaluations of before do not say it
+    noise = float(found.cdbs.posterior.details.get("return_noise") or 0.0)
+    for number in range(slots, 0, -1):
+        # a day of fewer policies has fewer cDBS sessions, and each policy is held against their mean
+        chosen = portfolio(differences, number, careful, tested, noise * math.sqrt(1 + 1 / cdbs_sessions(number)))
+        if len(chosen) == number:
+            return tuple(Suggested(policies[s.name], s) for s in chosen)
+    return ()

@@ -144,10 +144,15 @@ def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[P
     return _timed(day, rules)
 
 
+def cdbs_sessions(tested: int) -> int:
+    """cDBS sessions of a visit day with so many sessions of policies: one between any two, and one before a single one, or before none."""
+    return max(tested - 1, 1)
+
+
 def total_minutes(policies: int, rules: Rules) -> float:
     """Minutes from the first session's start to the last one's end of a day with this many policies."""
     tested = policies * rules.repeats
-    controls = max(tested - 1, 1) if tested or rules.exploring else 0
+    controls = cdbs_sessions(tested) if tested or rules.exploring else 0
     full = tested + controls + rules.exploring
     sessions = full + rules.no_dbs
     rest = rules.break_minutes if sessions > 1 else 0.0

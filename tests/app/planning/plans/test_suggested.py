@@ -7,12 +7,18 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
+from app.accounts.permissions import SYSTEM
+from app.evaluation.ranking.service import current
 from app.learning.models import BufferSnapshot, Policy
+from app.planning.plans.suggested import suggested as suggested_of
+from app.study.repository import participant_by_code
+from ml.ope.posterior.portfolio import portfolio
 from tests.app.evaluations import judge as judge
 from tests.app.evaluations import judged
 from tests.app.evaluations import policies as policies
@@ -53,6 +59,21 @@ def test_the_best_comes_first_and_then_what_may_turn_out_better(
     assert [item.split(":")[0] for item in found] == ["p0", "p2"]
     assert found[0].startswith("p0: > 99 % likely to turn out better on the whole than cDBS; its test alone would settle")
     assert found[1].startswith("p2: 50 % likely to turn out better on the whole than all above")
+
+
+def test_the_noise_of_a_test_is_that_of_as_many_cdbs_sessions_as_the_day_has(
+    client: TestClient, db: Session, policies: list[int], judge: Judge
+) -> None:
+    """One policy or two are held against one cDBS session, three against two; where fewer are worth a test the day has fewer slots."""
+    reference = cdbs().to_json()
+    reference["details"]["return_noise"] = 6.0
+    random = np.random.default_rng(3)
+    draws = {i: [reference["details"]["draws"][k] + float(x) for k, x in enumerate(random.normal(1.0, 9.0, N))] for i in policies}
+    judge({i: _with(51.0, drawn) for i, drawn in draws.items()}, reference)
+    found = current(db, participant_by_code(db, "P1", SYSTEM), SYSTEM)
+    gaps = {str(i): np.array(drawn) - np.array(reference["details"]["draws"]) for i, drawn in draws.items()}
+    for slots, number, controls in ((1, 1, 1), (2, 2, 1), (3, 3, 2), (4, 3, 2)):
+        assert [s.why for s in suggested_of(found, slots)] == list(portfolio(gaps, number, noise=6.0 * (1 + 1 / controls) ** 0.5))
 
 
 def test_neither_unsafe_nor_untold_policies_are_suggested_and_one_with_care_at_most(

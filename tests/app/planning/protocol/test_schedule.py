@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.planning.protocol.schedule import Candidate, PlannedSession, Rule, Rules, most_policies, schedule, total_minutes
+from app.planning.protocol.schedule import Candidate, PlannedSession, Rule, Rules, cdbs_sessions, most_policies, schedule, total_minutes
 from app.planning.protocol.session_order import Order
 from app.platform.errors import Invalid
 from app.study.models import Controller
@@ -64,6 +64,7 @@ def test_every_day_that_is_laid_out_keeps_every_rule(chosen: list[Candidate], ru
     assert day[-1].washout_minutes == 0
     assert end_minute(day[-1]) <= rules.total_minutes + 1e-6
     assert end_minute(day[-1]) == pytest.approx(total_minutes(len(chosen), rules))
+    assert sum(s.controller is Controller.CDBS for s in day) == cdbs_sessions(len(chosen) * rules.repeats)
     assert schedule(chosen, rules, seed) == day
 
 
