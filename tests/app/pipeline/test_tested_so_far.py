@@ -86,13 +86,19 @@ def test_a_retired_policy_is_evidence_as_before_and_no_parent_and_one_without_it
     assert training.tested_so_far(db, snapshot, SYSTEM) == {"tests": [], "policies": []}
 
 
+@pytest.fixture
+def policies_then_worker(policies: list[int], request: pytest.FixtureRequest) -> list[int]:
+    """A worker that begins earlier would hold the database that the policies are copied from."""
+    request.getfixturevalue("worker")
+    return policies
+
+
 @pytest.mark.slow
-@pytest.mark.usefixtures("worker")
 def test_an_evaluation_of_one_policy_knows_what_others_showed_and_says_which_sessions_it_does_not_know(
-    client: TestClient, db: Session, policies: list[int], upload: Callable[..., int], ended: Callable[..., dict[str, Any]]
+    client: TestClient, db: Session, policies_then_worker: list[int], upload: Callable[..., int], ended: Callable[..., dict[str, Any]]
 ) -> None:
     """The first two are like each other in what they do; the second is retired after a bad test, the third's file is lost."""
-    retired, like_it, lost = policies[1], policies[0], policies[2]
+    like_it, retired, lost = policies_then_worker
     client.post("/api/v1/participants/P1/visits", json={"number": 2})
     for k in range(2):
         upload("cdbs", visit=2, qoc={"grasp_hz": 2.9 + 0.1 * k, "rating": 9, "tremor_percent": 5.0})
