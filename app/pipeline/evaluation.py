@@ -9,8 +9,8 @@ from sqlalchemy.orm import Session
 
 from app.evaluation import repository, service
 from app.evaluation.estimates import compute, dose_shapes
-from app.evaluation.ranking.tested import replayable, tested
 from app.evaluation.schemas import EvaluateParams
+from app.evaluation.tested import replayable, tested
 from app.learning.models import BufferSnapshot
 from app.learning.policies.baselines import ensure_baselines
 from app.learning.snapshots.buffers import read_buffer

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.evaluation.ranking.tested import tested
+from app.evaluation.tested import tested
 from app.learning import repository
 from app.learning.models import BufferSnapshot
 from app.learning.policies import service
