@@ -14,10 +14,12 @@ from app.evaluation.ranking.answer import Answer, Row
 from app.evaluation.ranking.assessment import cdbs_amplitude_now
 from app.evaluation.ranking.judged import Judged
 from app.evaluation.ranking.service import current
+from app.evaluation.verdict_wording import plainly
 from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning import wording
 from app.planning.plans.designs import offered
+from app.planning.plans.grounds import HAPPENED, events_against
 from app.planning.plans.schemas import HeldIn, LimitIn, PlanIn, PlanOptions
 from app.planning.plans.service import rules_of
 from app.planning.plans.suggested import Held, held_in, suggested
@@ -96,6 +98,7 @@ def shown_of(db: Session, visit: Visit, caller: Caller, full: PlanView | None, v
         "ranking": found,
         "typed": values or {},
         "choices": choices,
+        "happened": plainly(HAPPENED.reasons),
         "suggestions": [(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],
         "held_rows": held_rows(values, held_in(found, slots - len(suggestions), place), place.lower_bound, cdbs_amplitude_now(participant)),
         "holding": wording.holding,
@@ -114,11 +117,13 @@ class Choice:
     """A policy that may be planned, and what the ranking says of it.
 
     Attributes:
-        row: its own; None for what no ranking holds. twins: policies that do the same by the ranking.
+        row: its own; None for what no ranking holds. harmful: whether a serious adverse event under it has not been cleared by a
+            clinician. twins: policies that do the same by the ranking.
     """
 
     policy: Policy
     row: Row | None
+    harmful: bool
     twins: tuple[Choice, ...] = ()
 
 
@@ -127,11 +132,12 @@ def _choices(db: Session, participant: Participant, answered: Answer | None) -> 
     rows, heads = (answered.everyone(), answered.heads()) if answered is not None else ({}, {})
     places = {i: k for k, i in enumerate(rows)}
     policies = sorted(learning.candidates(db, participant.id), key=lambda p: (places.get(p.id, len(places)), p.id))
+    harmful = events_against(db, participant)
     known = {p.id for p in policies}  # a retired one is in the ranking, and may not be planned
     groups: dict[int, list[Choice]] = {}
     for p in policies:
         head = heads.get(p.id, p.id)
-        groups.setdefault(head if head in known else p.id, []).append(Choice(p, rows.get(p.id)))
+        groups.setdefault(head if head in known else p.id, []).append(Choice(p, rows.get(p.id), p.id in harmful))
     return [replace(first, twins=tuple(others)) for first, *others in groups.values()]
 
 

@@ -211,7 +211,8 @@ HAZARDS: tuple[Hazard, ...] = (
         "H24", "An adverse event is written down, and the controller goes on", (_U, _O), _S3, _P2,
         "What is entered on the clinic day, adverse events and its own Stop included, does not signal the control loop. Whoever runs the "
         "session stops the controller on its tablet (Ctrl-C, or the device's stop), which returns to cDBS, the clinical settings, at once. "
-        "The form of an adverse event says to do so first; after a severe one the page asks for it until the return is confirmed.",
+        "The form of an adverse event says to do so first; after a severe one the page asks for it until the return is confirmed. A policy "
+        "with a serious event that no clinician has cleared is unsafe from then on: no plan takes it without a clinician's reason.",
         _P1, "It rests on whoever runs the session: nothing in betaloop stops a session because of what was written down.",
     ),
 )  # fmt: skip

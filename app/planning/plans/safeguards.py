@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from app.evaluation import verdict_wording
-from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.decisions import Decided
 from app.learning.models import Policy
+from app.planning.plans.grounds import Grounds
 from app.platform.errors import Conflict, Forbidden, Invalid
 
 ROUNDING = 1e-9
@@ -19,7 +19,7 @@ class Safeguard:
     """What a plan records of one policy.
 
     Attributes:
-        verdict: of the ranking; None where the policy is not in it.
+        verdict: of the ranking, or *unsafe* after a serious adverse event; None where neither says anything of the policy.
         min_fraction: lowest amplitude, fraction of cDBS; None where the plan states none. override_reason: a clinician's.
     """
 
@@ -29,12 +29,12 @@ class Safeguard:
 
 
 def safeguards(
-    found: Assessment | None, policies: Sequence[Policy], overrides: Mapping[int, str], limits: Mapping[int, float], *, may_override: bool
+    found: Grounds, policies: Sequence[Policy], overrides: Mapping[int, str], limits: Mapping[int, float], *, may_override: bool
 ) -> dict[int, Safeguard]:
     """What the plan records of each policy.
 
     Args:
-        found: the ranking behind the plan; None without one. policies: to test.
+        found: what policies are planned by. policies: to test.
         overrides: reasons for unsafe policies, by id. limits: stated lowest amplitudes, by id.
         may_override: whether whoever drafts may approve plans.
 
@@ -45,7 +45,7 @@ def safeguards(
     _all_planned(policies, overrides, limits)
     made, careful = {}, []
     for policy in policies:
-        decided = _decided(found, policy.id)
+        decided = found.of(policy.id)
         reason, limit = overrides.get(policy.id, "").strip() or None, limits.get(policy.id)
         unsafe = decided is not None and decided.needs_override
         if decided is not None and unsafe:
@@ -61,7 +61,7 @@ def safeguards(
     return made
 
 
-def refuse_approval(found: Assessment | None, planned: Sequence[tuple[Policy, Safeguard]]) -> None:
+def refuse_approval(found: Grounds, planned: Sequence[tuple[Policy, Safeguard]]) -> None:
     """Hold a draft against the verdicts of now, which margins and later findings may have changed since it was drafted.
 
     Raises:
@@ -70,7 +70,7 @@ def refuse_approval(found: Assessment | None, planned: Sequence[tuple[Policy, Sa
     """
     careful = []
     for policy, stated in planned:
-        decided = _decided(found, policy.id)
+        decided = found.of(policy.id)
         if decided is None:
             continue
         if decided.needs_override and not stated.override_reason:
@@ -122,11 +122,6 @@ def _all_planned(policies: Sequence[Policy], *stated: Mapping[int, object]) -> N
         if stray:
             words = f"Policy {stray[0]} has a reason or a limit, but is not among the policies to test."
             raise Invalid(words, "Name it there too.", field="policy_ids")
-
-
-def _decided(found: Assessment | None, policy_id: int) -> Decided | None:
-    one = found.of(policy_id) if found is not None else None
-    return one.decided if one is not None else None
 
 
 def _why(decided: Decided) -> str:

@@ -166,7 +166,10 @@ class PlannedSessionOut(Model):
     medication: str
     estimate: PlanEstimateOut | None
     predicted_energy: float | None = Field(description="Mean squared amplitude fraction; cDBS = 1.")
-    verdict: str | None = Field(description="What the ranking said of the policy when the plan was drafted; null for what is not ranked.")
+    verdict: str | None = Field(
+        description="What the ranking said of the policy when the plan was drafted; null for what is not ranked, but `unsafe` after a "
+        "serious adverse event that no clinician has cleared."
+    )
     min_fraction: float | None = Field(description="Lowest amplitude of the session, fraction of the cDBS amplitude.")
     override_reason: str | None = Field(description="Why a clinician plans an unsafe policy all the same.")
     repeat: int = Field(description="Which session of this policy or controller within the visit, from 1.")

@@ -14,11 +14,11 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation import repository as evaluations
 from app.evaluation.models import Evaluation
-from app.evaluation.ranking.judged import judged
 from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of, near_sessions, planned_sessions, seed_of
+from app.planning.plans.grounds import grounds
 from app.planning.plans.key import label_sessions, sealed
 from app.planning.plans.limits import StatedLimits, lowest_draw, planned_cdbs_ma, require_limits, set_limits
 from app.planning.plans.models import Plan, PlanItem, is_held
@@ -55,7 +55,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
     seed = _seed(participant, rules) if draft.seed is None else draft.seed
     day = schedule([Candidate(p.id, controller_of(p)) for p in chosen], rules, seed)
     evaluation = _evaluation(db, participant, draft.evaluation_id)
-    found = judged(db, participant, evaluation).assessment if evaluation else None
+    found = grounds(db, participant, evaluation)
     overrides, limits = {o.policy_id: o.reason for o in draft.overrides}, {v.policy_id: v.min_fraction for v in draft.limits}
     guarded = safeguards(found, chosen, overrides, limits, may_override=study.may(caller, can.APPROVE_PLAN, participant))
     repository.lock_visit(db, visit.id)
@@ -120,7 +120,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
     refuse_withdrawn(view)
     policies = {line.policy.id: line.policy for line in view.lines if line.policy}
     stated = [(v.policy, Safeguard(v.item.verdict, v.item.min_fraction, v.item.override_reason)) for v in view.lines if v.policy]
-    refuse_approval(judged(db, visit.participant, view.evaluation).assessment if view.evaluation else None, stated)
+    refuse_approval(grounds(db, visit.participant, view.evaluation), stated)
     releases.refuse_unreleased(db, visit.participant, [(line.policy, line.item) for line in view.lines if line.policy])
     _fix_designs(visit, plan)
     require_limits(visit, plan.items)

@@ -100,9 +100,19 @@ def policy_of(event: AdverseEvent, caller: Caller) -> int | None:
     return event.policy_id if caller.may(can.READ_ARMS, site.study_id, site.id) or visit is not None else None
 
 
+def blocking_events(events: Iterable[AdverseEvent], caller: Caller) -> dict[int, tuple[AdverseEvent, ...]]:
+    """By policy, what was serious under it and has not been cleared by a clinician, in the order of the events."""
+    found: dict[int, tuple[AdverseEvent, ...]] = {}
+    for event in events:
+        policy_id = policy_of(event, caller) if event.blocks else None
+        if policy_id is not None:
+            found[policy_id] = (*found.get(policy_id, ()), event)
+    return found
+
+
 def blocked_policies(events: Iterable[AdverseEvent], caller: Caller) -> frozenset[int]:
     """Policies under which something serious happened that no clinician has cleared."""
-    return frozenset(found for e in events if e.blocks for found in [policy_of(e, caller)] if found is not None)
+    return frozenset(blocking_events(events, caller))
 
 
 def _checked_visit(db: Session, participant: Participant, draft: AdverseEventIn, caller: Caller) -> int | None:

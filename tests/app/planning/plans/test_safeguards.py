@@ -52,6 +52,42 @@ def test_an_unsafe_policy_is_planned_only_with_a_clinicians_reason(
     assert sign_plan(visit).status_code == 200
 
 
+def event(client: TestClient, policy: int) -> dict[str, Any]:
+    body = {"kind": "fall", "severity": "severe", "serious": True, "policy_id": policy}
+    answer = client.post("/api/v1/participants/P1/adverse-events", json=body)
+    assert answer.status_code == 201, answer.text
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+@pytest.mark.hazard("H24")
+@pytest.mark.parametrize("ranked", [False, True])
+def test_a_serious_adverse_event_needs_the_reason_whether_or_not_a_ranking_holds_its_policy(
+    client: TestClient, policies: list[int], judge: Judge, visit: int, sign_plan: Approve, ranked: bool
+) -> None:
+    a, b, _ = policies
+    if ranked:
+        judge({b: judged(40.0)})
+    assert draft(client, visit, a).status_code == 201
+    found = event(client, a)
+    unsigned = sign_plan(visit)
+    assert (unsigned.status_code, "serious adverse event, not cleared" in unsigned.json()["detail"]) == (409, True)
+    refused = draft(client, visit, a)
+    assert (refused.status_code, "serious adverse event, not cleared" in refused.json()["detail"]) == (422, True)
+    page = client.get(f"/visits/{visit}/plan").text
+    assert f'name="override_{a}"' in page
+    assert f'name="override_{b}"' not in page
+    plan = draft(client, visit, a, overrides=[{"policy_id": a, "reason": "the fall was a stumble, watched"}])
+    assert [(s["verdict"], s["override_reason"]) for s in plan.json()["sessions"] if s["policy_id"]] == [
+        ("unsafe", "the fall was a stumble, watched")
+    ]
+    assert sign_plan(visit).status_code == 200
+    cleared = client.post(f"/api/v1/adverse-events/{found['id']}/clearance", json={"revision": 1, "reason": "she tripped"})
+    assert cleared.status_code == 200
+    anew = draft(client, visit, a, reason="without the override").json()
+    assert [(s["verdict"], s["override_reason"]) for s in anew["sessions"] if s["policy_id"]] == [(None, None)]
+
+
 def test_what_is_dangerous_whatever_the_data_say_needs_the_reason_even_where_nothing_can_be_told(
     client: TestClient, policies: list[int], judge: Judge, visit: int
 ) -> None:
