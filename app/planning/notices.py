@@ -25,6 +25,8 @@ class Code(StrEnum):
     DATE_PAST = "date_past"
     ONE_POLICY = "one_policy"
     KEY_REASON_MISSING = "key_reason_missing"
+    ADVERSE_EVENT = "adverse_event"
+    """A serious one that no clinician has cleared, and that the plan's reason for its policy does not answer: the plan may not run."""
     OTHER_MEDICATION = "other_medication"
     """The participant's schedule says otherwise now than when the plan was drafted."""
 
@@ -49,5 +51,6 @@ class PlanWarning:
 
 
 def without_policies(warnings: Sequence[PlanWarning]) -> list[PlanWarning]:
-    """Those that name no policy: what a blinded reader may see."""
-    return [w for w in warnings if w.policy_id is None and w.code is not Code.RANKING_NOTE]
+    """Those that name no policy: what a blinded reader may see. That a plan may not run after an adverse event is told, and not why."""
+    told = [w for w in warnings if w.policy_id is None and w.code is not Code.RANKING_NOTE]
+    return told + [PlanWarning(Code.ADVERSE_EVENT)] * any(w.code is Code.ADVERSE_EVENT for w in warnings)

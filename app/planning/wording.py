@@ -58,9 +58,37 @@ _ABOUT: dict[Code, str] = {
 }
 
 
+ANSWER_EVENT = (
+    "Clear the event with a reason on the page of adverse events; or draft the visit anew, without the policy or with the reason why it is "
+    "tested all the same, and have it signed."
+)
+"""How a plan, or a policy's bundle, comes to run again after a serious adverse event."""
+
+
+def happened(policy: str | None, events: Sequence[int]) -> str:
+    """What stands against a policy, in one clause.
+
+    Args:
+        policy: its name; None where nobody may be shown which one it is. events: numbers of the adverse events; none where they would tell.
+    """
+    if policy is None:
+        return "a serious adverse event, which no clinician has cleared, stands against a policy of it"
+    one = len(events) == 1
+    which = f"adverse event{'' if one else 's'} {_listed(events)}"
+    return f"{which} under policy '{policy}' {'is' if one else 'are'} serious, and no clinician has cleared {'it' if one else 'them'}"
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    """As "3", "3 and 4", "3, 4 and 5"."""
+    *first, last = map(str, numbers)
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 def warning(found: PlanWarning) -> str:
     """The sentence of a warning."""
     values = dict(found.values) | {"policy": found.policy}
+    if found.code is Code.ADVERSE_EVENT:
+        return f"The plan may not run: {happened(found.policy, values.get('events', ()))}. {ANSWER_EVENT}"
     if found.code is Code.LOWEST_AMPLITUDE:
         fraction, cdbs_ma = values["fraction"], values["cdbs_ma"]
         return f"Policy '{found.policy}' may not go below {amplitude(fraction, None if cdbs_ma is None else fraction * cdbs_ma)}."

@@ -212,8 +212,11 @@ HAZARDS: tuple[Hazard, ...] = (
         "What is entered on the clinic day, adverse events and its own Stop included, does not signal the control loop. Whoever runs the "
         "session stops the controller on its tablet (Ctrl-C, or the device's stop), which returns to cDBS, the clinical settings, at once. "
         "The form of an adverse event says to do so first; after a severe one the page asks for it until the return is confirmed. A policy "
-        "with a serious event that no clinician has cleared is unsafe from then on: no plan takes it without a clinician's reason.",
-        _P1, "It rests on whoever runs the session: nothing in betaloop stops a session because of what was written down.",
+        "with a serious event that no clinician has cleared is unsafe from then on: no plan takes it without a clinician's reason. Of a "
+        "plan that was signed before, no further session starts and no bundle leaves, and the list of withdrawals names it, until a "
+        "clinician has cleared the event or signed a newer reason.",
+        _P1, "It rests on whoever runs the session: nothing in betaloop stops a session that runs because of what was written down. A "
+        "bundle that is on the tablet already is refused once the new list of withdrawals reaches it.",
     ),
 )  # fmt: skip
 

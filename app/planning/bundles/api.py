@@ -24,7 +24,7 @@ Milliamperes = Annotated[float | None, Query(ge=0, le=25.5, allow_inf_nan=False)
 @router.get(
     "/policies/{policy_id}/bundle",
     response_class=Response,
-    responses={200: {"content": {"application/zip": {}}, "description": "The controller bundle."}},
+    responses=problems(409) | {200: {"content": {"application/zip": {}}, "description": "The controller bundle."}},
 )
 def read_bundle(
     policy: CurrentPolicy,
@@ -58,7 +58,8 @@ def read_session_bundle(
     """The signed bundle of one session of the visit's signed plan: it runs on the day of the visit, once.
 
     Sessions of policies hold the network, random and cDBS sessions their schedule. A plan that is not signed, was changed since, or holds
-    a withdrawn policy has none. It is stored when it is first taken; later it is the same bytes, and the audit trail has each time.
+    a withdrawn policy has none; nor has one with a policy under which something serious happened since, until a clinician clears it. It
+    is stored when it is first taken; later it is the same bytes, and the audit trail has each time.
     """
     name, content = slots.bundle(db, visit, position, caller)
     db.commit()
@@ -67,7 +68,10 @@ def read_session_bundle(
 
 @router.get("/bundle-withdrawals", response_class=PlainTextResponse)
 def read_withdrawals(db: Db, caller: CurrentCaller) -> PlainTextResponse:
-    """Policies and plans that were withdrawn, signed: bring it to the tablet, which then refuses their bundles."""
+    """Policies and plans that were withdrawn, signed: bring it to the tablet, which then refuses their bundles.
+
+    Plans that may not run after a serious adverse event are among them, until a clinician has cleared it.
+    """
     return PlainTextResponse(slots.withdrawals(db))
 
 

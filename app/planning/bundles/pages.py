@@ -24,7 +24,7 @@ from app.planning.plans.limits import device_limits
 from app.planning.plans.view import read_plan
 from app.planning.releases import service as releases
 from app.platform.database import Db
-from app.platform.errors import BetaloopError, Invalid
+from app.platform.errors import BetaloopError, Conflict, Invalid
 from app.platform.web import numbers
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
@@ -132,8 +132,13 @@ def _page(
     *,
     releasing: bool = False,
 ) -> HTMLResponse:
+    facts: dict[str, Any] = {"manifest": None, "warnings": [], "energy": None, "unmade": None, "stopped": None}
+    if error is None:
+        try:
+            bundles.refuse_after_events(db, participant, policy)
+        except Conflict as stopped:
+            facts["stopped"] = stopped.problem(request.url.path)
     sides = sorted({Hemisphere(a.hemisphere) for visit in participant.visits for a in visit.cdbs_amplitudes})
-    facts: dict[str, Any] = {"manifest": None, "warnings": [], "energy": None, "unmade": None}
     try:
         wished = (typed or {}).get("hemisphere")
         side = next((side for side in sides if side == wished), sides[0] if sides else None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sqlalchemy import or_, select, text
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, selectinload
 
 from app.learning.models import Policy
 from app.planning.bundles.models import BundleRelease
@@ -44,6 +44,12 @@ def withdrawn_policies(db: Session) -> Sequence[int]:
 def withdrawn_plans(db: Session) -> Sequence[int]:
     """Plans of this installation that were signed and then replaced."""
     return db.scalars(select(Plan.id).where(Plan.status == "superseded", Plan.approved_at.is_not(None)).order_by(Plan.id)).all()
+
+
+def signed_plans(db: Session, participant_id: int) -> Sequence[Plan]:
+    """The participant's approved visit plans with their items."""
+    query = select(Plan).join(Visit, Visit.id == Plan.visit_id).where(Visit.participant_id == participant_id, Plan.status == "approved")
+    return db.scalars(query.order_by(Plan.id).options(selectinload(Plan.items))).all()
 
 
 def planned_limits(db: Session, participant_id: int, policy_id: int) -> Sequence[float]:

@@ -26,10 +26,11 @@ from app.learning.snapshots.buffers import read_buffer
 from app.planning import wording
 from app.planning.bundles import repository
 from app.planning.bundles.models import BundleRelease
+from app.planning.plans.grounds import events_against, unanswered
 from app.planning.plans.limits import DeviceLimits, device_limits
 from app.platform import files
 from app.platform.database import set_reason
-from app.platform.errors import Invalid
+from app.platform.errors import Conflict, Invalid
 from app.settings import get_settings
 from app.study import cdbs_amplitude
 from app.study import repository as study_repository
@@ -81,12 +82,22 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
     Raises:
         NotFound: the policy is another participant's.
         Invalid: the cDBS amplitude or the unit of beta is not known, limits that contradict each other, or leave the stimulator's own.
-        Forbidden: the caller may only read.
+        Conflict: as `refuse_after_events`. Forbidden: the caller may only read.
     """
     study.require(caller, can.TAKE_BUNDLES, participant)
+    refuse_after_events(db, participant, policy)
     manifest, windows = manifest_of(db, participant, policy, limits, hemisphere, caller)
     content = content_of(manifest, windows, policy, caller.label if limits.stated else None)
     return take(db, participant, manifest, content, lambda: policy_bundle(policy, manifest, windows), caller)
+
+
+def refuse_after_events(db: Session, participant: Participant, policy: Policy) -> None:
+    """Raises Conflict for a policy under which something serious happened that no clinician has cleared, and no signed plan answers."""
+    events = events_against(db, participant)
+    plans = [plan for plan, _ in repository.approved_plans(db, participant.id, policy.id)]
+    if policy.id in events and all(policy.id in unanswered(plan, events) for plan in plans):
+        what = wording.happened(policy.name, [event.id for event in events[policy.id]])
+        raise Conflict(f"No bundle of the policy leaves: {what}.", wording.ANSWER_EVENT)
 
 
 def policy_bundle(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64]) -> bytes:

@@ -15,6 +15,7 @@ from app.learning import repository as learning
 from app.planning import wording
 from app.planning.bundles import repository, service
 from app.planning.plans.designs import Planned, seed_of
+from app.planning.plans.grounds import events_against, unanswered
 from app.planning.plans.key import common_limits
 from app.planning.plans.limits import device_limits
 from app.planning.plans.models import PlanItem
@@ -25,6 +26,7 @@ from app.platform import files
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.platform.signatures.models import Signature
 from app.study import service as study
+from app.study.adverse_events.repository import with_serious_events
 from app.study.models import Controller, Hemisphere, Visit
 from ml.deploy.blinding import Common, blind, room_for
 from ml.deploy.bundle import build_scheduled_bundle, sign
@@ -98,11 +100,24 @@ def runnable(view: PlanView, day: date | None = None) -> Signature:
 
 
 def withdrawals(db: Session) -> bytes:
-    """What was withdrawn, as a tablet takes it: a line of JSON, and its signature in a second one."""
+    """What was withdrawn, as a tablet takes it: a line of JSON, and its signature in a second one.
+
+    Plans that may not run after an adverse event are among it until the event is cleared: a bundle of theirs may have left before it.
+    """
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
-    gone = Withdrawals(now, frozenset(repository.withdrawn_policies(db)), frozenset(repository.withdrawn_plans(db)))
+    plans = frozenset(repository.withdrawn_plans(db)) | _stopped_plans(db)
+    gone = Withdrawals(now, frozenset(repository.withdrawn_policies(db)), plans)
     body = withdrawals_body(gone)
     return body + b"\n" + service.signing_key().sign(body).hex().encode() + b"\n"
+
+
+def _stopped_plans(db: Session) -> frozenset[int]:
+    """Signed plans of this installation with a policy under which something serious happened that nobody has cleared or answered."""
+    found: set[int] = set()
+    for participant in with_serious_events(db):
+        events = events_against(db, participant)
+        found |= {plan.id for plan in repository.signed_plans(db, participant.id) if unanswered(plan, events)}
+    return frozenset(found)
 
 
 def _slot(view: PlanView, item: PlanItem, signature: Signature, at: datetime) -> Slot:

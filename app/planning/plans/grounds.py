@@ -12,11 +12,15 @@ from app.evaluation.models import Evaluation
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.decisions import Decided
 from app.evaluation.ranking.judged import judged
+from app.planning.plans.models import Plan
 from app.study.adverse_events.models import AdverseEvent
 from app.study.adverse_events.repository import events_of_participant
 from app.study.adverse_events.service import blocking_events
 from app.study.models import Participant
 from ml.ope.flags import Flag
+
+Events = Mapping[int, tuple[AdverseEvent, ...]]
+"""Serious adverse events that no clinician has cleared, by policy."""
 
 HAPPENED = Decided("unsafe", (Flag("adverse_event"),))
 """The verdict on a policy under which something serious happened, where no ranking says so."""
@@ -27,11 +31,11 @@ class Grounds:
     """All that a participant's policies are planned by.
 
     Attributes:
-        ranking: the one behind the plan; None without one. events: by policy, serious ones that no clinician has cleared.
+        ranking: the one behind the plan; None without one. events: as `events_against` gives them.
     """
 
     ranking: Assessment | None
-    events: Mapping[int, tuple[AdverseEvent, ...]]
+    events: Events
 
     def of(self, policy_id: int) -> Decided | None:
         """What is said of a policy; None where nothing is known of it."""
@@ -50,6 +54,25 @@ def grounds(db: Session, participant: Participant, evaluation: Evaluation | None
     return Grounds(ranking, events_against(db, participant))
 
 
-def events_against(db: Session, participant: Participant) -> dict[int, tuple[AdverseEvent, ...]]:
+def unanswered(plan: Plan, events: Events) -> Events:
+    """By policy of a plan, the events that keep it from being signed and run.
+
+    An event is answered where the plan says why the policy is tested all the same, and was drafted after the event was last described: who
+    gave a reason before cannot have meant it.
+
+    Args:
+        events: as `events_against` gives them.
+    """
+    found = {}
+    for item in plan.items:
+        open_ones = tuple(
+            event for event in events.get(item.policy_id or 0, ()) if not item.override_reason or event.now.created_at >= plan.created_at
+        )
+        if item.policy_id is not None and open_ones:
+            found[item.policy_id] = open_ones
+    return found
+
+
+def events_against(db: Session, participant: Participant) -> Events:
     """By policy, serious adverse events that no clinician has cleared; those of sealed visits too, as a verdict depends on no reader."""
     return blocking_events(events_of_participant(db, participant.id), SYSTEM)

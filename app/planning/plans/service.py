@@ -25,7 +25,7 @@ from app.planning.plans.models import Plan, PlanItem, is_held
 from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
 from app.planning.plans.schemas import HeldIn, Move, PlanIn, PlanOptions
 from app.planning.plans.sign_off import sign_plan
-from app.planning.plans.view import PlanView, medication_due, read_plan, refuse_withdrawn, view_of
+from app.planning.plans.view import PlanView, medication_due, read_plan, refuse_after_events, refuse_withdrawn, view_of
 from app.planning.protocol.schedule import Candidate, Rules, require_controls, schedule
 from app.planning.protocol.session_order import Order
 from app.planning.releases import service as releases
@@ -106,7 +106,8 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
 
     Raises:
         NotFound: no plan. Conflict: approved already, replaced meanwhile, with a policy that was retired since it was drafted, limits that
-            were set for another cDBS amplitude, or what `safeguards.refuse_approval` or `releases.refuse_unreleased` refuse.
+            were set for another cDBS amplitude, a serious adverse event since the reason was given why its policy is tested all the same,
+            or what `safeguards.refuse_approval` or `releases.refuse_unreleased` refuse.
         Invalid: no cDBS amplitude by which limits are ones in milliamperes. Forbidden, TooMany: as `sign_off.sign_plan`.
     """
     study.require(caller, can.APPROVE_PLAN, visit.participant)
@@ -121,6 +122,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
     policies = {line.policy.id: line.policy for line in view.lines if line.policy}
     stated = [(v.policy, Safeguard(v.item.verdict, v.item.min_fraction, v.item.override_reason)) for v in view.lines if v.policy]
     refuse_approval(grounds(db, visit.participant, view.evaluation), stated)
+    refuse_after_events(view)
     releases.refuse_unreleased(db, visit.participant, [(line.policy, line.item) for line in view.lines if line.policy])
     _fix_designs(visit, plan)
     require_limits(visit, plan.items)

@@ -21,12 +21,14 @@ from app.learning.models import Policy
 from app.planning.notices import Code, PlanWarning, without_policies
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of
+from app.planning.plans.grounds import Events, events_against, unanswered
 from app.planning.plans.key import CommonLimits, common_limits, sealed
 from app.planning.plans.limits import require_limits
 from app.planning.plans.models import Plan, PlanItem
 from app.planning.plans.sign_off import signature_of
 from app.planning.plans.visits import today
 from app.planning.protocol.medication import due_before
+from app.planning.wording import ANSWER_EVENT, happened
 from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
 from app.platform.signatures.models import Signature
 from app.platform.signatures.service import SignatureState
@@ -69,6 +71,8 @@ class PlanView:
     warnings: list[PlanWarning]
     signature: Signature | None
     signature_state: SignatureState
+    unanswered: Events
+    """By policy, the adverse events for which it is neither signed nor run (`app.planning.plans.grounds.unanswered`)."""
 
     @property
     def sealed(self) -> bool:
@@ -111,8 +115,20 @@ def refuse_withdrawn(view: PlanView) -> None:
             )
 
 
+def refuse_after_events(view: PlanView) -> None:
+    """Raises Conflict for a plan with a policy under which something serious happened that nobody has cleared or answered."""
+    names = {line.policy.id: line.policy.name for line in view.lines if line.policy}
+    for policy_id, events in view.unanswered.items():
+        # of a sealed plan neither policy nor event is named, for the event may tell the policy
+        what = happened(None if view.sealed else names[policy_id], [event.id for event in events])
+        may_not = "be signed" if view.plan.status == "draft" else "run"
+        raise Conflict(f"Plan {view.plan.id} of visit {view.visit.number} may not {may_not}: {what}.", ANSWER_EVENT)
+
+
 def refuse_running(view: PlanView) -> None:
     """Hold a plan against what may run in a participant: signed, unchanged since, no policy withdrawn, the cDBS amplitude that was signed.
+
+    Nor may one run with a policy under which something serious happened since, until a clinician has cleared it.
 
     Raises:
         Conflict: one of these fails; it says which. Invalid: nobody knows the cDBS amplitude any more.
@@ -126,6 +142,7 @@ def refuse_running(view: PlanView) -> None:
         }[view.signature_state]
         raise Conflict(f"Plan {view.plan.id} of visit {view.visit.number} {why}.", "Draft the visit anew, and have a clinician sign it.")
     refuse_withdrawn(view)
+    refuse_after_events(view)
     require_limits(view.visit, view.plan.items)
 
 
@@ -174,7 +191,9 @@ def view_of(db: Session, plan: Plan, visit: Visit) -> PlanView:
         start += item.minutes + item.washout_minutes + item.break_minutes
     stale = _stale_reasons(db, visit.participant, evaluation)
     state, signature = signature_of(db, visit, plan, policies)
-    return PlanView(plan, visit, lines, evaluation, stale, _warnings(db, visit, plan, lines, found, stale), signature, state)
+    against = unanswered(plan, events_against(db, visit.participant))
+    warnings = _warnings(db, visit, plan, lines, found, stale, against)
+    return PlanView(plan, visit, lines, evaluation, stale, warnings, signature, state, against)
 
 
 def _design(visit: Visit, item: PlanItem) -> Planned | None:
@@ -207,9 +226,14 @@ def _stale_reasons(db: Session, participant: Participant, evaluation: Evaluation
 
 
 def _warnings(
-    db: Session, visit: Visit, plan: Plan, lines: Sequence[PlanLine], found: Judged | None, stale: Sequence[str]
+    db: Session, visit: Visit, plan: Plan, lines: Sequence[PlanLine], found: Judged | None, stale: Sequence[str], against: Events
 ) -> list[PlanWarning]:
-    warnings = [PlanWarning(Code.STALE_RANKING, values={"reason": reason}) for reason in stale]
+    names = {line.policy.id: line.policy.name for line in lines if line.policy}
+    warnings = [
+        PlanWarning(Code.ADVERSE_EVENT, policy_id, names[policy_id], {"events": tuple(event.id for event in events)})
+        for policy_id, events in against.items()
+    ]
+    warnings += [PlanWarning(Code.STALE_RANKING, values={"reason": reason}) for reason in stale]
     if found:
         warnings += [PlanWarning(Code.RANKING_NOTE, values={"text": text}) for text in evaluation_notes(found)]
     elif any(line.policy for line in lines):

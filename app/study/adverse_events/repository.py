@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.permissions import Caller
 from app.platform.errors import NotFound
-from app.study.adverse_events.models import AdverseEvent
+from app.study.adverse_events.models import AdverseEvent, AdverseEventRevision
 from app.study.models import Participant, StudySession, Visit
 from app.study.repository import in_scope
 
@@ -26,6 +26,12 @@ def event(db: Session, event_id: int, caller: Caller) -> AdverseEvent:
 def events_of_participant(db: Session, participant_id: int) -> Sequence[AdverseEvent]:
     """A participant's events in the order in which they were entered."""
     return db.scalars(_events().where(AdverseEvent.participant_id == participant_id).order_by(AdverseEvent.id)).all()
+
+
+def with_serious_events(db: Session) -> Sequence[Participant]:
+    """Participants of this installation of whom a serious event was ever written down, cleared or not."""
+    serious = select(AdverseEvent.participant_id).join(AdverseEvent.revisions).where(AdverseEventRevision.serious)
+    return db.scalars(select(Participant).where(Participant.id.in_(serious)).order_by(Participant.id)).all()
 
 
 def events_of_session(db: Session, session_id: int) -> Sequence[AdverseEvent]:

@@ -104,7 +104,7 @@ class Slot:
 
 @dataclass(frozen=True)
 class Withdrawals:
-    """Policies and plans that the study has taken back, signed by it. `issued_at`: ISO 8601; a later list holds all of an earlier one."""
+    """Policies and plans that the study has taken back, signed by it. `issued_at`: ISO 8601; the newest list counts."""
 
     issued_at: str
     policies: frozenset[int]
