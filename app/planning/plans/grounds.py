@@ -1,4 +1,4 @@
-"""What a policy is planned by: the verdict of the ranking behind the plan, and adverse events, with a ranking or without."""
+"""What a policy is planned by: the verdicts of the ranking behind the plan and of the newest one, and adverse events, ranked or not."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.evaluation import repository as evaluations
 from app.evaluation.models import Evaluation
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.decisions import Decided
 from app.evaluation.ranking.judged import judged
+from app.evaluation.schemas import Decision
 from app.planning.plans.models import Plan
 from app.study.adverse_events.models import AdverseEvent
 from app.study.adverse_events.repository import events_of_participant
@@ -26,32 +28,74 @@ HAPPENED = Decided("unsafe", (Flag("adverse_event"),))
 """The verdict on a policy under which something serious happened, where no ranking says so."""
 
 
+_STRICTEST_FIRST = ("unsafe", "test_with_care")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is said of one policy, taken together: a plan goes by the strictest of it.
+
+    Attributes:
+        said: of the ranking behind the plan, then of the newest one; after a serious adverse event that neither holds, by that alone.
+    """
+
+    said: tuple[Decided, ...]
+
+    @property
+    def verdict(self) -> Decision:
+        """The strictest; where none is strict, that of the ranking behind the plan."""
+        verdicts = [decided.decision for decided in self.said]
+        return next((strict for strict in _STRICTEST_FIRST if strict in verdicts), verdicts[0])
+
+    @property
+    def held_back(self) -> Decided | None:
+        """The newest for which it is planned only with a clinician's stated reason; None where none asks for that."""
+        return next((decided for decided in reversed(self.said) if decided.needs_override), None)
+
+    @property
+    def with_care(self) -> bool:
+        """Whether it is to be tested with care by any."""
+        return any(decided.decision == "test_with_care" for decided in self.said)
+
+    @property
+    def limit(self) -> float | None:
+        """The highest of the lowest amplitudes of a test with care, fraction of cDBS; None where no verdict names one."""
+        return max((decided.limit for decided in self.said if decided.limit is not None), default=None)
+
+
 @dataclass(frozen=True)
 class Grounds:
     """All that a participant's policies are planned by.
 
     Attributes:
-        ranking: the one behind the plan; None without one. events: as `events_against` gives them.
+        rankings: the one behind the plan, then the newest where it is another one; empty without any. events: as `events_against` gives
+            them.
     """
 
-    ranking: Assessment | None
+    rankings: tuple[Assessment, ...]
     events: Events
 
-    def of(self, policy_id: int) -> Decided | None:
+    def of(self, policy_id: int) -> Finding | None:
         """What is said of a policy; None where nothing is known of it."""
-        one = self.ranking.of(policy_id) if self.ranking is not None else None
-        decided = one.decided if one is not None else None
-        return HAPPENED if decided is None and policy_id in self.events else decided
+        ranked = [one for ranking in self.rankings if (one := ranking.of(policy_id)) is not None]
+        said = tuple(one.decided for one in ranked if one.decided is not None)
+        if not said and policy_id in self.events:
+            said = (HAPPENED,)
+        return Finding(said) if said else None
 
 
 def grounds(db: Session, participant: Participant, evaluation: Evaluation | None) -> Grounds:
     """What plans of a participant go by now.
 
+    A plan may rest on an older ranking, so that what it predicted can be held against what sessions show, but is made no more leniently.
+
     Args:
         evaluation: that the plan rests on; None where there is none.
     """
-    ranking = judged(db, participant, evaluation).assessment if evaluation is not None else None
-    return Grounds(ranking, events_against(db, participant))
+    newest = evaluations.newest_evaluation(db, participant.id)
+    counted = {e.id: e for e in (evaluation, newest) if e is not None}
+    rankings = tuple(judged(db, participant, one).assessment for one in counted.values())
+    return Grounds(rankings, events_against(db, participant))
 
 
 def unanswered(plan: Plan, events: Events) -> Events:

@@ -95,7 +95,8 @@ class PlanItem(Base):
     medication: Mapped[str] = mapped_column(Text, server_default="")
     """What is due before the session."""
     verdict: Mapped[str | None] = mapped_column(String(20))
-    """What the ranking said of the policy when the plan was drafted; `unsafe` after a serious adverse event, ranked or not."""
+    """What the ranking said of the policy when the plan was drafted, the strictest of it and the newest one; `unsafe` after a serious
+    adverse event, ranked or not."""
     min_fraction: Mapped[float | None]
     """Lowest amplitude of the session's envelope, fraction of the cDBS amplitude; None where the plan states none."""
     override_reason: Mapped[str | None] = mapped_column(Text)

@@ -19,7 +19,8 @@ class Safeguard:
     """What a plan records of one policy.
 
     Attributes:
-        verdict: of the ranking, or *unsafe* after a serious adverse event; None where neither says anything of the policy.
+        verdict: the strictest of the ranking behind the plan and the newest one, *unsafe* after a serious adverse event; None where
+            nothing is known of the policy.
         min_fraction: lowest amplitude, fraction of cDBS; None where the plan states none. override_reason: a clinician's.
     """
 
@@ -45,16 +46,16 @@ def safeguards(
     _all_planned(policies, overrides, limits)
     made, careful = {}, []
     for policy in policies:
-        decided = found.of(policy.id)
+        finding = found.of(policy.id)
         reason, limit = overrides.get(policy.id, "").strip() or None, limits.get(policy.id)
-        unsafe = decided is not None and decided.needs_override
-        if decided is not None and unsafe:
-            _require_override(policy, decided, reason, may_override)
-        if decided is not None and decided.decision == "test_with_care":
+        held_back = finding.held_back if finding is not None else None
+        if held_back is not None:
+            _require_override(policy, held_back, reason, may_override)
+        if finding is not None and finding.with_care:
             careful.append(policy)
-            limit = _checked_limit(policy, decided, limit)
+            limit = _checked_limit(policy, finding.limit, limit)
         # a reason that nothing asks for is not kept: it would look as if something had been overridden
-        made[policy.id] = Safeguard(decided.decision if decided else None, limit, reason if unsafe else None)
+        made[policy.id] = Safeguard(finding.verdict if finding else None, limit, reason if held_back else None)
     if len(careful) > 1:
         words = f"{_names(careful)} are each to be tested with care; a visit takes one of them."
         raise Invalid(words, "Leave all but one out.", field="policy_ids")
@@ -70,18 +71,19 @@ def refuse_approval(found: Grounds, planned: Sequence[tuple[Policy, Safeguard]])
     """
     careful = []
     for policy, stated in planned:
-        decided = found.of(policy.id)
-        if decided is None:
+        finding = found.of(policy.id)
+        if finding is None:
             continue
-        if decided.needs_override and not stated.override_reason:
+        if finding.held_back is not None and not stated.override_reason:
             raise Conflict(
-                f"Policy '{policy.name}' is not to be run without a clinician's word: {_why(decided)}.",
+                f"Policy '{policy.name}' is not to be run without a clinician's word: {_why(finding.held_back)}.",
                 "Draft the visit anew without it, or with the reason why it is tested all the same.",
             )
-        if decided.decision == "test_with_care":
+        if finding.with_care:
             careful.append(policy)
-            if stated.min_fraction is None or (decided.limit is not None and stated.min_fraction < decided.limit - ROUNDING):
-                least = f" of at least {decided.limit:.2f} of the cDBS amplitude" if decided.limit is not None else ""
+            limit = finding.limit
+            if stated.min_fraction is None or (limit is not None and stated.min_fraction < limit - ROUNDING):
+                least = f" of at least {limit:.2f} of the cDBS amplitude" if limit is not None else ""
                 raise Conflict(
                     f"Policy '{policy.name}' is to be tested with care, and the plan states no lowest amplitude{least} for it.",
                     "Draft the visit anew with that limit.",
@@ -101,13 +103,13 @@ def _require_override(policy: Policy, decided: Decided, reason: str | None, may_
         raise Forbidden(f"Policy '{policy.name}' is unsafe; only those who may approve plans can plan it.", "Ask a clinician of the study.")
 
 
-def _checked_limit(policy: Policy, decided: Decided, stated: float | None) -> float | None:
+def _checked_limit(policy: Policy, least: float | None, stated: float | None) -> float | None:
     """The lowest amplitude of a test with care: what was stated, else the verdict's; never below that."""
-    if stated is None or decided.limit is None:
-        return decided.limit if stated is None else stated
-    if stated < decided.limit - ROUNDING:
+    if stated is None or least is None:
+        return least if stated is None else stated
+    if stated < least - ROUNDING:
         raise Invalid(
-            f"Policy '{policy.name}' may be tested down to {decided.limit:.2f} of the cDBS amplitude, not to {stated:.2f}: no two sessions "
+            f"Policy '{policy.name}' may be tested down to {least:.2f} of the cDBS amplitude, not to {stated:.2f}: no two sessions "
             "held less.",
             "Leave the limit out, or raise it.",
             field=f"limit_{policy.id}",

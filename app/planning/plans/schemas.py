@@ -50,7 +50,11 @@ class PlanOptions(Model):
         None, gt=0, le=100, description="Fastest change, mA/s; the cDBS amplitude within one period where not given."
     )
     seed: Int | None = Field(None, ge=0, description="Draws the order; without one it is drawn too, and recorded.")
-    evaluation_id: Id | None = Field(None, description="Ranking that the choice rests on; the participant's newest where not given.")
+    evaluation_id: Id | None = Field(
+        None,
+        description="Ranking that the choice rests on; the participant's newest where not given. Beside an older one the newest counts "
+        "too: what is unsafe by either needs a reason, and a test with care has the higher limit of both.",
+    )
     note: Text = Field("", max_length=4000)
     reason: Text | None = Field(
         None, max_length=1000, description="Why an approved plan is replaced; needed then, recorded in the audit trail."
@@ -167,8 +171,8 @@ class PlannedSessionOut(Model):
     estimate: PlanEstimateOut | None
     predicted_energy: float | None = Field(description="Mean squared amplitude fraction; cDBS = 1.")
     verdict: str | None = Field(
-        description="What the ranking said of the policy when the plan was drafted; null for what is not ranked, but `unsafe` after a "
-        "serious adverse event that no clinician has cleared."
+        description="What the ranking said of the policy when the plan was drafted, the strictest where the plan rests on an older one; "
+        "null for what is not ranked, but `unsafe` after a serious adverse event that no clinician has cleared."
     )
     min_fraction: float | None = Field(description="Lowest amplitude of the session, fraction of the cDBS amplitude.")
     override_reason: str | None = Field(description="Why a clinician plans an unsafe policy all the same.")

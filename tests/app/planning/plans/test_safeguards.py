@@ -137,6 +137,53 @@ def test_verdicts_are_asked_again_at_approval(
     assert (answer.status_code, "is worse by more than its margin, most often tremor" in answer.json()["detail"]) == (409, True)
 
 
+@pytest.mark.hazard("H04")
+@pytest.mark.parametrize("newest_is_strict", [True, False])
+def test_a_plan_on_an_older_ranking_goes_by_the_newest_too(
+    client: TestClient, policies: list[int], judge: Judge, visit: int, sign_plan: Approve, newest_is_strict: bool
+) -> None:
+    a, b, c = policies
+    lenient = {i: judged(50.0) for i in policies}
+    strict = {a: judged(50.0, **UNSAFE), b: judged(60.0, **CAREFUL), c: judged(40.0, **CAREFUL)}
+    older, _ = [judge(found) for found in ([lenient, strict] if newest_is_strict else [strict, lenient])]
+    refused = draft(client, visit, a, evaluation_id=older)
+    assert (refused.status_code, "nearly off 42 % of the time" in refused.json()["detail"]) == (422, True)
+    two = draft(client, visit, b, c, evaluation_id=older)
+    assert (two.status_code, "a visit takes one of them" in two.json()["detail"]) == (422, True)
+    low = draft(client, visit, b, evaluation_id=older, limits=[{"policy_id": b, "min_fraction": 0.3}])
+    assert (low.status_code, "not to 0.30" in low.json()["detail"]) == (422, True)
+    plan = draft(client, visit, a, b, evaluation_id=older, overrides=[{"policy_id": a, "reason": "watched"}]).json()
+    stated = {s["policy_id"]: (s["verdict"], s["min_fraction"], s["override_reason"]) for s in plan["sessions"] if s["policy_id"]}
+    assert stated == {a: ("unsafe", None, "watched"), b: ("test_with_care", 0.5, None)}
+    assert plan["evaluation"]["id"] == older
+    assert sign_plan(visit).status_code == 200
+
+
+def test_a_limit_is_the_higher_of_both_rankings(client: TestClient, policies: list[int], judge: Judge, visit: int) -> None:
+    a = policies[0]
+    limited = [judged(50.0, supported=False, support={"lowest_supported": least, "dose": 0.4}) for least in (0.7, 0.5)]
+    older, _ = [judge({a: found}) for found in limited]
+    for chosen, least in ((None, 0.5), (older, 0.7)):
+        plan = draft(client, visit, a, evaluation_id=chosen).json()
+        assert [s["min_fraction"] for s in plan["sessions"] if s["policy_id"]] == [least]
+
+
+def test_a_ranking_that_is_made_after_the_draft_counts_at_the_signature(
+    client: TestClient, policies: list[int], judge: Judge, visit: int, sign_plan: Approve
+) -> None:
+    a, b, _ = policies
+    judge({a: judged(50.0)})
+    assert draft(client, visit, a).status_code == 201
+    judge({a: judged(50.0, **CAREFUL), b: judged(40.0)})
+    careful = sign_plan(visit)
+    assert (careful.status_code, "states no lowest amplitude of at least 0.50" in careful.json()["detail"]) == (409, True)
+    judge({a: judged(50.0, **UNSAFE), b: judged(40.0)})
+    unsafe = sign_plan(visit)
+    assert (unsafe.status_code, "nearly off 42 % of the time" in unsafe.json()["detail"]) == (409, True)
+    judge({a: judged(50.0), b: judged(40.0)})
+    assert sign_plan(visit).status_code == 200
+
+
 def test_a_reason_for_what_is_not_unsafe_is_not_kept_and_one_for_what_is_not_planned_is_refused(
     client: TestClient, policies: list[int], judge: Judge, visit: int
 ) -> None:
