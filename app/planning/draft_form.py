@@ -18,8 +18,8 @@ from app.evaluation.verdict_wording import plainly
 from app.learning import repository as learning
 from app.learning.models import Policy
 from app.planning import wording
+from app.planning.grounds import HAPPENED, events_against
 from app.planning.plans.designs import offered
-from app.planning.plans.grounds import HAPPENED, events_against
 from app.planning.plans.schemas import HeldIn, LimitIn, PlanIn, PlanOptions
 from app.planning.plans.service import rules_of
 from app.planning.plans.suggested import Held, held_in, suggested

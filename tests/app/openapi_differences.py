@@ -190,6 +190,7 @@ INTENDED: dict[str, str] = {
         ),
         "API: policies are released for testing by a signature",
     ),
+    "paths > /api/v1/policies/{policy_id}/bundle > get > responses > 409": "a policy's bundle may be refused with 409.",
     **dict.fromkeys(
         ("paths > /api/v1/bundle-withdrawals", "paths > /api/v1/visits/{visit_id}/plan/sessions/{position}/bundle"),
         "API: bundles for the sessions of a signed plan",

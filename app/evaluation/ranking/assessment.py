@@ -33,7 +33,8 @@ class Assessed:
         reference: `cdbs`, `constant`, `best_constant`, `proportional`, `cloning`; None for a candidate.
         estimate: by the ranking's method; None where it has none. estimates: of every method.
         rank: 1 is best; None for references, and where the data cannot order policies. probability_best: likewise.
-        decided: the verdict; None for references. coverage: None where nothing was checked. tested: None where it never ran.
+        decided: the verdict; None for references. planned: the same for candidates, and for references the verdict by which a plan takes
+            them; None for cDBS. coverage: None where nothing was checked. tested: None where it never ran.
     """
 
     policy: PolicyHead
@@ -43,6 +44,7 @@ class Assessed:
     rank: int | None
     probability_best: float | None
     decided: Decided | None
+    planned: Decided | None
     coverage: CoverageOut | None
     tested: TestedBefore | None = None
 
@@ -167,6 +169,15 @@ def assess(
         )
         for i in candidates
     }
+    # a reference may be planned as any policy; how many sessions would settle it is not asked
+    unasked = replace(given, noise={})
+    planned = decided | {
+        i: decide(
+            table[i], cdbs, evaluation.default_method, unasked, i, retired_reason=policies[i].retired_reason, adverse_event=i in harmful
+        )
+        for i, reference in references.items()
+        if reference != "cdbs" and i in table
+    }
     ordered = ordering_told({i: by[POSTERIOR] for i, by in table.items() if POSTERIOR in by and i not in references})
     # who is unsafe comes last, as who is not supported does
     held_back = {str(i): replace(e, supported=e.supported and decided[i].decision not in _LAST) for i, e in candidates.items()}
@@ -182,6 +193,7 @@ def assess(
             places[i].rank if i in places and ordered else None,
             places[i].probability_best if i in places and ordered else None,
             decided.get(i),
+            planned.get(i),
             coverage.get(i),
         )
         for i in order

@@ -26,7 +26,7 @@ from app.learning.snapshots.buffers import read_buffer
 from app.planning import wording
 from app.planning.bundles import repository
 from app.planning.bundles.models import BundleRelease
-from app.planning.plans.grounds import events_against, unanswered
+from app.planning.grounds import events_against, unanswered
 from app.planning.plans.limits import DeviceLimits, device_limits
 from app.platform import files
 from app.platform.database import set_reason

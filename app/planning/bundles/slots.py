@@ -14,8 +14,8 @@ from app.accounts.permissions import Caller
 from app.learning import repository as learning
 from app.planning import wording
 from app.planning.bundles import repository, service
+from app.planning.grounds import events_against, unanswered
 from app.planning.plans.designs import Planned, seed_of
-from app.planning.plans.grounds import events_against, unanswered
 from app.planning.plans.key import common_limits
 from app.planning.plans.limits import device_limits
 from app.planning.plans.models import PlanItem

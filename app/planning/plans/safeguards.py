@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from app.evaluation import verdict_wording
 from app.evaluation.ranking.decisions import Decided
 from app.learning.models import Policy
-from app.planning.plans.grounds import Grounds
+from app.planning.grounds import Grounds
 from app.platform.errors import Conflict, Forbidden, Invalid
 
 ROUNDING = 1e-9

@@ -16,9 +16,9 @@ from app.evaluation import repository as evaluations
 from app.evaluation.models import Evaluation
 from app.learning import repository as learning
 from app.learning.models import Policy
+from app.planning.grounds import grounds
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of, near_sessions, planned_sessions, seed_of
-from app.planning.plans.grounds import grounds
 from app.planning.plans.key import label_sessions, sealed
 from app.planning.plans.limits import StatedLimits, lowest_draw, planned_cdbs_ma, require_limits, set_limits
 from app.planning.plans.models import Plan, PlanItem, is_held

@@ -18,10 +18,10 @@ from app.evaluation.ranking.judged import Judged, judged
 from app.evaluation.ranking.service import evaluation_notes
 from app.evaluation.ranking.staleness import stale_reasons
 from app.learning.models import Policy
+from app.planning.grounds import Events, events_against, unanswered
 from app.planning.notices import Code, PlanWarning, without_policies
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of
-from app.planning.plans.grounds import Events, events_against, unanswered
 from app.planning.plans.key import CommonLimits, common_limits, sealed
 from app.planning.plans.limits import require_limits
 from app.planning.plans.models import Plan, PlanItem
@@ -72,7 +72,7 @@ class PlanView:
     signature: Signature | None
     signature_state: SignatureState
     unanswered: Events
-    """By policy, the adverse events for which it is neither signed nor run (`app.planning.plans.grounds.unanswered`)."""
+    """By policy, the adverse events for which it is neither signed nor run (`app.planning.grounds.unanswered`)."""
 
     @property
     def sealed(self) -> bool:

@@ -184,6 +184,32 @@ def test_a_ranking_that_is_made_after_the_draft_counts_at_the_signature(
     assert sign_plan(visit).status_code == 200
 
 
+@pytest.mark.hazard("H04")
+def test_a_reference_is_planned_by_the_same_rule_as_a_candidate(
+    client: TestClient, policies: list[int], judge: Judge, visit: int, db: Session, sign_plan: Approve
+) -> None:
+    a = policies[0]
+    judge({a: judged(50.0)})
+    baselines = {row.name: row.id for row in db.execute(text("select id, name from policy where kind = 'baseline'"))}
+    cdbs = baselines.pop("cDBS (constant 1.00)")
+    assert {"constant 0.40", "constant 0.55"} < set(baselines), "and two that follow beta"
+    judge({a: judged(50.0)} | {i: judged(10.0, **UNSAFE) for i in baselines.values()})
+    for name, i in baselines.items():
+        refused = draft(client, visit, i)
+        assert (refused.status_code, "nearly off 42 % of the time" in refused.json()["detail"]) == (422, True), name
+    held = baselines["constant 0.40"]
+    plan = draft(client, visit, held, overrides=[{"policy_id": held, "reason": "watched"}]).json()
+    assert {(s["verdict"], s["override_reason"]) for s in plan["sessions"] if s["policy_id"]} == {("unsafe", "watched")}
+    assert sign_plan(visit).status_code == 200
+    judge({a: judged(50.0, **CAREFUL), held: judged(10.0, **CAREFUL)})
+    assert "a visit takes one of them" in draft(client, visit, a, held, reason="anew").json()["detail"]
+    careful = draft(client, visit, held, reason="anew").json()
+    assert {(s["verdict"], s["min_fraction"]) for s in careful["sessions"] if s["policy_id"]} == {("test_with_care", 0.5)}
+    assert draft(client, visit, cdbs).json()["sessions"][0]["verdict"] is None, "cDBS is what everything is held against"
+    shown = client.get("/api/v1/participants/P1/ranking").json()
+    assert {r["decision"] for r in shown["references"]} == {None}, "the ranking itself judges candidates alone"
+
+
 def test_a_reason_for_what_is_not_unsafe_is_not_kept_and_one_for_what_is_not_planned_is_refused(
     client: TestClient, policies: list[int], judge: Judge, visit: int
 ) -> None:

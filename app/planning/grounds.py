@@ -78,7 +78,7 @@ class Grounds:
     def of(self, policy_id: int) -> Finding | None:
         """What is said of a policy; None where nothing is known of it."""
         ranked = [one for ranking in self.rankings if (one := ranking.of(policy_id)) is not None]
-        said = tuple(one.decided for one in ranked if one.decided is not None)
+        said = tuple(one.planned for one in ranked if one.planned is not None)
         if not said and policy_id in self.events:
             said = (HAPPENED,)
         return Finding(said) if said else None
