@@ -30,7 +30,9 @@ def path(studied: Any, tail: str = "") -> str:
 
 @pytest.fixture
 def drafted(client: TestClient, studied: Any) -> dict[str, Any]:
-    answer = client.post(path(studied), json={"policy_ids": list(studied.policies[:2]), "seed": 7, "min_ma": 0.5, "max_ma": 3.5})
+    answer = client.post(
+        path(studied), json={"policy_ids": list(studied.policies[:2]), "seed": 7, "min_ma": 0.5, "max_ma": 3.5, "random_sessions": 1}
+    )
     assert answer.status_code == 201, answer.text
     plan: dict[str, Any] = answer.json()
     return plan
@@ -45,7 +47,7 @@ def test_limits_are_set_with_the_draft_and_signed(
     client: TestClient, db: Session, studied: Any, drafted: dict[str, Any], sign_plan: Callable[..., Any]
 ) -> None:
     limits = {(s["controller"], s["min_ma"], s["max_ma"], s["ramp_ma_per_s"], s["cdbs_ma"]) for s in drafted["sessions"]}
-    assert limits == {("rl", 0.5, 3.5, 1.5, 3.0), ("cdbs", 3.0, 3.0, 1.5, 3.0)}
+    assert limits == {("rl", 0.5, 3.5, 1.5, 3.0), ("random", 0.9, 3.5, 1.5, 3.0), ("cdbs", 3.0, 3.0, 1.5, 3.0)}
     assert (drafted["signature"], drafted["signature_state"]) == (None, "none")
     signed = sign_plan(studied.visit, plan_id=drafted["id"]).json()
     assert (signed["signature_state"], signed["signature"]["signer"]) == ("stands", "signer@clinic.example")
@@ -55,7 +57,7 @@ def test_limits_are_set_with_the_draft_and_signed(
     assert [s["policy"] for s in sessions] == [s["policy_id"] for s in signed["sessions"]]
     files = {p.id: p.onnx_sha256 for p in db.scalars(select(Policy))}
     assert all(s["policy_sha256"] == files[s["policy"]] for s in sessions if s["policy"])
-    assert all(s["max_ma"] == (3.5 if s["policy"] else 3.0) for s in sessions)
+    assert all(s["max_ma"] == (3.0 if s["controller"] == "cdbs" else 3.5) for s in sessions)
     refuse_running(seen(db, studied))
 
 
@@ -88,6 +90,9 @@ def test_a_wrong_password_signs_nothing(client_as: Callable[..., TestClient], st
         "update plan_item set position = 10 - position",
         "update plan_item set controller = 'distilled' where policy_id is not null",
         "update plan_item set minutes = 20",
+        "update plan_item set min_fraction = 0.9 where policy_id is not null",
+        "update plan_item set override_reason = 'watched' where policy_id is not null",
+        "update plan_item set design = jsonb_set(design, '{lower_bound}', '0.1') where design is not null",
         "update policy set onnx_sha256 = (select min(onnx_sha256) from policy)",
         "update plan set note = 'something else'",
     ],
