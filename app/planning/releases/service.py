@@ -66,13 +66,14 @@ def release(
     Raises:
         Forbidden: whoever brought a policy, or one that it was made from, from elsewhere; one who approves no plans; a wrong password.
         TooMany: too many wrong ones.
-        Conflict: a retired policy. Invalid: limits that contradict each other or leave the stimulator's own; a damaged file; or nobody has
-            stated the cDBS amplitude or the unit of beta.
+        Conflict: a retired policy, or as `bundles.refuse_after_events`. Invalid: limits that contradict each other or leave the
+            stimulator's own; a damaged file; or nobody has stated the cDBS amplitude or the unit of beta.
     """
     study.require(caller, can.APPROVE_PLAN, participant)
     study.require_own(participant, policy, f"policy {policy.id}")
     if policy.retired_reason:
         raise Conflict(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", "Take it back first, or release another one.")
+    bundles.refuse_after_events(db, participant, policy)
     brought = brought_by(db, policy, caller)
     if brought is not None:
         made_of = "" if brought is policy else f" Policy '{policy.name}' was made from it."

@@ -100,6 +100,19 @@ def test_whoever_brought_a_policy_does_not_release_what_was_made_from_it(
     assert release(client_as("clinician"), tuned).status_code == 201
 
 
+def test_a_policy_under_which_something_serious_happened_is_not_released_until_it_is_cleared(
+    client: TestClient, client_as: Clients, policy: int
+) -> None:
+    body = {"kind": "fall", "severity": "severe", "serious": True, "policy_id": policy}
+    event = client.post("/api/v1/participants/P1/adverse-events", json=body).json()
+    clinician = client_as("clinician")
+    refused = release(clinician, policy)
+    assert (refused.status_code, f"adverse event {event['id']}" in refused.json()["detail"]) == (409, True), refused.text
+    given = {"revision": event["revision"], "reason": "she tripped"}
+    assert clinician.post(f"/api/v1/adverse-events/{event['id']}/clearance", json=given).status_code == 200
+    assert release(clinician, policy).status_code == 201
+
+
 def test_a_retired_policy_and_impossible_limits_are_refused(client: TestClient, client_as: Clients, policy: int) -> None:
     clinician = client_as("clinician")
     assert release(clinician, policy, min_ma=3.0, max_ma=1.0).status_code == 422
