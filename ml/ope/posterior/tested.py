@@ -17,7 +17,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtr, stdtrit
 
 from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference
 from ml.returns import actual_return
@@ -34,7 +34,7 @@ PRIOR_FREEDOM = 3
 FEWEST = 3
 """Degrees of freedom below which the spread between visits is asked as well."""
 
-_WITHIN_ONE = float(stats.norm.cdf(1.0))
+_WITHIN_ONE = float(ndtr(1.0))
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def _noise(name: str, groups: Mapping[tuple[str | None, int], Sequence[TestSessi
     if not total:
         return LEAST_ERROR[name]
     rests_on = total**2 / sum(part**2 / of for part, _, of in parts if of)
-    return max(float(np.sqrt(total / weights) * stats.t.ppf(_WITHIN_ONE, rests_on)), LEAST_ERROR[name])
+    return max(float(np.sqrt(total / weights) * stdtrit(rests_on, _WITHIN_ONE)), LEAST_ERROR[name])
 
 
 def _squares(groups: Sequence[Floats]) -> tuple[float, int]:
