@@ -17,23 +17,11 @@ from ml.deploy.runtime.slot import read_withdrawals
 from tests.app.planning.bundles.test_slots import policies as policies
 from tests.app.planning.bundles.test_slots import signed as signed
 from tests.app.planning.bundles.test_slots import taken
+from tests.app.planning.serious_events import clear, event
 
 PAGE = {"Accept": "text/html"}
 Sign = Callable[..., Any]
 ANSWERED = "the fall was a stumble over a cable"
-
-
-def event(client: TestClient, policy: int) -> dict[str, Any]:
-    body = {"kind": "fall", "severity": "severe", "serious": True, "policy_id": policy}
-    answer = client.post("/api/v1/participants/P1/adverse-events", json=body)
-    assert answer.status_code == 201, answer.text
-    found: dict[str, Any] = answer.json()
-    return found
-
-
-def clear(client: TestClient, found: dict[str, Any]) -> None:
-    given = {"revision": found["revision"], "reason": "she tripped"}
-    assert client.post(f"/api/v1/adverse-events/{found['id']}/clearance", json=given).status_code == 200
 
 
 def warned(client: TestClient, visit: int) -> list[tuple[int | None, str]]:

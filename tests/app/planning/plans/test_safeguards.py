@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 from tests.app.evaluations import judge as judge
 from tests.app.evaluations import judged
 from tests.app.evaluations import policies as policies
+from tests.app.planning.serious_events import event
 from tests.ml.ope.posterior.draws import N
 
 Judge = Callable[..., int]
@@ -50,14 +51,6 @@ def test_an_unsafe_policy_is_planned_only_with_a_clinicians_reason(
     assert stated == {a: ("test", None), b: ("unsafe", "asked for by the family, 5 minutes, watched")}
     assert any("unsafe and planned all the same: asked for by the family" in w["text"] for w in plan.json()["warnings"])
     assert sign_plan(visit).status_code == 200
-
-
-def event(client: TestClient, policy: int) -> dict[str, Any]:
-    body = {"kind": "fall", "severity": "severe", "serious": True, "policy_id": policy}
-    answer = client.post("/api/v1/participants/P1/adverse-events", json=body)
-    assert answer.status_code == 201, answer.text
-    found: dict[str, Any] = answer.json()
-    return found
 
 
 @pytest.mark.hazard("H24")

@@ -16,6 +16,7 @@ from app.platform import files
 from app.platform.signatures.models import Signature
 from app.settings import get_settings
 from ml.rl import MlpPolicy
+from tests.app.planning.serious_events import clear, event
 from tests.conftest import PASSWORD
 
 PAGE = {"Accept": "text/html"}
@@ -103,13 +104,11 @@ def test_whoever_brought_a_policy_does_not_release_what_was_made_from_it(
 def test_a_policy_under_which_something_serious_happened_is_not_released_until_it_is_cleared(
     client: TestClient, client_as: Clients, policy: int
 ) -> None:
-    body = {"kind": "fall", "severity": "severe", "serious": True, "policy_id": policy}
-    event = client.post("/api/v1/participants/P1/adverse-events", json=body).json()
+    found = event(client, policy)
     clinician = client_as("clinician")
     refused = release(clinician, policy)
-    assert (refused.status_code, f"adverse event {event['id']}" in refused.json()["detail"]) == (409, True), refused.text
-    given = {"revision": event["revision"], "reason": "she tripped"}
-    assert clinician.post(f"/api/v1/adverse-events/{event['id']}/clearance", json=given).status_code == 200
+    assert (refused.status_code, f"adverse event {found['id']}" in refused.json()["detail"]) == (409, True), refused.text
+    clear(clinician, found)
     assert release(clinician, policy).status_code == 201
 
 
