@@ -137,6 +137,13 @@ class Judged:
         return self.kept(("picture", lower_bound, policy_id), read)
 
 
+def _with_copies(harmful: frozenset[int], heads: Mapping[int, PolicyHead]) -> frozenset[int]:
+    """Policies under which something serious happened, their students and their teachers: a student does what its teacher does."""
+    students = {i for i, head in heads.items() if head.teacher_id in harmful}
+    teachers = {head.teacher_id for i, head in heads.items() if i in harmful and head.teacher_id is not None}
+    return harmful | students | teachers
+
+
 def judged(
     db: Session,
     participant: Participant,
@@ -160,9 +167,9 @@ def judged(
         there = [m for m in method_keys() if m in stored]
         if chosen not in there:
             raise Invalid(f"This ranking has no estimates by '{chosen}'.", f"Choose one of {', '.join(there)}.")
-    # a verdict does not depend on who asks for it
-    harmful = frozenset(blocked_policies(events_of_participant(db, participant.id), SYSTEM))
     heads, cdbs_ma = repository.policy_heads(db, evaluation.id), cdbs_amplitude_now(participant)
+    # a verdict does not depend on who asks for it
+    harmful = _with_copies(blocked_policies(events_of_participant(db, participant.id), SYSTEM), heads)
     return Judged(db, participant, evaluation, chosen, heads, harmful, cdbs_ma, caller, sessions)
 
 

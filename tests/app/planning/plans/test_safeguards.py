@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 from tests.app.evaluations import judge as judge
 from tests.app.evaluations import judged
 from tests.app.evaluations import policies as policies
-from tests.app.planning.serious_events import event
+from tests.app.planning.serious_events import clear, event
 from tests.ml.ope.posterior.draws import N
 
 Judge = Callable[..., int]
@@ -128,6 +128,26 @@ def test_verdicts_are_asked_again_at_approval(
     client.put("/api/v1/participants/P1/margins", json={"margins": {"tremor_points": 5}, "reason": "she fears tremor most"})
     answer = sign_plan(visit)
     assert (answer.status_code, "is worse by more than its margin, most often tremor" in answer.json()["detail"]) == (409, True)
+
+
+@pytest.mark.parametrize("under", ["teacher", "student"])
+def test_a_serious_adverse_event_holds_back_what_does_the_same_by_making(
+    client: TestClient, policies: list[int], judge: Judge, visit: int, db: Session, under: str
+) -> None:
+    teacher, student, other = policies
+    judge({i: judged(50.0) for i in policies})
+    made = "snapshot_id = (select max(id) from buffer_snapshot)"
+    db.execute(text(f"update policy set {made}, kind = 'trained' where id = :a"), {"a": teacher})
+    db.execute(text(f"update policy set {made}, kind = 'distilled', teacher_id = :a where id = :b"), {"a": teacher, "b": student})
+    db.commit()
+    assert draft(client, visit, teacher, student, other).status_code == 201
+    found = event(client, teacher if under == "teacher" else student)
+    for policy in (teacher, student):
+        refused = draft(client, visit, policy)
+        assert (refused.status_code, "serious adverse event, not cleared" in refused.json()["detail"]) == (422, True), refused.text
+    assert draft(client, visit, other).status_code == 201
+    clear(client, found)
+    assert draft(client, visit, teacher, student).status_code == 201
 
 
 @pytest.mark.hazard("H04")
