@@ -14,7 +14,7 @@ from app.platform.errors import FULL, BetaloopError, Conflict
 from app.settings import Settings, get_settings
 
 _WHY = {
-    errno.EADDRINUSE: ("another program listens there", "Is betaloop running already? Else choose another port: --port 8001."),
+    errno.EADDRINUSE: ("another program listens there", "Is betaloop running already? Else choose another port: --port {free}."),
     errno.EACCES: ("this user may not listen there", "Choose a port from 1024 up: --port 8000. A proxy before it may have port 443."),
     **dict.fromkeys(
         (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT),
@@ -38,7 +38,17 @@ def require_free(host: str, port: int) -> None:
         return
     first = next((refused for refused in refusals if refused not in absent), refusals[0])
     why, hint = _WHY.get(first.errno or 0, (str(first.strerror), "Give another address: --host, --port."))
-    raise Conflict(f"No service can listen at {host}:{port}: {why}.", hint) from first
+    raise Conflict(f"No service can listen at {host}:{port}: {why}.", hint.format(free=_next_free(host, port))) from first
+
+
+def _next_free(host: str, port: int) -> int:
+    """Return the next port above at which a service can listen here; 8000 where there is none."""
+    for other in range(port + 1, 1 << 16):
+        found = socket.getaddrinfo(host, other, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        refusals = [_refusal(family, address) for family, _, _, _, address in found]
+        if not any(refused is not None and refused.errno not in _ABSENT for refused in refusals):
+            return other
+    return 8000
 
 
 _ABSENT = {errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT}

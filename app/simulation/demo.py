@@ -6,6 +6,7 @@ day on which the demo was begun is kept, so that what was uploaded before is rec
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import secrets
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx2 as httpx
+import psutil
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
@@ -28,7 +30,7 @@ from app.accounts import repository as accounts_repository
 from app.accounts import service as accounts
 from app.accounts.models import Role
 from app.platform.database import now, transaction
-from app.platform.errors import BetaloopError
+from app.platform.errors import BetaloopError, Conflict
 from app.platform.migrate import migrate
 from app.platform.start import require_data_folder, require_free
 from app.platform.web.numbers import time_left
@@ -57,16 +59,35 @@ def run_demo(host: str, port: int) -> None:
     require_free(host, port)
     require_data_folder()
     started = time.monotonic()
-    with console.status("Starting the database …"):
-        migrate()
-        password = _accounts(settings.data_dir)
-    with _children(settings.data_dir / "log", host, port) as children:
-        with console.status("Starting the web service and a worker …"):
-            _wait_until_up(url, children)
-        say_welcome(url, time.monotonic() - started, password)
-        _load_and_rank(url, settings.data_dir / "demo.json", children)
-        _say("\n  Ready. Ctrl-C stops the demo and keeps its data; `make demo` starts it again.")
-        _wait(children)
+    with _only_demo(settings.data_dir, url):
+        with console.status("Starting the database …"):
+            migrate()
+            password = _accounts(settings.data_dir)
+        with _children(settings.data_dir / "log", host, port) as children:
+            with console.status("Starting the web service and a worker …"):
+                _wait_until_up(url, host, port, children)
+            say_welcome(url, time.monotonic() - started, password)
+            _load_and_rank(url, settings.data_dir / "demo.json", children)
+            _say("\n  Ready. Ctrl-C stops the demo and keeps its data; `make demo` starts it again.")
+            _wait(children)
+
+
+@contextmanager
+def _only_demo(folder: Path, url: str) -> Iterator[None]:
+    """Hold the data folder for this demo. Raises Conflict where another one runs in it."""
+    with (folder / "demo.lock").open("a+") as lock:
+        lock.seek(0)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            address = lock.read() or "an address that it has not printed yet"
+            raise Conflict(
+                f"A demo of the data folder {folder} runs already, at {address}.", "Use it, or name another folder in BETALOOP_DATA_DIR."
+            ) from None
+        lock.truncate()
+        lock.write(url)
+        lock.flush()
+        yield
 
 
 def _say(line: str) -> None:
@@ -136,16 +157,28 @@ def _interrupt(_number: int, _frame: Any) -> None:
     raise KeyboardInterrupt
 
 
-def _wait_until_up(url: str, children: list[subprocess.Popen[bytes]]) -> None:
+def _wait_until_up(url: str, host: str, port: int, children: list[subprocess.Popen[bytes]]) -> None:
     deadline = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline:
+        if children[0].poll() is not None:
+            require_free(host, port)  # which another program may have taken meanwhile
         _check(children)
         try:
-            if httpx.get(f"{url}/healthz", timeout=2).status_code == 200:
+            # another betaloop may answer at this address, until our own service finds that it cannot listen there
+            if httpx.get(f"{url}/healthz", timeout=2).status_code == 200 and _listens(children[0], port):
                 return
         except httpx.TransportError:
-            time.sleep(0.2)
+            pass
+        time.sleep(0.2)
     raise DemoFailed(f"The web service did not answer within {START_TIMEOUT_S:.0f} s.", _log_hint())
+
+
+def _listens(child: subprocess.Popen[bytes], port: int) -> bool:
+    try:
+        connections = psutil.Process(child.pid).net_connections("tcp")
+    except psutil.NoSuchProcess:
+        return False
+    return any(c.status == psutil.CONN_LISTEN and c.laddr.port == port for c in connections)
 
 
 def _check(children: list[subprocess.Popen[bytes]]) -> None:

@@ -128,7 +128,7 @@ PEOPLE: list[Promise] = [
     *of(
         "platform/files",
         ("stored files are the service's alone", "        draft.chmod(0o600)\n", "        draft.chmod(0o644)\n",
-         "tests/app/platform/test_database_access.py::test_stored_files_are_the_services_alone"),
+         "tests/app/platform/embedded/test_database_access.py::test_stored_files_are_the_services_alone"),
     ),
     *of(
         "platform/raw_bytes",
@@ -151,7 +151,7 @@ PEOPLE: list[Promise] = [
     *of(
         "settings",
         ("a damaged key is never used", "    if len(key) != 32:\n", "    if False:\n",
-         "tests/app/platform/test_first_start.py::test_a_damaged_secret_is_refused_and_never_used"),
+         "tests/app/platform/embedded/test_first_start.py::test_a_damaged_secret_is_refused_and_never_used"),
     ),
     *of(
         "platform/database",

