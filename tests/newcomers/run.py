@@ -81,7 +81,8 @@ def open_python(first: str) -> str:
     """Return an interpreter that every user may run and that makes virtual environments. Raises SystemExit where there is none."""
     check = "import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))"
     for python in (first, "/usr/bin/python3", "/usr/local/bin/python3"):
-        command = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", python, "-c", check]
+        # `env` looks the program up as that user; setpriv itself still does it with root's rights
+        command = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "env", python, "-c", check]
         if subprocess.run(command, capture_output=True, cwd="/", check=False).returncode == 0:
             return python
     raise SystemExit("newcomers' machines need a Python 3.11 or newer with venv that every user may run, such as Debian's python3-venv.")
