@@ -9,6 +9,7 @@ from importlib import import_module
 
 LAZY = (
     "numba.core.dispatcher",
+    "pyarrow.parquet",
     "scipy.integrate",
     "scipy.interpolate",
     "scipy.linalg",

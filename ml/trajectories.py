@@ -18,11 +18,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from ml.arrow import to_arrow, to_numpy
 from ml.mdp import AMPLITUDE_TOLERANCE, MdpSettings, end_reward, step_reward
 from ml.qoc import Qoc
 
@@ -298,6 +297,9 @@ def to_parquet(buffer: ReplayBuffer) -> bytes:
 
     The bytes depend on the buffer alone (and the pyarrow version), so that their SHA-256 names it.
     """
+    import pyarrow as pa  # 28 MB, which a process that reads no snapshot does without
+    import pyarrow.parquet as pq
+
     columns: dict[str, list[NDArray[Any]]] = {"session_id": [], "step": [], "beta": [], "amplitude": []}
     for s in buffer.sessions:
         lead = s.lead_beta.size
@@ -312,7 +314,7 @@ def to_parquet(buffer: ReplayBuffer) -> bytes:
         "beta_source": buffer.beta_source,
         "sessions": [_session_meta(s) for s in buffer.sessions],
     }
-    table = pa.table({name: np.concatenate(parts) for name, parts in columns.items()})
+    table = pa.table({name: to_arrow(np.concatenate(parts)) for name, parts in columns.items()})
     table = table.replace_schema_metadata({"betaloop": json.dumps(meta, sort_keys=True)})
     sink = io.BytesIO()
     pq.write_table(table, sink, compression="zstd")
@@ -321,7 +323,9 @@ def to_parquet(buffer: ReplayBuffer) -> bytes:
 
 def from_parquet(content: bytes) -> ReplayBuffer:
     """The inverse of `to_parquet`. Raises ValueError when the bytes are not such a buffer."""
-    table = pq.read_table(io.BytesIO(content))
+    import pyarrow.parquet as pq
+
+    table = pq.ParquetFile(io.BytesIO(content)).read()
     raw = (table.schema.metadata or {}).get(b"betaloop")
     if raw is None:
         raise ValueError("this Parquet file is not a betaloop buffer snapshot: its metadata lack the key 'betaloop'")
@@ -331,10 +335,7 @@ def from_parquet(content: bytes) -> ReplayBuffer:
             f"buffer snapshot of schema version {meta['schema_version']}; "
             f"this betaloop reads {_SCHEMA_VERSION} to {_STOPPED_SCHEMA_VERSION}"
         )
-    ids = table["session_id"].to_numpy()
-    step = table["step"].to_numpy()
-    beta = table["beta"].to_numpy()
-    amplitude = table["amplitude"].to_numpy()
+    ids, step, beta, amplitude = (to_numpy(table[name]) for name in ("session_id", "step", "beta", "amplitude"))
     sessions = []
     for m in meta["sessions"]:
         own = ids == m["session_id"]

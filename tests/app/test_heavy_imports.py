@@ -17,8 +17,10 @@ def loaded(code: str) -> set[str]:
     return set(subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split())
 
 
-SLOW_TO_LOAD = {"torch", "numba", "scipy.stats", "scipy.signal", "scipy.optimize", "scipy.spatial", "fpdf", "authlib", "fsspec"}
-"""Each takes a third of a second or more of every start, for what few of the processes do."""
+SLOW_TO_LOAD = {
+    "torch", "numba", "scipy.stats", "scipy.signal", "scipy.optimize", "scipy.spatial", "fpdf", "authlib", "fsspec", "pyarrow", "pandas",
+}  # fmt: skip
+"""Each takes a third of a second or 25 MB or more of every start, for what few of the processes do."""
 
 
 def test_the_web_process_never_loads_torch_and_starts_without_what_it_may_never_need() -> None:
