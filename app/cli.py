@@ -102,7 +102,6 @@ def serve(
     from app.ingest.uploads.interrupted import keep_resuming
     from app.main import create_app
     from app.platform.audit.chain import keep_sealing
-    from app.platform.jobs.children import limited
     from app.platform.migrate import migrate as bring_up_to_date
 
     logs.configure()
@@ -121,7 +120,6 @@ def serve(
     if configured():
         provider()  # settings that do not fit are said now, not to the first person who signs on
     service = create_app()
-    limited.prepare()  # before the first upload, which would wait for it
     # beside the service, for reading what a crash left behind may take minutes
     threading.Thread(target=keep_resuming, args=("the service", threading.Event()), daemon=True).start()
     threading.Thread(target=keep_sealing, args=(threading.Event(),), daemon=True).start()

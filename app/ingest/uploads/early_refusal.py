@@ -1,6 +1,6 @@
 """Uploads are refused by role before their body is read: a form is parsed before any dependency is asked, and may have gigabytes.
 
-What is read then is encrypted on its way (`app.platform.web.encrypted_form`).
+What is read then is encrypted on its way (`app.platform.web.encrypted_form`). Meanwhile the process that forks readers starts.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from starlette.concurrency import run_in_threadpool
 from app.accounts import permissions as can
 from app.accounts.deps import get_caller
 from app.platform.database import new_session
+from app.platform.jobs.children import limited
 from app.platform.web.encrypted_form import EncryptedForm
 
 _bearer = HTTPBearer(auto_error=False)
@@ -40,3 +41,4 @@ def _check(request: Request, bearer: HTTPAuthorizationCredentials | None) -> Non
     """Raises Unauthorized for an unknown caller, Forbidden for one whose roles do not include uploads."""
     with new_session() as db:
         get_caller(request, db, bearer).require(can.UPLOAD)
+    limited.prepare()

@@ -21,6 +21,7 @@ from app.ingest.uploads.interrupted import why_left
 from app.ingest.uploads.service import BetaStated, Incoming, UploadOutcome
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, passing
+from app.platform.jobs.children import limited
 from app.platform.web.forms import field_notes, parse
 from app.platform.web.schemas import Int, RowId, Text
 from app.platform.web.templates import render
@@ -54,6 +55,7 @@ class _PageForm(UploadForm):
 def upload_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, visit: str = "") -> HTMLResponse:
     """The upload form and the uploads so far."""
     study_service.require(caller, can.UPLOAD, participant)
+    limited.prepare()  # it is ready before a file is chosen
     return _page(request, db, participant, {"visit": visit} if visit else {})
 
 

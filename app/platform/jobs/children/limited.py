@@ -19,6 +19,8 @@ from app.settings import get_settings
 
 PREPARED = ("app.ingest.uploads.compute:prepare",)
 """What children are to have ready, as names: the platform lies below the phases and may not import them."""
+IDLE_S = 120.0
+"""Time after the last file at which the process that forks readers ends, seconds: files of one sitting come within two minutes."""
 WALL_PER_CPU = 5
 """A child may take so many times its limit of processor time by the clock, on a machine that has other work too."""
 
@@ -89,18 +91,18 @@ def run_limited(
 
 
 def prepare() -> None:
-    """Start the process that forks children, so that the first call need not wait; one that cannot start is told by that call."""
+    """Start the process that forks children, where a call is likely to come soon. If it cannot start, that call raises the error."""
     with suppress(OSError):
         _children()[0].prepare()
 
 
 def server_pid() -> int | None:
-    """Number of the process that forks children, once there is one."""
+    """Number of the process that forks children; None while there is none."""
     return _children()[0].server_pid
 
 
 def _children() -> tuple[ForkedProcesses, Slots]:
     with _guard:
         if not _shared or _shared[0][0] != os.getpid():
-            _shared[:] = [(os.getpid(), ForkedProcesses(PREPARED), Slots(get_settings().decode_slots))]
+            _shared[:] = [(os.getpid(), ForkedProcesses(PREPARED, idle_s=IDLE_S), Slots(get_settings().decode_slots))]
         return _shared[0][1:]

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
+import psutil
 import pytest
 
 from app.platform.jobs.children.child import FULL_DISK, ChildLimits, params_hash
@@ -70,3 +74,78 @@ def test_a_full_disk_is_told_where_there_is_no_room_to_write_that_down(kinds, tm
         outcome = children.run(call, lambda messages: None, lambda: None)
         children.close()
     assert (outcome["ok"], outcome["cause"], outcome["message"]) == (False, "full", FULL_DISK)
+
+
+def who(children: ForkedProcesses, folder: Path) -> int:
+    """Process that forked the child of one call."""
+    call = ComputeCall("who", "sample_job_kinds:who_prepared", {}, folder, ChildLimits(1024))
+    outcome = children.run(call, lambda messages: None, lambda: None)
+    assert outcome["ok"], outcome
+    return int(outcome["result"]["forked_by"])
+
+
+def wait_until_gone(pid: int) -> None:
+    deadline = time.monotonic() + 30
+    while psutil.pid_exists(pid):  # a zombie exists too
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_the_process_that_forks_ends_when_idle_and_the_next_call_starts_another(kinds, tmp_path):
+    children = ForkedProcesses(learns=True, idle_s=0.5)
+    try:
+        first = who(children, tmp_path / "1")
+        assert who(children, tmp_path / "2") == first == children.server_pid
+        wait_until_gone(first)
+        assert children.server_pid is None
+        again = who(children, tmp_path / "3")
+        assert again == children.server_pid != first
+        wait_until_gone(again)
+    finally:
+        children.close()
+
+
+def test_a_process_started_ahead_of_a_call_serves_it_and_ends_where_no_call_comes(kinds, tmp_path):
+    children = ForkedProcesses(learns=True, idle_s=5.0)
+    try:
+        children.prepare()
+        assert who(children, tmp_path / "1") == children.server_pid
+    finally:
+        children.close()
+    children = ForkedProcesses(learns=True, idle_s=0.3)
+    try:
+        children.prepare()
+        unused = children.server_pid
+        assert unused is not None
+        wait_until_gone(unused)
+    finally:
+        children.close()
+
+
+def test_a_call_that_lasts_longer_than_the_idle_time_keeps_its_process(kinds, tmp_path):
+    children = ForkedProcesses(learns=True, idle_s=0.2)
+    params = {"part": 0, "numbers": 10, "pause_s": 0.15}
+    try:
+        call = ComputeCall("count", "sample_job_kinds:count", params, tmp_path / "long", ChildLimits(1024))
+        outcome = children.run(call, lambda messages: None, lambda: None)
+    finally:
+        children.close()
+    assert (outcome["ok"], outcome["result"]["counted"]) == (True, 10), outcome
+
+
+def test_no_call_is_lost_where_calls_come_just_when_the_process_ends(kinds, tmp_path):
+    children = ForkedProcesses(learns=True, idle_s=0.05)
+
+    def calls(thread: int) -> set[int]:
+        servers = set()
+        for number in range(6):
+            servers.add(who(children, tmp_path / f"{thread}-{number}"))
+            time.sleep(0.02 * (number + thread))
+        return servers
+
+    try:
+        with ThreadPoolExecutor(3) as pool:
+            servers = set().union(*pool.map(calls, range(3)))
+    finally:
+        children.close()
+    assert len(servers) > 1, "it ended between calls"
