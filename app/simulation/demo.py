@@ -36,11 +36,11 @@ from app.platform.start import require_data_folder, require_free
 from app.platform.web.numbers import time_left
 from app.settings import get_settings, private_folder, written_once
 from app.simulation.demo_study import DemoVisit, demo_visits, participant_body
+from app.simulation.keeper import ENDED_BY_ITSELF, ENDING, become_keeper, interrupt, stop
 
 ACCOUNTS = {"admin@demo.example": Role.ADMIN, "clinician@demo.example": Role.CLINICIAN, "engineer@demo.example": Role.ENGINEER}
 PARTICIPANTS = ("P1", "P2", "P3", "P4")
 START_TIMEOUT_S = 180.0
-STOP_TIMEOUT_S = 20.0
 _POLL_S = 0.5
 _LINE_S = 15.0
 
@@ -69,13 +69,14 @@ def run_demo(host: str, port: int) -> None:
             say_welcome(url, time.monotonic() - started, password)
             _load_and_rank(url, settings.data_dir / "demo.json", children)
             _say("\n  Ready. Ctrl-C stops the demo and keeps its data; `make demo` starts it again.")
-            _wait(children)
+            become_keeper((child.pid for child in children), settings.data_dir / "log")
 
 
 @contextmanager
 def _only_demo(folder: Path, url: str) -> Iterator[None]:
-    """Hold the data folder for this demo. Raises Conflict where another one runs in it."""
+    """Hold the data folder for this demo, as its keeper too. Raises Conflict where another one runs in it."""
     with (folder / "demo.lock").open("a+") as lock:
+        os.set_inheritable(lock.fileno(), True)  # the keeper is this process with another program
         lock.seek(0)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -125,7 +126,7 @@ def _children(logs: Path, host: str, port: int) -> Iterator[list[subprocess.Pope
     private_folder(logs)
     commands = {"web": ["serve", "--host", host, "--port", str(port)], "worker": ["worker"]}
     children: list[subprocess.Popen[bytes]] = []
-    previous = [(number, signal.signal(number, _interrupt)) for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)]
+    previous = [(number, signal.signal(number, interrupt)) for number in ENDING]
     try:
         for name, arguments in commands.items():
             with (logs / f"{name}.log").open("ab") as log:
@@ -136,25 +137,10 @@ def _children(logs: Path, host: str, port: int) -> Iterator[list[subprocess.Pope
     except KeyboardInterrupt:
         _say("\n  Stopping …")
     finally:
-        impatient = [(number, signal.signal(number, signal.SIG_IGN)) for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)]
-        _stop(children)
+        impatient = [(number, signal.signal(number, signal.SIG_IGN)) for number in ENDING]
+        stop(children)
         for number, handler in (*impatient, *previous):
             signal.signal(number, handler)
-
-
-def _stop(children: list[subprocess.Popen[bytes]]) -> None:
-    for child in reversed(children):
-        child.terminate()
-    for child in children:
-        try:
-            child.wait(timeout=STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-
-
-def _interrupt(_number: int, _frame: Any) -> None:
-    raise KeyboardInterrupt
 
 
 def _wait_until_up(url: str, host: str, port: int, children: list[subprocess.Popen[bytes]]) -> None:
@@ -183,17 +169,11 @@ def _listens(child: subprocess.Popen[bytes], port: int) -> bool:
 
 def _check(children: list[subprocess.Popen[bytes]]) -> None:
     if any(child.poll() is not None for child in children):
-        raise DemoFailed("The web service or the worker ended by itself.", _log_hint())
+        raise DemoFailed(ENDED_BY_ITSELF, _log_hint())
 
 
 def _log_hint() -> str:
     return f"See the files in {get_settings().data_dir / 'log'}."
-
-
-def _wait(children: list[subprocess.Popen[bytes]]) -> None:
-    while True:
-        time.sleep(1.0)
-        _check(children)
 
 
 def _load_and_rank(url: str, state_path: Path, children: list[subprocess.Popen[bytes]]) -> None:

@@ -1,0 +1,121 @@
+"""The process of a running demo: it waits for the web service and the worker, and stops them.
+
+`betaloop demo` becomes this process once its study is loaded. The libraries it needed until then hold 0.3 GB, so this module imports none.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    from typing import Protocol
+
+    class Service(Protocol):
+        """A running service, as `subprocess.Popen` is one."""
+
+        def poll(self) -> int | None:
+            """Return its exit code, or None while it runs."""
+
+        def terminate(self) -> None:
+            """Ask it to end."""
+
+        def kill(self) -> None:
+            """End it."""
+
+
+MODULE = "app.simulation.keeper"
+ENDING = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+STOP_TIMEOUT_S = 20.0
+ENDED_BY_ITSELF = "The web service or the worker ended by itself."
+_POLL_S = 0.05
+_LOOK_S = 1.0
+
+
+class OwnChild:
+    """A child of this process that is known by its number alone: the object that started it went with the former program."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._code: int | None = None
+
+    def poll(self) -> int | None:
+        """Return its exit code, or None while it runs."""
+        if self._code is None:
+            ended, status = os.waitpid(self._pid, os.WNOHANG)
+            self._code = os.waitstatus_to_exitcode(status) if ended else None
+        return self._code
+
+    def terminate(self) -> None:
+        """Ask it to end."""
+        self._send(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it."""
+        self._send(signal.SIGKILL)
+
+    def _send(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self._pid, number)
+
+
+def become_keeper(pids: Iterable[int], logs: Path) -> NoReturn:
+    """Replace the program of this process by the keeper of its children.
+
+    Args:
+        pids: the children, in the order of their start.
+        logs: folder with their logs, named where one of them ends by itself.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)  # until the keeper can handle them; the new program inherits the mask
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, [sys.executable, "-m", MODULE, str(logs), *map(str, pids)])  # noqa: S606 - our own words, no shell
+
+
+def stop(services: Sequence[Service]) -> None:
+    """End services in order, the one started last first; those that take longer than STOP_TIMEOUT_S are killed."""
+    for service in reversed(services):
+        service.terminate()
+    for service in services:
+        deadline = time.monotonic() + STOP_TIMEOUT_S
+        while service.poll() is None:
+            if time.monotonic() > deadline:
+                service.kill()
+            time.sleep(_POLL_S)
+
+
+def interrupt(_number: int, _frame: Any) -> None:
+    """Handle a signal that ends the demo."""
+    raise KeyboardInterrupt
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Wait until a signal comes or a service ends, stop what runs, and return the exit code: 1 where a service ended by itself."""
+    logs, *pids = arguments
+    services = [OwnChild(int(pid)) for pid in pids]
+    code = 0
+    try:
+        for number in ENDING:
+            signal.signal(number, interrupt)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
+        while all(service.poll() is None for service in services):
+            time.sleep(_LOOK_S)
+        sys.stderr.write(f"betaloop: {ENDED_BY_ITSELF} See the files in {logs}.\n")
+        code = 1
+    except KeyboardInterrupt:
+        sys.stdout.write("\n  Stopping …\n")
+        sys.stdout.flush()
+    finally:
+        for number in ENDING:
+            signal.signal(number, signal.SIG_IGN)
+        stop(services)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
