@@ -31,6 +31,8 @@ SCHEMA = "dbos"
 QUEUE = "jobs"
 WORKFLOW = "betaloop.job"
 QUEUE_POLL_S = 0.5
+POOL = {"pool_size": 2, "max_overflow": 18}
+"""Connections that the engine keeps when idle, and how many more it opens for a moment; its own measure is to keep all 20."""
 
 
 class JsonSerializer(Serializer):
@@ -138,6 +140,7 @@ def launch(url: str, executor_id: str, jobs_at_once: int, runner: Callable[[str]
         "log_level": "WARNING",
         "console_log_level": "WARNING",
         "run_migrations": False,
+        "db_engine_kwargs": POOL,
         "enable_otlp": False,
     }
     DBOS(config=config)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from datetime import timedelta
 from importlib.metadata import version
 
 import pytest
 from sqlalchemy import text
+from sqlalchemy.orm import Session
 
-from app.platform.database import new_session, transaction
+from app.platform.database import get_engine, new_session, transaction
 from app.platform.jobs import engine
 from app.platform.jobs.errors import WorkerStopping
 
@@ -159,3 +161,29 @@ def test_tracebacks_of_cancelled_workflows_are_dropped_and_others_kept():
 
     assert not engine.CancelNoise().filter(record(SomeCancelledError()))
     assert engine.CancelNoise().filter(record(ValueError()))
+
+
+def test_an_idle_process_keeps_two_connections_of_a_burst(owner_db: Session) -> None:
+    get_engine().dispose()
+    burst = [get_engine().connect() for _ in range(7)]
+    ours = [connection.scalar(text("select pg_backend_pid()")) for connection in burst]
+    for connection in burst:
+        connection.close()
+    count = text("select count(*) from pg_stat_activity where pid = any(:pids)")
+    deadline = time.monotonic() + 30
+    while (left := owner_db.scalar(count, {"pids": ours})) > 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert left == 2
+
+
+def test_the_engine_of_an_idle_worker_keeps_few_connections(jobs, owner_db: Session) -> None:
+    jobs.start_worker(slots=4)
+    for job_id in [jobs.submit(parts=1) for _ in range(4)]:
+        assert jobs.ended(job_id).status == "succeeded"
+    count = text("select count(*) from pg_stat_activity where datname = current_database() and application_name = 'dbos_transact'")
+
+    def few() -> bool:
+        owner_db.rollback()
+        return 1 <= owner_db.scalar(count) <= 3  # one listens, two are kept
+
+    jobs.wait(few)
