@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import lzma
 import os
 import shutil
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,9 +27,7 @@ from app.accounts.pages import failed_sign_ins
 from app.accounts.passwords import FewAtOnce
 from app.platform import service_role
 from app.platform.embedded.server import EmbeddedPostgres
-from app.platform.files import path_of
 from app.platform.jobs import engine as jobs_engine
-from app.platform.migrate import migrate
 from app.platform.web.body_limit import sent
 from app.settings import get_settings
 
@@ -47,8 +43,6 @@ PASSWORD = "correct horse battery"
 MEMORY = Path("/dev/shm")
 ROOM_IN_MEMORY = 2 << 30
 """Free bytes that databases in memory need, so that nothing else has to leave it: a worker uses up to a few hundred MiB."""
-RELEASED_DUMP = ROOT / "tests" / "data" / "released-0.1.0.sql.xz"
-RELEASED_FILES = ROOT / "tests" / "data" / "released-0.1.0-files.zip"
 
 
 pytest_plugins = ["tests.hazard_marks"]
@@ -178,35 +172,11 @@ Template = tuple[str, Path]
 """A database that nobody is connected to, and its data folder; tests work on copies."""
 
 
-@pytest.fixture(scope="session")
-def released_template(server: EmbeddedPostgres, tmp_path_factory: pytest.TempPathFactory) -> Template:
-    """The database that release 0.1.0 filled (see test_released_database.py), with its small files, migrated to the newest schema."""
-    data = tmp_path_factory.mktemp("released") / "data"
-    with pytest.MonkeyPatch.context() as patch, own_database(server, data, patch, "template0", keep="released"):
-        with psycopg.connect(database.owner_url().replace("+psycopg", ""), autocommit=True) as connection:
-            connection.execute(lzma.decompress(RELEASED_DUMP.read_bytes()).decode())
-        with zipfile.ZipFile(RELEASED_FILES) as archive:
-            for sha256 in archive.namelist():
-                path_of(sha256).parent.mkdir(parents=True, exist_ok=True)
-                path_of(sha256).write_bytes(archive.read(sha256))
-        migrate()
-    return "released", data
-
-
 @contextmanager
 def copy_of(template: Template, server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A copy of a template, for one test."""
     shutil.copytree(template[1], tmp_path / "data")
     with own_database(server, tmp_path / "data", monkeypatch, template[0]) as url:
-        yield url
-
-
-@pytest.fixture
-def released_database(
-    released_template: Template, server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[str]:
-    """The study of release 0.1.0, in the newest schema."""
-    with copy_of(released_template, server, tmp_path, monkeypatch) as url:
         yield url
 
 

@@ -44,13 +44,10 @@ def table(amplitude: NDArray[np.float64], rng: np.random.Generator, lead: int = 
 
 
 @pytest.fixture(scope="session")
-def full_study(
-    released_template: Template, server: EmbeddedPostgres, application: Any, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Template, World]:
-    """The released study with a row for every route, made once."""
+def full_study(server: EmbeddedPostgres, application: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Template, World]:
+    """A study in use with a row for every route, made once."""
     data = tmp_path_factory.mktemp("full") / "data"
-    shutil.copytree(released_template[1], data)
-    with pytest.MonkeyPatch.context() as patch, own_database(server, data, patch, released_template[0], keep="filled"):
+    with pytest.MonkeyPatch.context() as patch, own_database(server, data, patch, "betaloop", keep="filled"):
         world = World(application)
     return ("filled", data), world
 

@@ -14,6 +14,7 @@ from app.analysis.energy.schemas import ImplantIn
 from app.learning.policies.baselines import constant_onnx
 from app.main import DESCRIPTION
 from app.platform.database import transaction
+from tests.app.filled_study import FilledStudy
 
 MAPPING = {
     "name": "two columns",
@@ -59,12 +60,13 @@ def token_of(role: str, study: str | None = None, name: str | None = None) -> st
 
 
 class World:
-    """A study in which every route has a row to work on: the one that a release filled, and what is waiting to be decided on."""
+    """A study in which every route has a row to work on: one in use, and what is waiting to be decided on."""
 
     def __init__(self, app: Any) -> None:
         self.app = app
         self.made = 0
         self.admin = self.calling(token_of("admin"))
+        FilledStudy(self.admin)
         ranking = self.read("/participants/P2/ranking")
         open_visit = next(v["id"] for v in self.read("/participants/P2/visits")["items"] if v["number"] == 4)
         first = {"policy_ids": [ranking["policies"][0]["policy_id"]], "seed": 1}
@@ -86,6 +88,7 @@ class World:
         jobs = self.read("/participants/P4/jobs")["items"]
         small = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "distilled")
         retired = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "trained")
+        elsewhere = next(p["id"] for p in self.read("/participants/P4/policies")["items"] if p["kind"] == "external")
         visit = self.read("/participants/P4/visits")["items"][0]["id"]
         session, graspless = (s["id"] for s in self.read(f"/visits/{visit}/sessions")["items"][:2])
         derived = self.upload("d.csv", TABLE, visit="2", controller="other", more=[("g.csv", GRASPS)])["sessions"][0]["id"]
@@ -183,7 +186,7 @@ class World:
             ("post", "/jobs/{job_id}/cancel"): {
                 "job_id": self.send("/participants/P4/jobs", json={"kind": "evaluate", "preset": "quick", "methods": ["linear"]})["id"]
             },
-            ("post", "/visits/{visit_id}/plan"): {"visit_id": visit, "json": {"policy_ids": [2]}},
+            ("post", "/visits/{visit_id}/plan"): {"visit_id": visit, "json": {"policy_ids": [elsewhere]}},
             ("get", "/visits/{visit_id}/plan"): {"visit_id": open_visit},
             ("get", "/visits/{visit_id}/plan.pdf"): {"visit_id": open_visit},
             ("post", "/visits/{visit_id}/plan/approve"): {"visit_id": open_visit, "json": {"password": PASSWORD}},

@@ -18,7 +18,6 @@ ELSEWHERE = {
     "/visit-day/files/{path:path}": "a script or a style of the day page, by its name",
 }
 """Addresses without /api that no page stands at, or none without what other tests bring along."""
-QUERIES = {"/search": "?q=rl", "/participants/{code}/compare": "?session=1&policy=15&policy=14"}
 
 
 def routes(app: Any) -> list[str]:
@@ -45,8 +44,10 @@ def addresses(world: World) -> dict[str, str]:
         "/visits/{visit_id}/bundles": world.ids_of("get", "/api/v1/visits/{visit_id}/day"),
         "/visit-day/{visit_id}": world.ids_of("get", "/api/v1/visits/{visit_id}/day"),
     }
+    students = [p["id"] for p in world.read("/participants/P1/policies")["items"] if p["kind"] == "distilled"]
+    queries = {"/search": "?q=rl", "/participants/{code}/compare": "?session=1" + "".join(f"&policy={i}" for i in students[:2])}
     paths = [p for p in routes(world.app) if p not in ELSEWHERE]
-    return {p: p.format(**(world.ids | own.get(p, {}))) + QUERIES.get(p, "") for p in paths}
+    return {p: p.format(**(world.ids | own.get(p, {}))) + queries.get(p, "") for p in paths}
 
 
 PARTS = {
@@ -57,7 +58,7 @@ PARTS = {
 
 
 def ended_jobs(world: World) -> dict[str, str]:
-    """By kind: the page of a succeeded job with steps, learning curves and a log: a pipeline that a release ran, and what it is made of.
+    """By kind: the page of a succeeded job with steps, learning curves and a log: a pipeline, and what it is made of.
 
     `failed` is one whose step raised what only engineers can read.
     """

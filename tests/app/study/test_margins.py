@@ -1,4 +1,4 @@
-"""Margins against cDBS: versioned, changed by a clinician with a reason, bounded, and there for participants of before."""
+"""Margins against cDBS: versioned, changed by a clinician with a reason, and bounded."""
 
 from __future__ import annotations
 
@@ -80,12 +80,3 @@ def test_the_page_says_which_visits_only_explore(client: TestClient, enrolled: s
     locked = client.post(f"{PATH}/locks", json={"version": 1, "reason": "protocol", "password": PASSWORD})
     assert locked.status_code == 201, locked.text
     assert "visits that began before the first lock only explore" in client.get(page, headers=HTML).text
-
-
-def test_participants_of_the_released_version_have_the_defaults(released_database: str) -> None:
-    with transaction("test") as session:
-        found, total = repository.participants(session, SYSTEM, 50, 0)
-        assert total > 1
-        for participant in found:
-            (only,) = participant.margins
-            assert {name: getattr(only, name) for name in DEFAULTS} == DEFAULTS

@@ -1,4 +1,4 @@
-"""A backup of the filled study of 0.1.0 comes back in a new data folder and in another PostgreSQL; the doctor says what is missing."""
+"""A backup of a filled study comes back in a new data folder and in another PostgreSQL; the doctor says what is missing."""
 
 from __future__ import annotations
 

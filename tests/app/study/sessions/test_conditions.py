@@ -137,23 +137,3 @@ def test_what_is_not_known_differs_in_nothing_and_the_other_side_neither() -> No
     assert (one.of, one.other, one.program) == ("60 us", "90 us", 0)
     (contacts,) = differences(own, [Program(None, None, 0, "-2 +C")], None)
     assert (contacts.of, contacts.other) == ("-1 +C", "-2 +C")
-
-
-def test_sessions_of_before_get_the_settings_of_their_time_marked_as_assumed(released_database: str) -> None:
-    import app.platform.database as database
-
-    with database.new_session() as db:
-        rows = db.execute(
-            text(
-                "select s.id, c.origin, c.revision, c.lower_bound, c.cdbs_amplitude_ma, c.lead_amplitude_ma, c.programming, s.policy_id,"
-                " c.min_ma, c.max_ma from session s left join session_conditions c on c.session_id = s.id where s.status = 'confirmed'"
-            )
-        ).all()
-        assert rows
-        assert {(r.origin, r.revision) for r in rows} == {("assumed", 1)}
-        assert all(r.cdbs_amplitude_ma and 0 < r.lower_bound < 1 for r in rows)
-        assert any(r.lead_amplitude_ma for r in rows)
-        assert any(p["rate_hz"] and p["pulse_width_us"] for r in rows for p in r.programming)
-        assert any(r.policy_id and r.max_ma for r in rows)
-        proposed = text("select count(*) from session_conditions c join session s on s.id = c.session_id where s.status = 'proposed'")
-        assert db.scalar(proposed) == 0
