@@ -175,8 +175,6 @@ PROMISES = [
         ("two passwords are hashed at a time", "        with _turns:\n            return super().hash",
          "        if True:\n            return super().hash", f"{HASHES}::test_two_at_a_time_whoever_asks_and_for_whatever"),
     ),
-    Promise("tokens of the first release end", "migrations/versions/20261126_token_ends.py", "'90 days'", "'90 years'",
-            "tests/app/platform/test_migrations.py::test_a_token_without_an_end_is_given_one_and_others_keep_theirs", at_start=True),
     *_of(
         "accounts/repository",
         ("tokens end on their day", ", ApiToken.expires_at > now())", ")",

@@ -364,7 +364,7 @@ def read(sha256: str) -> bytes:
 
 
 def close_to_others() -> None:
-    """Close what an earlier version left readable by every user of the machine: stored files, job folders, the demo's logs."""
+    """Close what other users of the machine can read: stored files, job folders, the demo's logs, secrets."""
     settings = get_settings()
     for folder in (settings.files_dir, settings.jobs_dir, settings.data_dir / "log", settings.data_dir / "secrets"):
         if folder.is_dir() and folder.stat().st_mode & 0o077:

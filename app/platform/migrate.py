@@ -8,6 +8,7 @@ from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
+from alembic.util import CommandError
 from psycopg.errors import InsufficientPrivilege
 from sqlalchemy import Connection, Engine, NullPool, create_engine, make_url, text
 from sqlalchemy.exc import ProgrammingError
@@ -24,10 +25,10 @@ _LOCK = 0x62657461  # any number that only this project uses
 def migrate() -> None:
     """Run every migration that is missing, as the owner of the tables, and give the service's role its rights.
 
-    Processes that start at once wait for each other. What an earlier version left open to other users of the machine is closed on the way.
+    Processes that start at once wait for each other. Folders that stand open to other users of the machine are closed on the way.
 
     Raises:
-        RuntimeError: migrations are missing, and the role may not run them.
+        RuntimeError: migrations are missing and the role may not run them, or the database has a schema that this version does not know.
     """
     close_to_others()
     owner, service = owner_url(), database_url()
@@ -52,7 +53,13 @@ def _upgrade(engine: Engine) -> None:
     config.set_main_option("script_location", str(ROOT / "migrations"))
     with _one_at_a_time(engine) as connection:
         config.attributes["connection"] = connection
-        command.upgrade(config, "head")
+        try:
+            command.upgrade(config, "head")
+        except CommandError as error:
+            raise RuntimeError(
+                f"this version of betaloop does not know the schema of its database ({error}): install the version that last ran on it,"
+                " or restore a backup that this version made"
+            ) from error
 
 
 @contextmanager

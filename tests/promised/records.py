@@ -29,7 +29,7 @@ RECORDS = [
          f"{KEPT}::test_the_service_may_not_delete_what_was_entered_or_measured"),
         at_start=True,
     ),
-    Promise("nobody deletes a confirmed session", "migrations/versions/20261126_nothing_deleted.py", "    op.execute(KEPT)\n", "",
+    Promise("nobody deletes a confirmed session", "migrations/versions/20261128_initial.py", "    op.execute(NEVER_DELETED)\n", "",
             f"{KEPT}::test_a_confirmed_session_is_deleted_by_nobody", at_start=True),
     *_of(
         "ingest/proposals/service",

@@ -1,10 +1,10 @@
-"""Promises that wide tests show: whole installations, released databases, every route and page, browsers, packaging and documents."""
+"""Promises that wide tests show: whole installations, every route and page, browsers, packaging and documents."""
 
 from __future__ import annotations
 
 from tests.promised.promise import Promise, of
 
-RELEASED, SOAK = "tests/app/platform/test_released_database.py", "tests/benchmarks/test_soak.py"
+SOAK = "tests/benchmarks/test_soak.py"
 ENTRIES, TLS = "tests/browser/test_entries.py", "tests/browser/test_visit_day_tls.py"
 ROUTES, TRUST = "tests/app/test_routes.py", "tests/test_trust.py"
 EVERY_PAGE = "tests/app/pages/test_every_page.py::test_every_address_of_a_browser_answers_and_every_page_is_small"
@@ -95,16 +95,6 @@ WIDE: list[Promise] = [
         ("a backup that was made around a damaged file comes back", "    known = {*damaged, *manifest", "    known = {*manifest", RESTORED),
         at_start=True,
     ),
-    *of(
-        "ingest/uploads/reports",
-        ("what the first release stored is read", 'stored["hint"] if "hint" in stored else stored["mend"]', 'stored["hint"]',
-         f"{RELEASED}::test_every_page_of_a_released_study_opens"),
-    ),
-    Promise("the trail of the first release is chained", "migrations/versions/20261122_audit_chain.py",
-            "    for statement in (FIELD, DIGEST, LINK, EARLIER):\n", "    for statement in (FIELD, DIGEST, LINK):\n",
-            f"{RELEASED}::test_the_trail_of_the_release_is_whole_after_the_upgrade", at_start=True),
-    Promise("tokens of the first release end ninety days after the upgrade", "migrations/versions/20261126_token_ends.py", "'90 days'",
-            "'9 days'", f"{RELEASED}::test_tokens_of_the_release_end_ninety_days_after_the_upgrade", at_start=True),
     Promise("answers are those of the description", "app/study/api.py", 'APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))',
             'APIRouter(tags=["study"], responses=problems(401, 403, 422))',
             f"{ROUTES}::test_the_interface_keeps_to_its_own_description", at_start=True),

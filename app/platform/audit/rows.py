@@ -17,7 +17,7 @@ from app.platform.audit.guards import keys
 from app.platform.audit.trail import AUDITED
 
 QUIET = ("last_seen_at", "last_used_at", "progress", "message", "updated_at")
-"""Columns of any table whose change alone writes no entry (`audit_row` of migration 0001)."""
+"""Columns of any table whose change alone writes no entry (`audit_row` of the first migration)."""
 
 _COLUMNS = """
 select c.relname, a.attname, t.typname, case when a.atthasmissing then 'given' when a.attnotnull or a.atthasdef then '' else 'null' end

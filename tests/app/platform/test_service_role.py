@@ -133,7 +133,7 @@ def test_the_service_alone_cannot_migrate_and_says_what_to_do(
     monkeypatch.delenv("BETALOOP_OWNER_URL")
     get_settings.cache_clear()
     migrate()  # nothing is missing: the service starts
-    owner_db.execute(text("update alembic_version set version_num = '0022'"))
+    owner_db.execute(text("delete from alembic_version"))
     owner_db.commit()
     with pytest.raises(RuntimeError, match="BETALOOP_OWNER_URL"):
         migrate()
