@@ -89,7 +89,7 @@ class SessionTrajectory:
             a decision of its own: a random session's density is then 1 / (1 - B) on [B, 1] at every step.
         lead_amplitude: amplitude fraction in force just before step 0, where it is known; else None.
         stopped: ended for the participant's sake (they asked for it, an adverse event), which is a failure of what ran: see `counted_qoc`.
-        most_imputed: how many imputed beta amplitudes a window may hold; 0 as in sessions of 0.1.0.
+        most_imputed: how many imputed beta amplitudes a window may hold.
         medication_h: hours from the last dose to the session's start, where they are known; else None.
 
     Raises:

@@ -37,7 +37,7 @@ class ReasonOut(Model):
 
 
 class FlagOut(ReasonOut):
-    """A finding about an estimate or a policy, with its sentence; `text` for a sentence that betaloop 0.1.0 stored."""
+    """A finding about an estimate or a policy, with its sentence."""
 
     text: str = Field(description="For people. Its wording may change; programs read the other fields.")
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from app.platform.web.charts import counted
-from ml.ope.flags import TEXT, Flag
+from ml.ope.flags import Flag
 from ml.ope.registry import shown
 
 UNSUPPORTED = "not supported by the data"
@@ -153,7 +153,6 @@ def _tests_not_counted(flag: Flag) -> str:
 
 
 _SENTENCES: dict[str, Callable[[Flag], str]] = {
-    TEXT: lambda f: str(f.fact("text")),
     # of estimates and of what the data cover
     "thin": _thin,
     "outside_range": lambda f: (

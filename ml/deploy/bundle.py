@@ -32,7 +32,7 @@ from ml.deploy import appraisal, vectors
 from ml.deploy.c_envelope import header_tanh
 from ml.deploy.c_header import fixed_point_header, float_header, self_test
 from ml.deploy.fixed_point import CutNetwork, quantise
-from ml.deploy.manifest import SCHEMA_VERSION, BundleError, BundleManifest
+from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.onnx_mlp import NoPlainNetwork, mlp_of
 from ml.deploy.runtime.__main__ import check
 from ml.deploy.runtime.controller import BoundedController, WindowNetwork
@@ -49,8 +49,6 @@ WEIGHTS, HEADER, SELF_TEST = "weights.f32", "betaloop_controller.h", "selftest.c
 HEADER_INT8, SELF_TEST_INT8 = "betaloop_controller_int8.h", "selftest_int8.c"
 _RUNTIME = Path(__file__).parent / "runtime"
 RUNNER = tuple(f"controller/{path.name}" for path in sorted(_RUNTIME.glob("*.py")))
-_OLDEST_RUNNER = {f"controller/{name}.py" for name in ("__init__", "__main__", "controller", "envelope", "network")}
-"""What the runner of a bundle of version 0.1.0 consists of; later ones have more files."""
 _REQUIRED = {SHEET, VECTORS}
 _OF_NETWORKS = {WEIGHTS, HEADER, SELF_TEST}
 _OF_SMALL_NETWORKS = {HEADER_INT8, SELF_TEST_INT8}
@@ -292,8 +290,7 @@ def _check_names(manifest: BundleManifest, present: set[str]) -> None:
     wanted = _REQUIRED | ({MODEL} if manifest.schedule is None else set())
     wanted |= (_OF_NETWORKS if manifest.layers else set()) | (_OF_SMALL_NETWORKS if manifest.int8_bound is not None else set())
     if manifest.layers or manifest.schedule:
-        older = manifest.schema_version < SCHEMA_VERSION and named >= _OLDEST_RUNNER
-        wanted |= named & set(RUNNER) if older else set(RUNNER)
+        wanted |= set(RUNNER)
     _compare_names(named, wanted, present)
 
 

@@ -16,8 +16,6 @@ from ml.deploy.runtime.schedule import Schedule
 from ml.deploy.runtime.slot import Slot
 
 SCHEMA_VERSION = 4
-READABLE = (3, 4)
-"""Version 3, of betaloop 0.1.0, has neither slot nor schedule nor limits of beta: such a bundle runs on the bench alone."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -174,10 +172,8 @@ class BundleManifest:
     schema_version: int = SCHEMA_VERSION
 
     def __post_init__(self) -> None:
-        if self.schema_version not in READABLE:
-            raise BundleError(
-                f"this bundle has manifest version {self.schema_version}; this betaloop reads {READABLE[0]} to {READABLE[-1]}"
-            )
+        if self.schema_version != SCHEMA_VERSION:
+            raise BundleError(f"this bundle has manifest version {self.schema_version}; this betaloop reads version {SCHEMA_VERSION}")
         self._check_kind()
         for name in ("participant", "policy_name", "beta_unit", "beta_source", "code_version", "policy_code_version"):
             if not getattr(self, name).strip():
@@ -200,9 +196,7 @@ class BundleManifest:
         self._check_device_limits()
 
     def _check_kind(self) -> None:
-        """A network or a schedule runs, and versions before 4 know neither schedule nor slot; what is sealed is not told."""
-        if self.schema_version < SCHEMA_VERSION and (self.slot or self.schedule):
-            raise BundleError(f"a manifest of version {self.schema_version} has neither slot nor schedule")
+        """A network or a schedule runs; what is sealed is not told."""
         if self.card is not None and self.slot is None:
             raise BundleError("a bundle without a slot has no card of a plan")
         if self.schedule is not None and (self.policy_id is not None or self.layers):

@@ -17,7 +17,7 @@ LEVEL = 0.90
 """Coverage of the intervals that estimators report."""
 
 STORED_VERSION = 2
-"""Version of `Estimate.to_json`. Version 1, of betaloop 0.1.0, does not name itself and holds its flags as sentences."""
+"""Version of `Estimate.to_json`."""
 
 OUTCOMES = ("r_end", "grasp_hz", "rating", "tremor_percent")
 """End-of-session outcomes, in the order of every array that holds them."""
@@ -69,14 +69,13 @@ class Estimate:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Estimate:
-        """The inverse of `to_json`, for every version.
+        """The inverse of `to_json`.
 
         Raises:
-            ValueError: a later version than this betaloop knows.
+            ValueError: another version than this betaloop knows.
         """
-        version = stored.get("version", 1)
-        if version > STORED_VERSION:
-            raise ValueError(f"an estimate of form {version} was stored by a later betaloop; this one reads up to form {STORED_VERSION}")
+        if (version := stored.get("version")) != STORED_VERSION:
+            raise ValueError(f"an estimate of form {version} was stored by another betaloop; this one reads form {STORED_VERSION}")
         values = {f.name: stored[f.name] for f in fields(cls)}
         return cls(**values | {"flags": tuple(Flag.from_json(flag) for flag in stored["flags"])})
 

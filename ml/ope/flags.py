@@ -9,9 +9,6 @@ from typing import Any, Literal
 Fact = float | str | tuple[str, ...] | None
 Source = Literal["logged", "simulated"]
 
-TEXT = "text"
-"""Code of a flag that betaloop 0.1.0 stored as a sentence: it can be shown, and nothing may be concluded from it."""
-
 
 @dataclass(frozen=True)
 class Flag:
@@ -72,10 +69,8 @@ class Flag:
         }
 
     @classmethod
-    def from_json(cls, stored: Mapping[str, Any] | str) -> Flag:
-        """The inverse of `to_json`; a sentence of betaloop 0.1.0 becomes a flag of the code `text`, which refuses nothing."""
-        if isinstance(stored, str):
-            return cls.of(TEXT, text=stored)
+    def from_json(cls, stored: Mapping[str, Any]) -> Flag:
+        """The inverse of `to_json`."""
         facts = {name: tuple(v) if isinstance(v, list) else v for name, v in stored["facts"].items()}
         plain = {name: stored[name] for name in ("value", "limit", "unit", "refuses", "source")}
         return cls(stored["code"], **plain, facts=tuple(facts.items()))

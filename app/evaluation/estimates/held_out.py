@@ -19,7 +19,7 @@ from ml.ope.estimate import Estimate
 from ml.ope.registry import AGGREGATE, POSTERIOR, shown
 
 STORED = "held_out"
-"""Member of an evaluation's diagnostics; `choice` in those of 0.1.0."""
+"""Member of an evaluation's diagnostics."""
 
 Tables = Mapping[str, Mapping[str, Estimate]]
 
@@ -47,8 +47,8 @@ def stored(outcome: Mapping[str, Any] | None, methods: Iterable[str]) -> dict[st
 
 
 def of_evaluation(evaluation: Evaluation) -> dict[str, Any]:
-    """What `stored` gave when an evaluation was made; empty for one that was made before methods were held against left-out controllers."""
-    kept = evaluation.diagnostics.get(STORED) or evaluation.diagnostics.get("choice") or {}
+    """What `stored` gave when an evaluation was made; empty for one without."""
+    kept = evaluation.diagnostics.get(STORED) or {}
     return {"table": [], "no_difference_error": None, "predictions": [], "failed": {}, "not_compared": []} | kept if kept else {}
 
 

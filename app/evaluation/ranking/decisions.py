@@ -92,8 +92,7 @@ def decide(
     """The verdict on one candidate.
 
     A retired policy cannot be told: it is not proposed, whatever is predicted. Nor can one of an evaluation without a posterior: a single
-    method knows no chance of keeping within the margins. What rankings of before called *reject*, a whole interval of the gain over cDBS
-    below 0, is *unsafe*; their *test next* and *needs more data* are *cannot tell* until the policies are evaluated again. A serious
+    method knows no chance of keeping within the margins. It is unsafe where the whole interval of its gain over cDBS is below 0. A serious
     adverse event counts whatever else is known.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, replace
 from typing import Any
@@ -52,24 +52,13 @@ def stored_reports(row: UploadFile) -> list[FileReport]:
     """The reports of a file as they were stored."""
     # a copy: sentences appended to the stored lists themselves would not be seen as a change, and not be written
     stored = deepcopy(row.report.get("reports", []))
-    return [FileReport(**{**r, "problem": _stored_problem(r["problem"])}) for r in stored]
-
-
-def _stored_problem(stored: Mapping[str, str] | None) -> Problem | None:
-    """The problem of a stored report; version 0.1.0 called its hint `mend`."""
-    if stored is None:
-        return None
-    return Problem(stored["what"], stored["where"], stored["hint"] if "hint" in stored else stored["mend"])
+    return [FileReport(**{**r, "problem": r["problem"] and Problem(**r["problem"])}) for r in stored]
 
 
 def unreadable_members(row: UploadFile) -> list[str]:
-    """Members of a stored file that could not be read, and why; in reports of version 0.1.0 they stand among the flags, behind a prefix."""
-    report = row.report or {}
-    found: list[str] | None = report.get("unreadable")
-    if found is not None:
-        return found
-    prefix = "kept encrypted, because it could not be read: "
-    return [s.removeprefix(prefix) for r in stored_reports(row) for s in r.flagged if s.startswith(prefix)]
+    """Members of a stored file that could not be read, and why."""
+    found: list[str] = (row.report or {}).get("unreadable", [])
+    return found
 
 
 def known_recordings(row: UploadFile) -> list[int]:

@@ -17,13 +17,6 @@ CLOCKS = {
     "table": "times of the table",
 }
 
-_STORED_SENTENCES = {
-    "timestamp more than a day off": Rejected.DAY_OFF,
-    "device and PC clock disagree by more than 2 s": Rejected.CLOCKS_DISAGREE,
-    "the same packet twice": Rejected.DUPLICATE,
-    "PacketGenTime steps back": Rejected.STEPS_BACK,
-}
-"""Version 0.1.0 counted rejected packets under sentences; these stand in stored recordings and are never changed."""
 _KNOWN = {
     *("packets", "samples", "missing", "missing_samples", "missing_s", "loss", "chunks", "rejected", "unusable", "clock", "loss_visible"),
     *("rate_hz", "paused_s", "reordered", "late", "moved"),
@@ -236,7 +229,7 @@ _SHOWN = {"latency_median_ms": "median latency (ms)", "flat_share": "share of sa
 
 def _rejected(stored: str) -> Rejected:
     """Why packets were left out, as stored."""
-    return _STORED_SENTENCES.get(stored) or Rejected(stored)
+    return Rejected(stored)
 
 
 def _ma(value: Any) -> str:

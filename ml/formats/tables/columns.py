@@ -131,8 +131,8 @@ def _refuse_log(headers: Sequence[str]) -> None:
             "this looks like the log of a controller without its first line, which says so: each of its rows has the beta of the step that "
             "ended and the amplitude of the next one, not of the same step",
             "line 1",
-            f"Upload the log as the controller wrote it. Where `betaloop control` of version 0.1.0 wrote it, put '{LOG_KIND_LINE}' (with "
-            "its period) as a line before the header. A table of steps has no such columns: leave them out.",
+            f"Upload the log as the controller wrote it, with its first line '{LOG_KIND_LINE}'. A table of steps has no such columns: "
+            "leave them out.",
         )
 
 

@@ -10,18 +10,14 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy.orm import Session
 
 from app.evaluation import verdict_wording, wording
-from app.evaluation.estimates.rows import row_of
-from app.evaluation.models import EstimateRow, Evaluation
 from app.platform.kept import forget
-from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag, distinct, not_counted_tests
 from ml.ope.posterior.verdict import Levels, verdict
 from ml.ope.support.coverage import thin
 from ml.qoc import Margins
-from tests.app.evaluations import estimate, judged
+from tests.app.evaluations import judged
 from tests.app.words import methods_named
 from tests.ml.ope.posterior.draws import N, cdbs, constructed
 
@@ -57,35 +53,6 @@ def test_reworded_sentences_change_no_rank_support_or_decision(
     reworded = client.get("/participants/P1/ranking").text
     assert reworded.count("not supported") >= 1
     assert [page.count(f'value="{i}"') for i in policies] == [reworded.count(f'value="{i}"') for i in policies]
-
-
-def test_an_evaluation_of_0_1_0_opens_with_its_sentences_and_its_stored_support(
-    client: TestClient, policies: list[int], evaluate: Callable[..., int], db: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def as_of_old(policy_id: int, e: Estimate) -> EstimateRow:
-        row = row_of(policy_id, e)
-        row.details = {name: v for name, v in row.details.items() if name != "version"}
-        row.flags = [] if e.supported else ["far from the data, as somebody put it once"]
-        return row
-
-    monkeypatch.setattr("app.evaluation.service.row_of", as_of_old)
-    a, b, c = policies
-    evaluate({a: estimate("dlsm", 60.0), b: estimate("dlsm", 99.0, supported=False), c: estimate("dlsm", 50.0)}, {1.0: 45.0})
-    row = db.get_one(Evaluation, client.get(RANKING).json()["evaluation_id"])
-    held = {"method": "dlsm", "chosen_by_data": True, "table": [], "predictions": [], "failed": {}, "not_compared": []}
-    kept = {name: v for name, v in row.diagnostics.items() if name != "held_out"}
-    row.diagnostics = kept | {"choice": held | {"reason": "linear erred least"}}
-    db.commit()
-    body = client.get(RANKING).json()
-    assert [(p["policy_id"], p["supported"], p["decision"]) for p in body["policies"]] == [
-        (a, True, "cannot_tell"), (c, True, "cannot_tell"), (b, False, "cannot_tell")
-    ]  # fmt: skip
-    assert body["policies"][2]["flags"] == [
-        {"code": "text", "value": None, "limit": None, "unit": "", "text": "far from the data, as somebody put it once"}
-    ]
-    assert "evaluate again" in body["policies"][2]["decision_reason"]
-    assert body["choice"] is None
-    assert client.get("/participants/P1/ranking").status_code == 200
 
 
 def test_every_code_that_the_science_or_a_rule_makes_has_a_sentence() -> None:
