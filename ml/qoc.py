@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, make_dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ml.outcomes import OUTCOMES, Outcome
 
 PLAUSIBLE_INTERVAL_S = (0.08, 3.0)
 """Intervals between open fists: faster is sensor bounce, slower is a pause and no grasp."""
@@ -24,52 +27,50 @@ UNTOLD = 0.02
 _COUNTED_COLUMNS = [TREMOR_CLASSES.index(name) for name in COUNTED]
 
 
-@dataclass(frozen=True)
-class Qoc:
-    """The three QoCs of one session; None where it was not measured.
+_Values: Any = make_dataclass("_Values", [(o.field, float | None, None) for o in OUTCOMES], frozen=True)
+_Margins: Any = make_dataclass("_Margins", [(o.margin.field, float, o.margin.default) for o in OUTCOMES], frozen=True)
 
-    Attributes:
-        grasp_hz: grasp frequency, Hz (eq:grasp_speed).
-        rating: the participant's rating, whole number 1-10 (eq:patient_rating).
-        tremor_percent: share of the session with mild, moderate or strong tremor, per cent (eq:tremor_severity).
+
+@dataclass(frozen=True)
+class Qoc(_Values):
+    """The outcomes of one session, an attribute per `Outcome.field`; None where not measured.
 
     Raises:
         ValueError: a value outside its range; the message names it.
     """
 
-    grasp_hz: float | None = None
-    rating: int | None = None
-    tremor_percent: float | None = None
-
     def __post_init__(self) -> None:
-        if self.grasp_hz is not None and not (math.isfinite(self.grasp_hz) and self.grasp_hz >= 0):
-            raise ValueError(f"grasp frequency must be 0 Hz or more, not {self.grasp_hz}")
-        if self.rating is not None and not (self.rating == int(self.rating) and 1 <= self.rating <= 10):
-            raise ValueError(f"rating must be a whole number from 1 to 10, not {self.rating}")
-        if self.tremor_percent is not None and not 0 <= self.tremor_percent <= 100:
-            raise ValueError(f"tremor must lie between 0 and 100 %, not {self.tremor_percent}")
+        for outcome in OUTCOMES:
+            value = getattr(self, outcome.field)
+            if value is not None:
+                outcome.check(value)
 
 
 @dataclass(frozen=True)
-class Margins:
-    """By how much an outcome may be worse than under cDBS and still count as no worse. The defaults are ours and no clinical standard.
-
-    Attributes:
-        grasp_share: slower grasp, share of the frequency under cDBS.
-        rating_points: lower rating, points of the scale of 1 to 10.
-        tremor_points: more tremor, percentage points of time.
+class Margins(_Margins):
+    """By how much an outcome may be worse than under cDBS and still count as no worse, an attribute per `Margin.field`.
 
     Raises:
         ValueError: a margin that is not above 0, or a share of 1 or more.
     """
 
-    grasp_share: float = 0.10
-    rating_points: float = 1.0
-    tremor_points: float = 10.0
-
     def __post_init__(self) -> None:
-        if not (0 < self.grasp_share < 1 and self.rating_points > 0 and self.tremor_points > 0):
-            raise ValueError(f"margins must be above 0, and that of grasp below 1: {self}")
+        for outcome in OUTCOMES:
+            outcome.margin.check(self.of(outcome))
+
+    def of(self, outcome: Outcome) -> float:
+        """Return the margin of an outcome, a share or points."""
+        return float(getattr(self, outcome.margin.field))
+
+
+def failed_qoc(measured: Iterable[Qoc]) -> Qoc:
+    """Return what a session that was stopped for the participant's sake counts as, in learning, evaluation and analyses alike.
+
+    Args:
+        measured: the outcomes of all sessions of the participant that count, stopped ones among them.
+    """
+    known = list(measured)
+    return Qoc(**{o.field: o.failed(getattr(q, o.field) for q in known) for o in OUTCOMES})
 
 
 def grasp_frequency(open_fist_s: NDArray[np.float64]) -> float:

@@ -1,0 +1,314 @@
+"""Outcomes of a session: one record each, and nothing about an outcome is written down elsewhere.
+
+Forms, tables, charts, statistics, export and the interface loop over `OUTCOMES`. A new outcome is a record here and a column for its values
+and its margin (a migration). Source: Gao et al. 2023, section 3.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+
+@dataclass(frozen=True, kw_only=True)
+class Margin:
+    """By how much an outcome may be worse than under cDBS and still count as no worse.
+
+    Attributes:
+        field: its name in tables, forms and the interface. kind: a share of the value under cDBS, or points of the outcome's scale.
+        default: ours, no clinical standard. least, most: bounds of the form. unit: of the margin, for the bounds' message.
+        label, help, form_unit: of the form. description: of the interface. exported: of the data package.
+    """
+
+    field: str
+    kind: Literal["share", "points"]
+    default: float
+    least: float
+    most: float
+    unit: str
+    label: str
+    help: str
+    form_unit: str
+    description: str
+    exported: str
+
+    def __post_init__(self) -> None:
+        self.check(self.default)
+
+    def check(self, value: float) -> None:
+        """Raise ValueError for a margin that is not above 0, or a share of 1 or more."""
+        if not value > 0 or (self.kind == "share" and not value < 1):
+            raise ValueError(f"{self.field} must be above 0{', and below 1' if self.kind == 'share' else ''}, not {value}")
+
+    def amount(self, value: float, under_cdbs: float) -> float:
+        """Return the margin in the outcome's unit, for a margin of `value` and an outcome under cDBS."""
+        return value * under_cdbs if self.kind == "share" else value
+
+
+@dataclass(frozen=True, kw_only=True)
+class EndWeight:
+    """The part of an outcome in the end-of-session reward (eq:end_of_session_reward).
+
+    Attributes:
+        setting: the name of its weight in the settings. sign: 1, or -1 where more takes reward away.
+        as_fraction: the setting that says that per cent enter as 0 to 1; None where the outcome enters as it is.
+    """
+
+    setting: str
+    sign: float
+    as_fraction: str | None = None
+
+    def scale(self, settings: Any) -> float:
+        """Return by what the outcome is divided before it is weighed."""
+        return 100.0 if self.as_fraction is not None and getattr(settings, self.as_fraction) else 1.0
+
+    def weight(self, settings: Any) -> float:
+        """Return the signed weight of the outcome as it enters."""
+        return self.sign * float(getattr(settings, self.setting))
+
+    def per_unit(self, settings: Any) -> float:
+        """Return what one unit of the outcome adds to the reward."""
+        return self.weight(settings) / self.scale(settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """One outcome of a session: what it is called, how it is measured, judged, tested and shown.
+
+    Attributes:
+        key: its name in analyses. field: in tables, forms and the interface. column: in the data package.
+        label: its whole name. short: the name in columns. noun: within a sentence. the_noun: as the subject of one.
+        unit: of a value. entry_unit: the same beside a field. difference_unit: of a change. contrast_unit: of the primary comparison.
+        share: what share per cent are of; empty of other units. help: what is measured. explained: the same for a glossary.
+        description: of the interface. exported: of the data package.
+        low, high: the range; an infinite `high` has no end. below: what a plausible value stays below; None where the range says it all.
+        whole: values are whole numbers. decimals: of a shown value. mean_decimals: of a shown mean or change.
+        higher_is_better: the better direction. margin: how much worse counts as no worse.
+        failure: the value of a stopped session; None for the participant's worst measured one.
+        end: its part in r_end; None where it has none.
+        scale: of the primary contrast. model: of the mixed model. resolution: the step between neighbouring values, 0 where continuous.
+        bounded: sessions reach an end of the range.
+        derived: uploaded files may give it. predicted: the outcome model of `ml.ope.outcomes` knows it.
+    """
+
+    key: str
+    field: str
+    column: str
+    label: str
+    short: str
+    noun: str
+    the_noun: str
+    unit: str
+    entry_unit: str
+    difference_unit: str
+    contrast_unit: str
+    share: str = ""
+    help: str
+    explained: str
+    description: str
+    exported: str
+    low: float
+    high: float = math.inf
+    below: float | None = None
+    whole: bool = False
+    decimals: int
+    mean_decimals: int
+    higher_is_better: bool
+    margin: Margin
+    failure: float | None
+    end: EndWeight | None = None
+    scale: Literal["difference", "ordinal"] = "difference"
+    model: Literal["linear", "ordinal", "minutes"] = "linear"
+    resolution: float = 0.0
+    bounded: bool = False
+    derived: bool = False
+    predicted: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ValueError(f"the range of {self.key} must not be empty: {self.low} to {self.high}")
+        if self.scale == "ordinal" and not self.resolution > 0:
+            raise ValueError(f"{self.key} is compared in steps, so its resolution must be above 0")
+        if self.failure is not None:
+            self.check(self.failure)
+
+    def check(self, value: float) -> None:
+        """Raise ValueError for a value outside the range, or a broken one where whole numbers are asked for."""
+        whole = not self.whole or value == math.floor(value)
+        if not (math.isfinite(value) and self.low <= value <= self.high and whole):
+            number = "a whole number " if self.whole else ""
+            within = f"from {self.low:g} to {self.high:g}" if math.isfinite(self.high) else f"of {self.low:g} or more"
+            raise ValueError(f"{self.noun} must be {number}{within} ({self.unit}), not {value}")
+
+    def loss(self, difference: Any) -> Any:
+        """Return by how much a difference is worse; below 0 where it is better. A number or an array."""
+        return -difference if self.higher_is_better else difference
+
+    def worst(self, values: Iterable[float]) -> float:
+        """Return the worst of at least one value."""
+        return (min if self.higher_is_better else max)(values)
+
+    def slack(self, own: Any, cdbs: Any, margin: float) -> Any:
+        """Return by how much a value keeps within its margin of cDBS; below 0 it is beyond.
+
+        Args:
+            own, cdbs: the outcome under a policy and under cDBS, numbers or arrays of one shape. margin: of the margin's kind.
+        """
+        if self.margin.kind == "share":
+            return own - (1 - margin) * cdbs if self.higher_is_better else (1 + margin) * cdbs - own
+        return own - cdbs + margin if self.higher_is_better else cdbs + margin - own
+
+    def less_margin(self, cdbs: Any, margin: float) -> Any:
+        """Return values under cDBS, a number or an array, made worse by a margin that is a share of them."""
+        return (1 - margin) * cdbs if self.higher_is_better else (1 + margin) * cdbs
+
+    def failed(self, measured: Iterable[float | None]) -> float | None:
+        """Return what a session that was stopped for the participant's sake counts as.
+
+        Args:
+            measured: the outcome in all sessions of the participant that count; None or NaN where it was not measured.
+
+        Returns:
+            The stated value, else the worst measured one. None where there is neither: it is unknown then.
+        """
+        if self.failure is not None:
+            return int(self.failure) if self.whole else self.failure
+        known = [float(v) for v in measured if v is not None and math.isfinite(v)]
+        return self.worst(known) if known else None
+
+
+OUTCOMES: tuple[Outcome, ...] = (
+    Outcome(
+        key="grasp",
+        field="grasp_hz",
+        column="grasp_hz",
+        label="Grasp frequency",
+        short="Grasp",
+        noun="grasp",
+        the_noun="grasp",
+        unit="Hz",
+        entry_unit="Hz",
+        difference_unit="Hz",
+        contrast_unit="Hz",
+        help="Full hand openings per second at the end of the session.",
+        explained="Full openings of the hand per second, at the end of a session; more is better.",
+        description="Grasp frequency, Hz.",
+        exported="Grasp frequency, Hz, newest revision.",
+        low=0.0,
+        below=20.0,
+        decimals=2,
+        mean_decimals=2,
+        higher_is_better=True,
+        margin=Margin(
+            field="grasp_share",
+            kind="share",
+            default=0.10,
+            least=0.01,
+            most=0.5,
+            unit="of the grasp frequency under cDBS",
+            label="Grasp slower by",
+            help="Share of the grasp frequency under cDBS, 0.1 being 10 %.",
+            form_unit="of cDBS",
+            description="Grasp may be slower by this share of the frequency under cDBS.",
+            exported="Grasp may be slower by this share of the frequency under cDBS.",
+        ),
+        failure=None,
+        end=EndWeight(setting="c2", sign=1.0),
+        derived=True,
+        predicted=True,
+    ),
+    Outcome(
+        key="rating",
+        field="rating",
+        column="rating_1_10",
+        label="Rating",
+        short="Rating",
+        noun="rating",
+        the_noun="the rating",
+        unit="1\u201310",
+        entry_unit="of 10",
+        difference_unit="points",
+        contrast_unit="points, in pairs",
+        help="The participant's own, 1 worst to 10 best.",
+        explained="The participant's own, 1 worst to 10 best.",
+        description="The participant's rating, 1-10.",
+        exported="The participant's rating, 1 worst to 10 best, newest revision.",
+        low=1.0,
+        high=10.0,
+        whole=True,
+        decimals=0,
+        mean_decimals=1,
+        higher_is_better=True,
+        margin=Margin(
+            field="rating_points",
+            kind="points",
+            default=1.0,
+            least=0.1,
+            most=5,
+            unit="points",
+            label="Rating lower by",
+            help="On the participant's scale of 1 to 10.",
+            form_unit="points",
+            description="The rating may be lower by this many points.",
+            exported="The rating may be lower by this.",
+        ),
+        failure=1.0,
+        end=EndWeight(setting="c3", sign=1.0),
+        scale="ordinal",
+        model="ordinal",
+        resolution=1.0,
+        bounded=True,
+        predicted=True,
+    ),
+    Outcome(
+        key="tremor",
+        field="tremor_percent",
+        column="tremor_percent",
+        label="Tremor",
+        short="Tremor",
+        noun="tremor",
+        the_noun="tremor",
+        unit="% of session",
+        entry_unit="%",
+        difference_unit="% points",
+        contrast_unit="% points",
+        share="of the session",
+        help="Share of the session with mild or worse tremor.",
+        explained="Share of the session with mild or worse tremor. A change is told in percentage points of that time.",
+        description="Share of the session with mild or worse tremor, %.",
+        exported="Share of the session with mild or worse tremor, %, newest revision.",
+        low=0.0,
+        high=100.0,
+        decimals=0,
+        mean_decimals=0,
+        higher_is_better=False,
+        margin=Margin(
+            field="tremor_points",
+            kind="points",
+            default=10.0,
+            least=0.5,
+            most=50,
+            unit="percentage points",
+            label="Tremor more by",
+            help="Of the time: 10 allows 30 % where cDBS has 20 %.",
+            form_unit="% points",
+            description="Tremor may take up this many more percentage points of the time.",
+            exported="Tremor may take up this many more percentage points.",
+        ),
+        failure=100.0,
+        end=EndWeight(setting="c4", sign=-1.0, as_fraction="tremor_as_fraction"),
+        model="minutes",
+        resolution=1.0,
+        bounded=True,
+        derived=True,
+        predicted=True,
+    ),
+)
+"""Every outcome, in the order in which forms and tables have them."""
+
+FIELDS = tuple(o.field for o in OUTCOMES)
+KEYS = tuple(o.key for o in OUTCOMES)
+BY_KEY: Mapping[str, Outcome] = {o.key: o for o in OUTCOMES}
+BY_FIELD: Mapping[str, Outcome] = {o.field: o for o in OUTCOMES}
