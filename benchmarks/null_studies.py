@@ -45,7 +45,8 @@ from support.null_worlds import (
     show_margin,
 )
 
-from app.analysis.primary.verdict import FAILURE, outcome_of
+from app.analysis.primary.verdict import judged_outcome
+from ml.outcomes import OUTCOMES
 from ml.statistics.association import within_visits
 from ml.statistics.effects import cliffs_delta, energy_saving
 from ml.statistics.noninferiority import assess
@@ -228,7 +229,7 @@ def speed() -> dict[str, float]:
             design = visit[rows], controller[rows] == tested, np.tile(np.arange(20.0), 10)[rows]
             data = {m: measure(m, z[k][rows], design, World(), rng) for k, m in enumerate(METRICS)}
             stopped = np.zeros(rows.sum(), dtype=bool)
-            outcomes = [o for m in FAILURE if (o := outcome_of(m, data[m], stopped, MARGINS)) is not None]
+            outcomes = [o for m in OUTCOMES if (o := judged_outcome(m, data[m.key], stopped, MARGINS.of(m), None)) is not None]
             for label, work in (
                 ("paper", lambda d=data: [naive(v) for v in d.values()]),
                 ("primary", lambda d=data: [(primary(v), cliffs_delta(v)) for v in d.values()]),

@@ -36,7 +36,7 @@ from app.study.blinding import Arm
 from app.study.models import Controller
 from ml.policies.policy import ConstantPolicy
 from ml.population import PARTICIPANTS, run_sessions
-from ml.qoc import Margins
+from ml.qoc import Margins, failed_qoc
 from ml.statistics.multiplicity import hommel
 from ml.statistics.noninferiority import Assessment, Inferior, NonInferiorAndSaving
 from ml.statistics.within_visits.contrasts import Average, Unavailable
@@ -185,7 +185,7 @@ def questions(code: str, day: Day, seeds: range, visits: int) -> list[Question]:
         harmed, saves = beyond(mean, cdbs), mean["energy"] < cdbs["energy"]
         results = []
         for theirs, ours in zip(reference, studies(code, level, day, seeds, visits), strict=True):
-            (result,) = verdicts([*theirs, *ours], [Controller.RL], locked)
+            (result,) = verdicts([*theirs, *ours], [Controller.RL], locked, failed_qoc([]))  # none is stopped
             if result.assessment is None:
                 raise SystemExit(f"{code} at {level}: no verdict, {result.no_verdict}")
             results.append(result.assessment)

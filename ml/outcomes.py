@@ -160,6 +160,11 @@ class Outcome:
             return own - (1 - margin) * cdbs if self.higher_is_better else (1 + margin) * cdbs - own
         return own - cdbs + margin if self.higher_is_better else cdbs + margin - own
 
+    @property
+    def worst_possible(self) -> float:
+        """The worst end of the range; infinite where the range has no such end."""
+        return self.low if self.higher_is_better else self.high
+
     def less_margin(self, cdbs: Any, margin: float) -> Any:
         """Return values under cDBS, a number or an array, made worse by a margin that is a share of them."""
         return (1 - margin) * cdbs if self.higher_is_better else (1 + margin) * cdbs

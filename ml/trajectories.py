@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,14 +23,11 @@ from numpy.typing import NDArray
 
 from ml.arrow import to_arrow, to_numpy
 from ml.mdp import AMPLITUDE_TOLERANCE, MdpSettings, end_reward, step_reward
-from ml.qoc import Qoc
+from ml.qoc import Qoc, failed_qoc
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-
-FAILED = Qoc(grasp_hz=0.0, rating=1, tremor_percent=100.0)
-"""The worst QoCs there are: those of a session that was stopped for the participant's sake."""
 
 PRIOR_PAIRS = 10
 """Pairs of unrelated rows that count beside the measured ones where autocorrelations are estimated: short sessions say little of them."""
@@ -88,7 +85,8 @@ class SessionTrajectory:
         holds: decisions of a random session whose draws are held, in order and without gaps up to where it ended. Empty where every step is
             a decision of its own: a random session's density is then 1 / (1 - B) on [B, 1] at every step.
         lead_amplitude: amplitude fraction in force just before step 0, where it is known; else None.
-        stopped: ended for the participant's sake (they asked for it, an adverse event), which is a failure of what ran: see `counted_qoc`.
+        stopped_as: the QoCs that a session counts as which ended for the participant's sake (they asked for it, an adverse event): it is a
+            failure of what ran (`ml.qoc.failed_qoc` of the participant's sessions). None of any other session.
         most_imputed: how many imputed beta amplitudes a window may hold.
         medication_h: hours from the last dose to the session's start, where they are known; else None.
 
@@ -107,7 +105,7 @@ class SessionTrajectory:
     policy_id: int | None = None
     random_lower_bound: float | None = None
     lead_amplitude: float | None = None
-    stopped: bool = False
+    stopped_as: Qoc | None = None
     most_imputed: int = 0
     holds: tuple[Hold, ...] = ()
     medication_h: float | None = None
@@ -186,10 +184,17 @@ class SessionTrajectory:
         return step_reward(settings, self.beta, self.amplitude)
 
     @property
+    def stopped(self) -> bool:
+        """Whether the session ended for the participant's sake."""
+        return self.stopped_as is not None
+
+    @property
     def counted_qoc(self) -> Qoc:
-        """The QoCs that count: `FAILED` of a session that was stopped, whatever was measured, except under cDBS, whose failures must not
-        help what is held against it; else as measured."""
-        return FAILED if self.stopped and self.controller != "cdbs" else self.qoc
+        """The QoCs that count: `stopped_as` of a stopped session, whatever was measured, else as measured.
+
+        A stopped cDBS session counts as measured, so that its failure does not help the policies that are compared with it.
+        """
+        return self.stopped_as if self.stopped_as is not None and self.controller != "cdbs" else self.qoc
 
     def end_reward(self, settings: MdpSettings) -> float | None:
         """r_end of the QoCs that count, or None where one it needs is missing."""
@@ -279,8 +284,8 @@ _IMPUTED_SCHEMA_VERSION = 2
 """Of buffers whose windows may hold imputed values, which a reader of version 1 would not find. Values are stored as measured."""
 _HELD_SCHEMA_VERSION = 3
 """Of buffers with held draws, whose steps a reader of version 2 would take for decisions of their own."""
-_STOPPED_SCHEMA_VERSION = 4
-"""Of buffers with sessions that were stopped for the participant's sake, which a reader of version 3 would take as measured."""
+_STOPPED_SCHEMA_VERSION = 5
+"""Version of buffers with stopped sessions, which a reader of version 3 would take as measured. Version 4 lacks what they count as."""
 
 
 def _schema_version(buffer: ReplayBuffer) -> int:
@@ -337,6 +342,7 @@ def from_parquet(content: bytes) -> ReplayBuffer:
         )
     ids, step, beta, amplitude = (to_numpy(table[name]) for name in ("session_id", "step", "beta", "amplitude"))
     sessions = []
+    failed = failed_qoc(Qoc(**m["qoc"]) for m in meta["sessions"])  # of version 4, which says of a session only that it was stopped
     for m in meta["sessions"]:
         own = ids == m["session_id"]
         lead, body = own & (step < 0), own & (step >= 0)
@@ -352,7 +358,7 @@ def from_parquet(content: bytes) -> ReplayBuffer:
                 qoc=Qoc(**m["qoc"]),
                 random_lower_bound=m["random_lower_bound"],
                 lead_amplitude=m.get("lead_amplitude"),
-                stopped=m.get("stopped", False),
+                stopped_as=Qoc(**m["stopped_as"]) if "stopped_as" in m else failed if m.get("stopped") else None,
                 most_imputed=m.get("most_imputed", 0),
                 holds=tuple(Hold(*h) for h in m.get("holds", ())),
                 medication_h=m.get("medication_h"),
@@ -371,7 +377,7 @@ def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
     later: dict[str, Any] = {"most_imputed": s.most_imputed} if s.most_imputed else {}
     later |= {"lead_amplitude": s.lead_amplitude} if s.lead_amplitude is not None else {}
     later |= {"holds": [[h.start, h.steps, h.log_density] for h in s.holds]} if s.holds else {}
-    later |= {"stopped": True} if s.stopped else {}
+    later |= {"stopped_as": asdict(s.stopped_as)} if s.stopped_as is not None else {}
     later |= {"medication_h": s.medication_h} if s.medication_h is not None else {}
     return later | {
         "session_id": s.session_id,
@@ -379,5 +385,5 @@ def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
         "controller": s.controller,
         "policy_id": s.policy_id,
         "random_lower_bound": s.random_lower_bound,
-        "qoc": {"grasp_hz": s.qoc.grasp_hz, "rating": s.qoc.rating, "tremor_percent": s.qoc.tremor_percent},
+        "qoc": asdict(s.qoc),
     }

@@ -10,6 +10,7 @@ from app.analysis.primary.verdict import LockedMargins, NoVerdict, VerdictResult
 from app.platform.web.charts import counted
 from app.platform.web.numbers import p_text
 from app.study.blinding import CONTROLLER_NAMES
+from ml.outcomes import OUTCOMES
 from ml.statistics.noninferiority import (
     ENERGY,
     LEAST_VISITS,
@@ -36,7 +37,9 @@ ENERGY_SHOWN = ("% of cDBS", 100.0)
 """How every page and figure shows energy: unit, and factor of the stored share of the energy under cDBS. Files and the REST interface keep
 the share."""
 
-OUTCOMES = {"grasp": "grasp", "rating": "the rating", "tremor": "tremor", ENERGY: "the energy saved"}
+JUDGED = {o.key: o.the_noun for o in OUTCOMES} | {ENERGY: "the energy saved"}
+"""Names of what a verdict judges, within a sentence."""
+
 FAMILY = (
     "Planned family: the five metrics of RL and of distilled RL, each against the same visit's cDBS; p-values are adjusted by Holm over "
     "all of them that could be tested. Everything else (other controllers, single policies) is exploration, adjusted by Benjamini and "
@@ -59,6 +62,8 @@ RULES = {
     FailureRule.WORST_CASE: "a stopped session of the controller counts as a failure, a stopped cDBS session as measured",
     FailureRule.BOTH_ARMS: "stopped sessions of both arms count as failures",
     FailureRule.AS_MEASURED: "stopped sessions count as measured",
+    FailureRule.END_OF_SCALE: "a stopped session of the controller counts as the worst that the scales allow, "
+    + ", ".join(f"{o.noun} {o.worst_possible:g}" for o in OUTCOMES),
 }
 MISSING = {
     Missing.NOT_ENTERED: "nobody entered it",
@@ -143,7 +148,7 @@ def verdict_sentence(name: str, found: Verdict, visits: int, *, planned: bool) -
 
 def _more(found: Inconclusive, *, planned: bool = True) -> str:
     short = [name for name, why in found.untested if why is Reason.TOO_FEW_VISITS]
-    with_ = "both arms" if {*short, ENERGY} >= OUTCOMES.keys() else f"{_listed(short)} in both arms" if short else ""
+    with_ = "both arms" if {*short, ENERGY} >= JUDGED.keys() else f"{_listed(short)} in both arms" if short else ""
     few = f"nothing is concluded from fewer than {LEAST_VISITS} visits with {with_}" if short else ""
     if found.more_visits is not None:
         more = (
@@ -288,7 +293,7 @@ def no_population_claim(found: Summary) -> str:
 
 
 def _listed(names: Sequence[str]) -> str:
-    words = [OUTCOMES.get(n, n) for n in names]
+    words = [JUDGED.get(n, n) for n in names]
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 

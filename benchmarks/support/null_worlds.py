@@ -1,7 +1,7 @@
 """Worlds of the null studies, and how a study is drawn from one: who was tested when, and what a metric then shows; and studies of
 controllers that lose nothing, or exactly what is accepted of one outcome.
 
-Steps and bounds of metrics, margins, scales and values of failures are those of the service (`app.analysis.primary.verdict.outcome_of`).
+Steps, bounds, margins, scales and values of failures are those of the service (`app.analysis.primary.verdict.judged_outcome`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from scipy.optimize import brentq
 from scipy.special import expit
 
 from app.analysis.evidence import measurements
-from app.analysis.primary.verdict import FAILURE, outcome_of
+from app.analysis.primary.verdict import judged_outcome
+from ml.outcomes import BY_KEY, KEYS
 from ml.qoc import Margins
 from ml.statistics.noninferiority import LEAST_VISITS, Inconclusive, NonInferiorAndSaving, assess
 from ml.statistics.within_visits.contrasts import Measurements
@@ -221,7 +222,7 @@ TREMOR_ALONE = (1.0, 2.0, 3.0)
 def margin_studies(visits: int, studies: int, seed: int) -> Tally:
     """One outcome exactly at its margin, or everything equal to cDBS; energy saved by a third."""
     tally = Tally()
-    cells = [(at, slope, slope, stops, studies) for slope, stops in EVERYWHERE for at in FAILURE]
+    cells = [(at, slope, slope, stops, studies) for slope, stops in EVERYWHERE for at in KEYS]
     cells += [("nothing", slope, slope, stops, studies // 4) for slope, stops in EVERYWHERE]
     cells += [("tremor", 0.0, slope, 0.0, studies) for slope in TREMOR_ALONE]
     for number, (at, slope, of_tremor, stops, count) in enumerate(cells):
@@ -229,7 +230,7 @@ def margin_studies(visits: int, studies: int, seed: int) -> Tally:
         where = f"day x dose {slope:g}" if slope == of_tremor else f"day x dose of tremor {of_tremor:g}"
         for study in range(count):
             small = World(visits=visits, each=4, day=1.0, slope=slope)
-            shown, saving = judged({m: replace(small, slope=of_tremor if m == "tremor" else slope) for m in FAILURE}, at, stops, rng, study)
+            shown, saving = judged({m: replace(small, slope=of_tremor if m == "tremor" else slope) for m in KEYS}, at, stops, rng, study)
             key = (f"{visits} visits", where, f"stopped {stops:.0%}", at)
             tally.add((*key, "non-inferior"), shown)
             tally.add((*key, "and saving"), saving)
@@ -248,7 +249,8 @@ def judged(worlds: dict[str, World], at: str, stops: float, rng: np.random.Gener
         if name == at != "tremor":
             lost = {"grasp": MARGINS.grasp_share * GRASP_HZ, "rating": MARGINS.rating_points}[name]
             data = replace(data, value=data.value - lost * tested)
-        judged_as = outcome_of(name, data, stopped, MARGINS)
+        record = BY_KEY[name]
+        judged_as = judged_outcome(record, data, stopped, MARGINS.of(record), record.failed(data.value))
         assert judged_as is not None, "cDBS has a grasp frequency in every study"
         outcomes.append(judged_as)
     energy = np.where(tested, 0.65, 1.0) + np.where(tested, 0.05, 0.01) * rng.standard_normal(visit.size)
@@ -269,7 +271,7 @@ def show_margin(tally: Tally) -> dict[str, float]:
     out(" | nothing lost (power), of it with the saving shown\n")
     asked = {k: c for k, c in tally.counts.items() if len(k) == 5}
     for key in sorted(dict.fromkeys(k[:3] for k in asked), key=lambda k: (int(k[0].split()[0]), k)):
-        wrong = [tally.share(*key, at, "non-inferior")[0] for at in FAILURE]
+        wrong = [tally.share(*key, at, "non-inferior")[0] for at in KEYS]
         right = [tally.share(*key, "nothing", label)[0] for label in ("non-inferior", "and saving")]
         out(f"  {', '.join(key):<50}{' |'.join(''.join(map(_share, shares)) for shares in (wrong, right))}\n")
     errors = {k: c for k, c in asked.items() if k[3] != "nothing" and k[4] == "non-inferior"}

@@ -45,12 +45,14 @@ class FailureRule(StrEnum):
     """What a session that was stopped for the patient's sake counts as.
 
     WORST_CASE: the failure value under the controller; under cDBS what was measured, so that no failure of cDBS helps the controller.
-    BOTH_ARMS: the failure value under either. AS_MEASURED: what was measured, or left out.
+    BOTH_ARMS: the failure value under either. AS_MEASURED: what was measured, or left out. END_OF_SCALE: under the controller the worst end
+    of the scale, also where the failure value is not that bad.
     """
 
     WORST_CASE = "worst_case"
     BOTH_ARMS = "both_arms"
     AS_MEASURED = "as_measured"
+    END_OF_SCALE = "end_of_scale"
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,8 @@ class Outcome:
         higher_is_better: direction. scale: of the contrast (`visits.visit_contrasts`). With `ordinal` the controller's values are made
             better by the margin, and must then win at least half of the pairs: that its shift is no loss of the margin or more is shown
             without taking steps of a rating for equal distances.
-        failure: value of a failed session, to which no margin is added; None for the worst value measured in either arm.
+        failure: value of a failed session, to which no margin is added; None where it is unknown, so that the session has no value.
+        worst_possible: the worst end of the scale; NaN where it has none.
 
     Raises:
         ValueError: a margin that is not above zero (or not below 0.5 for a probability), `ordinal` values without a step, or `stopped` of
@@ -78,6 +81,7 @@ class Outcome:
     higher_is_better: bool
     scale: Scale = "difference"
     failure: float | None = None
+    worst_possible: float = float("nan")
 
     def __post_init__(self) -> None:
         if not self.margin > 0:
@@ -99,10 +103,9 @@ class Outcome:
         if self.scale == "ordinal":
             value = np.where(self.data.tested, value + self.margin, value)
         if rule is not FailureRule.AS_MEASURED:
-            rows = self.stopped & self.data.tested if rule is FailureRule.WORST_CASE else self.stopped
-            known = sign * self.data.value[np.isfinite(self.data.value)]
-            worst = sign * self.failure if self.failure is not None else float(known.min()) if known.size else np.nan
-            value = np.where(rows, worst, value)
+            rows = self.stopped if rule is FailureRule.BOTH_ARMS else self.stopped & self.data.tested
+            failure = self.worst_possible if rule is FailureRule.END_OF_SCALE else np.nan if self.failure is None else self.failure
+            value = np.where(rows, sign * failure, value)
         return replace(self.data, value=value, bounded=False)
 
     @property
@@ -225,7 +228,7 @@ def assess(
         verdict = _planned(verdict, outcomes, spent, alpha, sessions_per_arm, seed)
     others = []
     failed = bool(stopped.any()) or any(o.stopped.any() for o in outcomes)
-    for other in (FailureRule.BOTH_ARMS, FailureRule.AS_MEASURED):
+    for other in (FailureRule.BOTH_ARMS, FailureRule.AS_MEASURED, FailureRule.END_OF_SCALE):
         if not failed:  # without failures the rules are one
             others.append((other, _verdict(results, saving, alpha)))
             continue

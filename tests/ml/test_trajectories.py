@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import io
+import json
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from ml.mdp import MdpSettings
-from ml.qoc import Qoc
+from ml.qoc import Qoc, failed_qoc
 from ml.trajectories import Hold, ReplayBuffer, SessionTrajectory, content_hash, from_parquet, to_parquet
 
 SETTINGS = MdpSettings(xi_beta=0.5, window=3)
@@ -201,11 +205,6 @@ def test_holds_leave_no_step_out_and_end_with_the_session(holds: tuple[Hold, ...
 
 
 def test_another_file_is_no_snapshot() -> None:
-    import io
-
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     sink = io.BytesIO()
     pq.write_table(pa.table({"x": [1]}), sink)
     with pytest.raises(ValueError, match="not a betaloop buffer snapshot"):
@@ -214,11 +213,23 @@ def test_another_file_is_no_snapshot() -> None:
 
 def test_a_stopped_session_counts_with_the_worst_outcomes_except_under_cdbs_and_stays_stopped_when_stored() -> None:
     weighted = replace(SETTINGS, c2=10.0, c3=10.0, c4=10.0)
-    tested, clinical = (session(k, controller=name, stopped=True, qoc=Qoc()) for k, name in ((1, "rl"), (2, "cdbs")))
-    assert tested.end_reward(weighted) == 10.0 * 0 + 10.0 * 1 - 10.0 * 1
+    worst = failed_qoc([Qoc(2.0, 7, 10.0), Qoc(1.5, 9, 0.0)])
+    tested, clinical = (session(k, controller=name, stopped_as=worst, qoc=Qoc()) for k, name in ((1, "rl"), (2, "cdbs")))
+    assert tested.end_reward(weighted) == 10.0 * 1.5 + 10.0 * 1 - 10.0 * 1
     assert clinical.end_reward(weighted) is None
     assert replace(clinical, qoc=Qoc(2.0, 7, 10.0)).end_reward(weighted) == 89.0
     stored = to_parquet(ReplayBuffer(SETTINGS, (tested, session(3)), "uV", "table"))
-    assert [s.stopped for s in from_parquet(stored).sessions] == [True, False]
+    assert [s.stopped_as for s in from_parquet(stored).sessions] == [worst, None]
     plain = to_parquet(ReplayBuffer(SETTINGS, (session(3),), "uV", "table"))
-    assert b'"stopped"' not in plain
+    assert b'"stopped_as"' not in plain
+
+
+def test_a_buffer_that_says_of_a_session_only_that_it_was_stopped_takes_the_worst_of_its_sessions() -> None:
+    stopped = replace(session(1, controller="rl", qoc=Qoc(1.8, 9, 5.0)), stopped_as=Qoc())
+    stored = pq.read_table(io.BytesIO(to_parquet(ReplayBuffer(SETTINGS, (stopped, session(3, qoc=Qoc(2.4, 8, 0.0))), "uV", "table"))))
+    meta = json.loads(stored.schema.metadata[b"betaloop"]) | {"schema_version": 4}
+    del meta["sessions"][0]["stopped_as"]
+    meta["sessions"][0]["stopped"] = True
+    sink = io.BytesIO()
+    pq.write_table(stored.replace_schema_metadata({"betaloop": json.dumps(meta)}), sink)
+    assert [s.counted_qoc for s in from_parquet(sink.getvalue()).sessions] == [Qoc(1.8, 1, 100.0), Qoc(2.4, 8, 0.0)]

@@ -15,7 +15,9 @@ from app.platform.kept import keep, recalled
 from app.study import blinding
 from app.study import repository as study
 from app.study.models import Participant, Recording, StudySession, Trace
+from app.study.sessions.data import failed_qoc_of
 from app.study.sessions.repository import fingerprints
+from ml.qoc import Qoc
 
 READ_AT_ONCE = 8
 """Participants whose traces are in memory together."""
@@ -28,7 +30,7 @@ class Evidence:
     Attributes:
         key: names participant, row versions and what the caller may know: equal keys, equal evidence.
         sessions: those that count, by visit and order. excluded: the others.
-        beta_unit, beta_source: as the participant's settings have them.
+        beta_unit, beta_source: as the participant's settings have them. failed: what a stopped session counts as.
     """
 
     participant: str
@@ -38,6 +40,7 @@ class Evidence:
     excluded: tuple[Excluded, ...]
     beta_unit: str | None
     beta_source: str | None
+    failed: Qoc
 
 
 def evidence(db: Session, participant: Participant, caller: Caller) -> Evidence:
@@ -92,4 +95,13 @@ def _read(
             except Invalid as error:
                 excluded.append(Excluded(*place, LeftOut.UNREADABLE, error.detail, arm, session.duration_s))
     settings = participant.current_settings
-    return Evidence(participant.code, participant.id, key, tuple(counted), tuple(excluded), settings.beta_unit, settings.beta_source)
+    return Evidence(
+        participant.code,
+        participant.id,
+        key,
+        tuple(counted),
+        tuple(excluded),
+        settings.beta_unit,
+        settings.beta_source,
+        failed_qoc_of(held),
+    )

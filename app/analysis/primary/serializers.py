@@ -16,7 +16,8 @@ from app.analysis.primary.schemas import (
     VisitRowOut,
 )
 from app.analysis.primary.service import Primary
-from app.analysis.primary.verdict import SCALE, LockedMargins, VerdictResult
+from app.analysis.primary.verdict import LockedMargins, VerdictResult
+from ml.outcomes import BY_KEY
 from ml.statistics.effects import Saving
 from ml.statistics.noninferiority import Inconclusive, Inferior, NonInferiorAndSaving
 from ml.statistics.ranksum import RankSum
@@ -108,7 +109,7 @@ def verdict_out(result: VerdictResult) -> VerdictOut:
             OutcomeVerdictOut(
                 outcome=o.name,
                 margin=o.margin,
-                scale=SCALE[o.name],
+                scale=BY_KEY[o.name].scale,
                 excluded=o.loss,
                 estimate=average and average.estimate,
                 low=average and average.low,

@@ -72,7 +72,7 @@ def _of(held: Evidence, locks: Sequence[LockedMargins], names: Mapping[int, str]
     def compute() -> Primary:
         kind = comparable_beta(held.sessions, held.beta_unit, held.beta_source)
         sessions = with_comparable_beta(held.sessions, kind)
-        earlier = tuple(earlier_verdicts(sessions, _tested(sessions), before))
+        earlier = tuple(earlier_verdicts(sessions, _tested(sessions), before, held.failed))
         return Primary(held, sessions, kind, results(sessions, names, picked), _verdicts(held, locked), locked, earlier)
 
     return kept(key, compute)
@@ -86,7 +86,7 @@ def verdicts_of(db: Session, participant: Participant, caller: Caller) -> tuple[
 def _verdicts(held: Evidence, locked: LockedMargins) -> tuple[VerdictResult, ...]:
     def compute() -> tuple[VerdictResult, ...]:
         sessions = with_comparable_beta(held.sessions, comparable_beta(held.sessions, held.beta_unit, held.beta_source))
-        return tuple(verdicts(sessions, _tested(sessions), locked))
+        return tuple(verdicts(sessions, _tested(sessions), locked, held.failed))
 
     return kept(("verdicts", held.key, locked), compute)
 

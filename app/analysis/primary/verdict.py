@@ -2,9 +2,9 @@
 
 A verdict confirms where the margins were locked before every session that it rests on; else it explores. A newer lock does not undo an
 older one: the visits that began between the two keep their verdict under the older, so that each is judged by the margins in force at its
-time. The margin of grasp is a share of the frequency under cDBS: the cDBS values are lowered by it, so that what is tested is "no slower
-than 1 - share of the same visit's cDBS", with the spread of that reference in the error. A rating has no equal steps: made better by its
-margin it must win at least half of the pairs with the same visit's cDBS ratings.
+time. Where a margin is a share of the value under cDBS, the cDBS values are made worse by it, so that what is tested is "no worse than
+1 - share of the same visit's cDBS", with the spread of that reference in the error. A scale without equal steps is ordinal: made better by
+its margin, a value must win at least half of the pairs with the same visit's cDBS.
 """
 
 from __future__ import annotations
@@ -18,15 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.analysis.evidence.facts import Facts
-from app.analysis.evidence.measurements import HIGHER_IS_BETTER, choose_each, of_controller
+from app.analysis.evidence.measurements import choose_each, of_controller
 from app.study.models import Controller
-from ml.qoc import Margins
-from ml.statistics.noninferiority import LEAST_VISITS, Assessment, Outcome, assess
-from ml.statistics.within_visits.contrasts import Measurements, Scale
-
-SCALE: dict[str, Scale] = {"grasp": "difference", "rating": "ordinal", "tremor": "difference"}
-FAILURE = {"grasp": None, "rating": 1.0, "tremor": 100.0}
-"""What a stopped session counts as; of grasp, the worst frequency measured."""
+from ml.outcomes import KEYS, OUTCOMES, Outcome
+from ml.qoc import Margins, Qoc
+from ml.statistics.noninferiority import LEAST_VISITS, Assessment, assess
+from ml.statistics.noninferiority import Outcome as JudgedOutcome
+from ml.statistics.within_visits.contrasts import Measurements
 
 
 class NoVerdict(StrEnum):
@@ -81,32 +79,38 @@ def opened_at(session: Facts) -> datetime:
     return min(session.created_at, session.started_at) if session.started_at else session.created_at
 
 
-def verdicts(sessions: Sequence[Facts], controllers: Sequence[Controller], locked: LockedMargins) -> list[VerdictResult]:
+def verdicts(sessions: Sequence[Facts], controllers: Sequence[Controller], locked: LockedMargins, failed: Qoc) -> list[VerdictResult]:
     """For every controller its confirmatory verdict where there is a lock, and its exploratory one where the other lacks visits that
-    earlier sessions could add."""
+    earlier sessions could add.
+
+    Args:
+        sessions: that count. locked: margins to judge by. failed: what a stopped session of the participant counts as.
+    """
     found = []
     for controller in controllers:
         confirmed = _after(sessions, locked.locked_at)
         if locked.locked_at is not None:
-            found.append(_judge(sessions, confirmed, controller, locked, confirmatory=True))
+            found.append(_judge(sessions, confirmed, controller, locked, failed, confirmatory=True))
             if len(found[-1].visits) >= LEAST_VISITS or len(confirmed) == len(sessions):
                 continue
-        found.append(_judge(sessions, sessions, controller, locked, confirmatory=False))
+        found.append(_judge(sessions, sessions, controller, locked, failed, confirmatory=False))
     return found
 
 
-def earlier_verdicts(sessions: Sequence[Facts], controllers: Sequence[Controller], locks: Sequence[LockedMargins]) -> list[VerdictResult]:
+def earlier_verdicts(
+    sessions: Sequence[Facts], controllers: Sequence[Controller], locks: Sequence[LockedMargins], failed: Qoc
+) -> list[VerdictResult]:
     """What earlier locks concluded, by lock and controller: of the visits that began under each, by its margins; without planning.
 
     Args:
-        locks: that a newer one followed, oldest first.
+        locks: that a newer one followed, oldest first. failed: what a stopped session of the participant counts as, as in every verdict.
     """
     found = []
     for lock in locks:
         later = {s.visit for s in _after(sessions, lock.until)}
         mine = [s for s in _after(sessions, lock.locked_at) if s.visit not in later]
         before = [s for s in sessions if s.visit not in later]
-        found += [_judge(before, mine, controller, lock, confirmatory=True, plan=False) for controller in controllers]
+        found += [_judge(before, mine, controller, lock, failed, confirmatory=True, plan=False) for controller in controllers]
     return found
 
 
@@ -123,14 +127,17 @@ def _judge(
     sessions: Sequence[Facts],
     controller: Controller,
     locked: LockedMargins,
+    failed: Qoc,
     *,
     confirmatory: bool,
     plan: bool = True,
 ) -> VerdictResult:
     tested = of_controller(controller)
-    chosen = choose_each(sessions, ("energy", *FAILURE), tested)
+    chosen = choose_each(sessions, ("energy", *KEYS), tested)
     energy = chosen["energy"]
-    outcomes = [outcome_of(name, chosen[name].data, chosen[name].stopped, locked.margins) for name in FAILURE]
+    outcomes = [
+        judged_outcome(o, chosen[o.key].data, chosen[o.key].stopped, locked.margins.of(o), getattr(failed, o.field)) for o in OUTCOMES
+    ]
     used = {s.visit for s in sessions}
     seen = {s.visit for s in sessions if tested(s)} & {s.visit for s in sessions if s.controller is Controller.CDBS}
     result, lacking = None, NoVerdict.NO_GRASP_REFERENCE if used else NoVerdict.NO_VISIT_AFTER_LOCK
@@ -150,21 +157,24 @@ def _judge(
     )
 
 
-def outcome_of(name: str, data: Measurements, stopped: NDArray[np.bool_], margins: Margins) -> Outcome | None:
-    """An outcome as verdicts judge it, with its margin; None where no cDBS session tells what a share of the grasp frequency is.
+def judged_outcome(
+    outcome: Outcome, data: Measurements, stopped: NDArray[np.bool_], margin: float, failure: float | None
+) -> JudgedOutcome | None:
+    """Return an outcome as verdicts judge it; None where no cDBS session tells what a share of the value under cDBS is.
 
     Args:
-        name: grasp, rating or tremor. data: its values in both arms, n sessions. stopped: for the patient's sake, [n].
+        outcome: its record. data: its values in both arms, n sessions. stopped: for the patient's sake, [n].
+        margin: of the margin's kind. failure: what a stopped session counts as; None where it is unknown.
     """
-    margin = {"rating": margins.rating_points, "tremor": margins.tremor_points}.get(name)
-    if margin is None:
+    if outcome.margin.kind == "share":
         cells = data.cells
         by_visit = cells.means(data.value[cells.rows])[:, 1]
         cdbs = data.value[~data.tested & np.isfinite(data.value)]
         reference = float(by_visit.mean()) if by_visit.size else float(cdbs.mean()) if cdbs.size else 0.0
         if not reference > 0:
             return None
-        margin = margins.grasp_share * reference
-        # lowered by the share and lifted by the margin: the average contrast stays, its spread gains that of the reference
-        data = replace(data, value=np.where(data.tested, data.value, (1 - margins.grasp_share) * data.value + margin))
-    return Outcome(name, data, stopped, margin, HIGHER_IS_BETTER[name], SCALE[name], FAILURE[name])
+        # made worse by the share and better by the margin: the average contrast stays, its spread gains that of the reference
+        share, margin = margin, outcome.margin.amount(margin, reference)
+        shifted = outcome.less_margin(data.value, share) + (margin if outcome.higher_is_better else -margin)
+        data = replace(data, value=np.where(data.tested, data.value, shifted))
+    return JudgedOutcome(outcome.key, data, stopped, margin, outcome.higher_is_better, outcome.scale, failure, outcome.worst_possible)

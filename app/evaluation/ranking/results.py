@@ -22,11 +22,13 @@ from app.study import repository as study_repository
 from app.study.blinding import Arm
 from app.study.margins.models import MarginsVersion
 from app.study.models import Controller, Participant, SettingsVersion, StudySession
+from app.study.sessions.data import failed_qoc_of
 from app.study.sessions.repository import ReadOnce
 from app.study.threshold import mdp_settings
 from app.study.traces import TracesOf, laid_out, traces_of
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
 from ml.mdp import MdpSettings
+from ml.qoc import Qoc
 from ml.trajectories import SessionTrajectory
 
 WORST = {"grasp_hz": min, "rating": min, "tremor_percent": max}
@@ -65,10 +67,10 @@ def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller, sessi
     version = study_repository.settings_version(db, snapshot.settings_version_id)
     arms = [(s, blinding.arm(s, caller)) for s in blinding.unsealed(sessions.rows)]
     driven = [(s, arm) for s, arm in arms if arm.policy_id is not None or arm.controller is Controller.CDBS]
-    traces = traces_of(db, [s for s, _ in driven])
+    traces, failed = traces_of(db, [s for s, _ in driven]), failed_qoc_of(sessions.rows)
     found = []
     for session, arm in driven:
-        read = _read(session, traces, arm, version, snapshot)
+        read = _read(session, traces, arm, version, snapshot, failed)
         trajectory, reason = (None, read) if isinstance(read, str) else (read, None)
         found.append(DrivenSession(session.id, session.visit.number, arm.controller, arm.policy_id, trajectory, reason))
     return found
@@ -119,13 +121,15 @@ def tested_before(
     return kept(key, read)
 
 
-def _read(session: StudySession, traces: TracesOf, arm: Arm, version: SettingsVersion, snapshot: BufferSnapshot) -> SessionTrajectory | str:
+def _read(
+    session: StudySession, traces: TracesOf, arm: Arm, version: SettingsVersion, snapshot: BufferSnapshot, failed: Qoc
+) -> SessionTrajectory | str:
     """The session's steps, or why they cannot be held against estimates."""
     try:
         table = laid_out(session, version, traces)
     except Invalid as error:
         return str(error)
-    read, trace = trajectory_of(session, table, arm, version), table.beta_trace
+    read, trace = trajectory_of(session, table, arm, version, failed), table.beta_trace
     if not isinstance(read, str) and trace is not None and (trace.unit, trace.source) != (snapshot.beta_unit, snapshot.beta_source):
         return f"its beta is in {trace.unit} from {trace.source}, the estimates are in {snapshot.beta_unit} from {snapshot.beta_source}"
     return read

@@ -34,12 +34,13 @@ from app.study.characteristics.models import CharacteristicsVersion
 from app.study.doses.since import hours_since_dose
 from app.study.models import Hemisphere, Participant, SettingsVersion, StudySession
 from app.study.sessions import repository as session_repository
-from app.study.sessions.data import session_data
+from app.study.sessions.data import failed_qoc_of, session_data
 from app.study.sessions.programming import Program, differences, stored
 from app.study.sessions.repeated import counts_elsewhere
 from app.study.threshold import mdp_settings, suggest_xi_beta
 from app.study.traces import StepTable, TracesOf, traces_of
 from ml.mdp import MdpSettings
+from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
 
 log = structlog.get_logger()
@@ -147,7 +148,8 @@ def collect(db: Session, participant: Participant, sessions: Sequence[StudySessi
     placeless = session_repository.repeated_sessions(db, participant.id)
     twice = {s.id for s in sessions if s.id in placeless and counts_elsewhere(db, s)}
     traces = traces_of(db, sessions)
-    read = [_read(db, s, version, traces) if s.id not in twice else Member(s, None, None, REPEATED) for s in sessions]
+    failed = failed_qoc_of(sessions)
+    read = [_read(db, s, version, traces, failed) if s.id not in twice else Member(s, None, None, REPEATED) for s in sessions]
     unit, source = _signal(version, read)
     barrier = gate(db, participant, sessions)
     admitted = _of_one_programming([_admit(m, unit, source) for m in read], version)
@@ -236,7 +238,7 @@ def _mend(db: Session, snapshot: BufferSnapshot, found: Collection) -> None:
             files.store(db, content)
 
 
-def _read(db: Session, session: StudySession, version: SettingsVersion, traces: TracesOf) -> Member:
+def _read(db: Session, session: StudySession, version: SettingsVersion, traces: TracesOf, failed: Qoc) -> Member:
     """The session's trajectory, or the first reason of its own against it."""
     if session.visit.sealed:
         return Member(session, None, None, SEALED)  # how much was learnt from it, and what, would tell what ran
@@ -244,7 +246,7 @@ def _read(db: Session, session: StudySession, version: SettingsVersion, traces: 
         table = session_data(db, session, traces).table
     except Invalid as error:
         return Member(session, None, None, str(error))
-    trajectory = trajectory_of(session, table, blinding.arm(session, SYSTEM), version)
+    trajectory = trajectory_of(session, table, blinding.arm(session, SYSTEM), version, failed)
     if isinstance(trajectory, str):
         return Member(session, table, None, trajectory)
     if not trajectory.usable().any():
@@ -342,6 +344,6 @@ def _digest(s: SessionTrajectory) -> str:
     for values in (s.lead_beta, s.beta, s.amplitude):
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes() + b"|")
     digest.update(repr((s.random_lower_bound, s.lead_amplitude, *s.holds)).encode())
-    if s.stopped:
-        digest.update(b"|stopped")
+    if s.stopped_as is not None:
+        digest.update(f"|stopped as {s.stopped_as}".encode())
     return digest.hexdigest()

@@ -9,16 +9,18 @@ from app.study.models import Controller, SettingsVersion, StudySession
 from app.study.sessions.data import qoc_of
 from app.study.sessions.designs import drawn
 from app.study.traces import StepTable
+from ml.qoc import Qoc
 from ml.trajectories import SessionTrajectory
 
 
-def trajectory_of(session: StudySession, table: StepTable, arm: Arm, version: SettingsVersion) -> SessionTrajectory | str:
+def trajectory_of(session: StudySession, table: StepTable, arm: Arm, version: SettingsVersion, failed: Qoc) -> SessionTrajectory | str:
     """The session's steps after its start, with the window of beta before it; or why there are none.
 
     Args:
         session: its QoCs are taken in their newest revision. table: its steps, [window + T].
         arm: what drove it, as far as the asker may know.
         version: W, and how many steps of a state may be imputed (one is always measured).
+        failed: the QoCs of a stopped session (`failed_qoc_of` the participant's sessions).
 
     B of a random session and the amplitude before it are those of its conditions, whatever the settings say today.
     """
@@ -41,7 +43,7 @@ def trajectory_of(session: StudySession, table: StepTable, arm: Arm, version: Se
         holds=by_design.holds if by_design else (),
         lead_amplitude=lead_ma / table.cdbs_ma if lead_ma is not None and table.cdbs_ma else None,
         most_imputed=min(version.most_imputed, window - 1),
-        stopped=session.stopped_reason is not None,
+        stopped_as=failed if session.stopped_reason is not None else None,
     )
 
 

@@ -232,7 +232,13 @@ def primary_table(sessions: Sequence[dict[str, Any]], controllers: Sequence[str]
     return found
 
 
-def noninferiority(sessions: Sequence[dict[str, Any]], row: Row, grasp_share: float) -> dict[str, float]:
+def worst_grasp(folder: Path) -> float:
+    """Return the slowest grasp of all sessions that nobody excluded, which a stopped session counts as; NaN without one."""
+    measured = [number(s["grasp_hz"]) for s in read(folder, "sessions.csv") if not s["excluded_reason"]]
+    return min((v for v in measured if math.isfinite(v)), default=math.nan)
+
+
+def noninferiority(sessions: Sequence[dict[str, Any]], row: Row, grasp_share: float, slowest: float) -> dict[str, float]:
     """One outcome of one verdict: a stopped session of the controller counts as the worst; the one-sided p of a loss of the margin or more.
 
     The margin of grasp is a share of cDBS: the cDBS values are lowered by that share and lifted by the margin. Ratings of the controller
@@ -247,12 +253,10 @@ def noninferiority(sessions: Sequence[dict[str, Any]], row: Row, grasp_share: fl
         value = np.where(tested, value, (1 - grasp_share) * value + margin)
     value = sign * value
     failed = tested & np.array([bool(s["stopped_reason"]) for s in taken])
-    measured = value[np.isfinite(value)]
     ordinal = outcome == "rating"
     if ordinal:
         value = np.where(tested, value + margin, value)
-    worst = sign * WORST[outcome] if outcome in WORST else float(measured.min()) if measured.size else math.nan
-    value = np.where(failed, worst, value)
+    value = np.where(failed, sign * WORST.get(outcome, slowest), value)
     c = Contrasts(value.tolist(), [s["visit"] for s in taken], tested.tolist(), [s["order"] for s in taken])
     if len(c.arms) < 3:
         return {}
@@ -293,10 +297,10 @@ def main(folder: Path) -> int:
             wrong += [
                 f"{r['controller']} {r['metric']} {n}: {r[n]} stored, {mine.get(n)} here" for n in checked if differs(r[n], mine.get(n))
             ]
-    count = len(stored)
+    count, slowest = len(stored), worst_grasp(folder)
     for r in read(folder, "noninferiority.csv"):
         count += 1
-        again = noninferiority(sessions, r, float(r["grasp_share"]))
+        again = noninferiority(sessions, r, float(r["grasp_share"]), slowest)
         named = f"{r['controller']} {r['outcome']} (margins_version {r['margins_version']}, confirmatory {r['confirmatory']})"
         wrong += [f"{named} {n}: {r[n]} stored, {again.get(n)} here" for n in ("estimate", "p_non_inferior") if differs(r[n], again.get(n))]
     said = "\n".join(wrong) if wrong else f"{count} rows of primary.csv and noninferiority.csv recomputed: all agree."

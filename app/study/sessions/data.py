@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from sqlalchemy.orm import Session
@@ -9,7 +10,8 @@ from sqlalchemy.orm import Session
 from app.study.models import SettingsVersion, StudySession
 from app.study.threshold import mismatch
 from app.study.traces import StepTable, TracesOf, laid_out, step_table
-from ml.qoc import Qoc
+from ml.outcomes import OUTCOMES
+from ml.qoc import Qoc, failed_qoc
 
 
 @dataclass(frozen=True)
@@ -41,4 +43,13 @@ def session_data(db: Session, session: StudySession, traces: TracesOf | None = N
 def qoc_of(session: StudySession) -> Qoc:
     """A session's QoCs as the science knows them."""
     row = session.qoc
-    return Qoc() if row is None else Qoc(row.grasp_hz, row.rating, row.tremor_percent)
+    return Qoc() if row is None else Qoc(**{o.field: getattr(row, o.field) for o in OUTCOMES})
+
+
+def failed_qoc_of(sessions: Iterable[StudySession]) -> Qoc:
+    """Return what a stopped session of a participant counts as, in buffers, rankings and analyses alike.
+
+    Args:
+        sessions: all of the participant. Those count that are confirmed, not excluded, and of no sealed visit.
+    """
+    return failed_qoc(qoc_of(s) for s in sessions if s.status == "confirmed" and not s.excluded_reason and not s.visit.sealed)

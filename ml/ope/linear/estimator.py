@@ -201,7 +201,7 @@ class FittedLinear:
         """r_end [P, n] if sessions that were stopped counted as measured; None where none was."""
         if not any(s.stopped for s in self.buffer.sessions):
             return None
-        buffer = replace(self.buffer, sessions=tuple(replace(s, stopped=False) for s in self.buffer.sessions))
+        buffer = replace(self.buffer, sessions=tuple(replace(s, stopped_as=None) for s in self.buffer.sessions))
         other = replace(self, buffer=buffer, end=fit_end_model(buffer, severity=self.main.levels[0]))
         return other.replay(policies, self.main, other.end, horizon).outcomes[:, :, :, 0].mean(1)
 

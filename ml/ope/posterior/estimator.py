@@ -197,7 +197,7 @@ class FittedPosterior:
         """What r_end of each policy, [P], would gain if stopped sessions counted as measured; None where none was, or no r_end is."""
         if not self.ends.seen[0] or not any(s.stopped for s in self.buffer.sessions):
             return None
-        buffer = replace(self.buffer, sessions=tuple(replace(s, stopped=False) for s in self.buffer.sessions))
+        buffer = replace(self.buffer, sessions=tuple(replace(s, stopped_as=None) for s in self.buffer.sessions))
         ends = self._outcomes(buffer, self.pooled)
         other = replace(self, buffer=buffer, ends=ends)._replays(policies, horizon, silent)
         measured, counted = (np.einsum("pdn,d->p", r.outcomes[..., 0], r.weights) / len(buffer.sessions) for r in (other, replays))

@@ -35,9 +35,9 @@ def study(visits=6, loss=0.0, seed=0, noise=0.05, saved=0.4, stopped=()):
     tremor = np.clip(10 + rng.normal(0, 3, visit.size), 0, 100)
     energy = Measurements.of(np.where(arms, 1 - saved, 1.0) + rng.normal(0, 0.03, visit.size), visit, arms)
     outcomes = [
-        Outcome("grasp", Measurements.of(grasp, visit, arms), flags, 0.3, True),
-        Outcome("rating", Measurements.of(rating, visit, arms, resolution=1), flags, 1.5, True, failure=1.0),
-        Outcome("tremor", Measurements.of(tremor, visit, arms), flags, 10.0, False, failure=100.0),
+        Outcome("grasp", Measurements.of(grasp, visit, arms), flags, 0.3, True, failure=float(grasp.min()), worst_possible=0.0),
+        Outcome("rating", Measurements.of(rating, visit, arms, resolution=1), flags, 1.5, True, failure=1.0, worst_possible=1.0),
+        Outcome("tremor", Measurements.of(tremor, visit, arms), flags, 10.0, False, failure=100.0, worst_possible=100.0),
     ]
     return outcomes, energy, flags
 
@@ -47,7 +47,7 @@ def test_nothing_lost_and_energy_saved_is_the_verdict_with_its_per_cent():
     assert isinstance(found.verdict, NonInferiorAndSaving)
     assert found.verdict.low < 40 < found.verdict.high
     assert found.p_non_inferior == max(r.p_non_inferior for r in found.outcomes) < 0.05
-    assert [v for _, v in found.sensitivity] == [found.verdict, found.verdict]
+    assert [v for _, v in found.sensitivity] == [found.verdict] * 3
 
 
 def test_each_p_value_is_the_one_sided_t_test_of_the_visits_against_the_margin():
@@ -113,13 +113,22 @@ def test_a_session_stopped_for_the_patients_sake_is_a_failure_even_where_its_val
     assert isinstance(dict(found.sensitivity)[FailureRule.AS_MEASURED], NonInferiorAndSaving)
 
 
-def test_a_failure_without_a_stated_value_counts_as_the_worst_that_was_measured():
-    outcomes, _, _ = study(stopped=(1,))
-    value = outcomes[0].data.value
-    assert outcomes[0].counted(FailureRule.WORST_CASE).value[1] == value.min()
-    assert outcomes[0].counted(FailureRule.BOTH_ARMS).value[1] == value.min()
-    tremor = replace(outcomes[2], failure=None)
-    assert tremor.counted(FailureRule.WORST_CASE).value[1] == -tremor.data.value.max()
+def test_a_failure_of_unknown_value_is_missing():
+    outcomes, energy, flags = study(stopped=(1,))
+    unknown = replace(outcomes[0], failure=None)
+    assert np.isnan(unknown.counted(FailureRule.WORST_CASE).value[1])
+    assert [r.missing for r in assess([unknown, *outcomes[1:]], energy, flags).outcomes] == [1, 0, 0]
+
+
+def test_the_end_of_the_scale_is_what_a_failure_counts_as_in_one_of_the_sensitivity_analyses():
+    outcomes, energy, flags = study(stopped=(0, 1))
+    worst = [o.counted(FailureRule.END_OF_SCALE).value for o in outcomes]
+    assert [v[1] for v in worst] == [0.0, 1.0, -100.0]
+    assert worst[0][0] == outcomes[0].data.value[0]  # of cDBS: as measured
+    mild = [replace(o, failure=float(o.data.value[2])) for o in outcomes]
+    found = assess(mild, energy, flags)
+    assert isinstance(found.verdict, NonInferiorAndSaving)
+    assert not isinstance(dict(found.sensitivity)[FailureRule.END_OF_SCALE], NonInferiorAndSaving)
 
 
 def test_a_stopped_cdbs_session_helps_the_controller_only_where_both_arms_count():

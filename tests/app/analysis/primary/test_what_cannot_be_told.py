@@ -15,7 +15,7 @@ from app.analysis.primary.verdict import LockedMargins, NoVerdict, VerdictResult
 from app.overview.package import recompute
 from app.study.blinding import Arm
 from app.study.models import Controller
-from ml.qoc import Margins
+from ml.qoc import Margins, failed_qoc
 from ml.statistics.noninferiority import Inconclusive, NonInferiorAndSaving
 from ml.statistics.within_visits.contrasts import Reason, Unavailable
 
@@ -49,7 +49,7 @@ def varied(visits: int, **fixed: float | None) -> list[Facts]:
 
 
 def judged(sessions: list[Facts]) -> VerdictResult:
-    (found,) = verdicts(sessions, [RL], LOCKED)
+    (found,) = verdicts(sessions, [RL], LOCKED, failed_qoc([]))
     return found
 
 
@@ -103,8 +103,8 @@ def test_an_outcome_of_two_visits_is_told_from_a_study_of_two_visits() -> None:
     found = open_verdict(some)
     assert found.untested == (("tremor", Reason.TOO_FEW_VISITS),)
     sentence, short = wording.verdict(judged(some)), wording.verdict(judged(varied(2)))
-    assert wording.OUTCOMES["tremor"] in sentence.split(";", 1)[1]
-    assert wording.OUTCOMES["tremor"] not in short.split(";", 1)[1]
+    assert wording.JUDGED["tremor"] in sentence.split(";", 1)[1]
+    assert wording.JUDGED["tremor"] not in short.split(";", 1)[1]
 
 
 def test_no_grasp_frequency_to_take_a_share_of_gives_no_verdict() -> None:

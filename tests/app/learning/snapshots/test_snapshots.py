@@ -19,7 +19,8 @@ from app.platform.database import new_session
 from app.platform.errors import Invalid
 from app.study.models import Participant, Trace
 from app.study.repository import participant_by_code
-from ml.trajectories import FAILED, ReplayBuffer, from_parquet
+from ml.qoc import failed_qoc
+from ml.trajectories import ReplayBuffer, from_parquet
 
 Upload = Callable[..., int]
 
@@ -103,7 +104,7 @@ def test_a_session_that_was_stopped_is_a_failure_in_the_buffer(upload: Upload, c
     assert client.patch("/api/v1/sessions/2", json={"stopped_reason": "dyskinesia"}).status_code == 200
     after, buffer = taken(db)
     assert [s.stopped for s in buffer.sessions] == [False, True]
-    assert buffer.sessions[1].counted_qoc == FAILED
+    assert buffer.sessions[1].counted_qoc == failed_qoc(s.qoc for s in buffer.sessions)
     assert after.id != before.id
 
 

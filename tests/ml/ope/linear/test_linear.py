@@ -12,7 +12,7 @@ from ml.ope.linear.estimator import LinearConfig, LinearModel
 from ml.ope.outcomes.minutes import by_minute
 from ml.ope.outcomes.model import fit_end_model
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
-from ml.qoc import Qoc
+from ml.qoc import Qoc, failed_qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 
@@ -145,7 +145,8 @@ def test_where_no_qoc_counts_the_return_is_that_of_the_steps_and_nothing_is_miss
 
 def test_a_stopped_session_lowers_the_estimate_and_the_flag_says_what_it_would_be_as_measured(linear_simulator):
     whole = linear_simulator.buffer(seed=3, n=12, steps=60)
-    sessions = tuple(replace(s, stopped=s.controller == "other") for s in whole.sessions)
+    worst = failed_qoc(s.qoc for s in whole.sessions)
+    sessions = tuple(replace(s, stopped_as=worst if s.controller == "other" else None) for s in whole.sessions)
     policies = {"low": ConstantPolicy(0.3)}
     before = LinearModel(LinearConfig(draws=20)).fit(whole).evaluate(policies, 60)["low"]
     after = LinearModel(LinearConfig(draws=20)).fit(replace(whole, sessions=sessions)).evaluate(policies, 60)["low"]

@@ -11,7 +11,7 @@ from scipy.special import expit
 from ml.mdp import MdpSettings
 from ml.ope.outcomes.minutes import Minutes, by_minute
 from ml.ope.outcomes.model import fit_end_model
-from ml.qoc import Qoc
+from ml.qoc import Qoc, failed_qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 W, T = 10, 60
@@ -173,9 +173,10 @@ def test_a_stopped_session_is_a_failure_of_what_ran_and_never_a_missing_one():
     doses = np.tile([0.5, 0.6, 0.9, 1.0], 5)
     ratings = np.full(20, 8.0)
     whole = buffer_of(doses, np.full(20, 2.0), np.arange(20) // 4, np.zeros(20), ALL, ratings)
-    failed = tuple(replace(s, stopped=True, qoc=Qoc()) if s.amplitude[0] == 0.5 and s.visit < 3 else s for s in whole.sessions)
+    worst = failed_qoc(s.qoc for s in whole.sessions)
+    failed = tuple(replace(s, stopped_as=worst, qoc=Qoc()) if s.amplitude[0] == 0.5 and s.visit < 3 else s for s in whole.sessions)
     stopped = fit_end_model(replace(whole, sessions=failed))
-    missing = fit_end_model(replace(whole, sessions=tuple(replace(s, stopped=False) for s in failed)))
+    missing = fit_end_model(replace(whole, sessions=tuple(replace(s, stopped_as=None) for s in failed)))
     before, after = missing.predict(at(0.5, 1.0))[:, 0], stopped.predict(at(0.5, 1.0))[:, 0]
     assert before[0] == pytest.approx(before[1], abs=3)
     assert after[0] < after[1] - 10

@@ -17,7 +17,7 @@ from ml.ope.posterior.gaussian import TestedDifference
 from ml.ope.posterior.structures import STRUCTURES, Fit
 from ml.ope.registry import POSTERIOR, build
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
-from ml.qoc import Qoc
+from ml.qoc import Qoc, failed_qoc
 from tests.ml.ope.posterior.known_system import STEPS, KnownSystem
 
 POLICIES = {f"constant {a}": ConstantPolicy(a) for a in (0.4, 0.55, 0.7, 0.85, 1.0)} | {"off": ConstantPolicy(0.0)}
@@ -144,7 +144,8 @@ def test_draws_are_dealt_out_by_weight() -> None:
 
 def test_a_stopped_session_lowers_the_estimate_and_the_flag_says_what_it_would_be_as_measured(known_buffer, found) -> None:
     lowest = min((s for s in known_buffer.sessions if s.controller == "random"), key=lambda s: s.amplitude.mean())
-    sessions = tuple(replace(s, stopped=s is lowest) for s in known_buffer.sessions)
+    worst = failed_qoc(s.qoc for s in known_buffer.sessions)
+    sessions = tuple(replace(s, stopped_as=worst if s is lowest else None) for s in known_buffer.sessions)
     after = SMALL.fit(replace(known_buffer, sessions=sessions)).evaluate({"constant 0.4": POLICIES["constant 0.4"]})["constant 0.4"]
     before = found["constant 0.4"]
     assert after.end_reward is not None

@@ -111,7 +111,7 @@ def test_the_spread_of_random_sessions_is_what_visits_and_a_line_over_the_dose_l
         for energy in energies:
             grasp = level + 2.0 * energy + next(added)
             sessions.append(drawn(len(sessions), visit, float(np.sqrt(energy)), Qoc(grasp, None, 10.0)))
-    sessions.append(drawn(90, 1, 0.7, Qoc(0.0, 1, 100.0), stopped=True))
+    sessions.append(drawn(90, 1, 0.7, Qoc(0.0, 1, 100.0), stopped_as=Qoc(0.0, 1, 100.0)))
     found = spread_of_random(ReplayBuffer(MdpSettings(window=5, xi_beta=50.0), tuple(sessions), "mV", "table"), 30)
     assert set(found) == {"grasp_hz", "tremor_percent"}, "energy is the dose, no rating was given, and no return is known without it"
     assert found["grasp_hz"].freedom == 7 - 2 - 1
