@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.outcomes import OUTCOMES
 from ml.qoc import Qoc
 
 AMPLITUDE_TOLERANCE = 1e-4
@@ -26,9 +27,7 @@ class MdpSettings:
         r_a: reward while beta is below the threshold.
         r_b: reward while beta is at or above it.
         c1: price of amplitude per step, C1.
-        c2: weight of the grasp frequency (Hz) in r_end, C2; 0 drops it.
-        c3: weight of the rating (1-10), C3; 0 drops it.
-        c4: weight of tremor, C4; 0 drops it.
+        c2, c3, c4: weights C2, C3 and C4 of outcomes in r_end (`ml.outcomes.EndWeight`); 0 drops one.
         gamma: discount per step (ours; the paper gives none).
         lower_bound: B, lowest amplitude fraction of the *random controller*; never bounds a policy (ours).
         tremor_as_fraction: True when tremor enters r_end as 0-1 instead of per cent.
@@ -92,19 +91,17 @@ def step_reward(settings: MdpSettings, beta: NDArray[Any], amplitude: NDArray[An
 
 
 def end_reward(settings: MdpSettings, qoc: Qoc) -> float | None:
-    """End-of-session reward r_end = C2 grasp + C3 rating - C4 tremor (eq:end_of_session_reward).
+    """End-of-session reward r_end: the weighted outcomes of `ml.outcomes` (eq:end_of_session_reward).
 
     Returns:
         The reward, or None when a QoC with a weight above zero is missing: that masks r_end of the session, never the session.
     """
-    tremor = qoc.tremor_percent
-    if tremor is not None and settings.tremor_as_fraction:
-        tremor = tremor / 100.0
     total = 0.0
-    for weight, value in ((settings.c2, qoc.grasp_hz), (settings.c3, qoc.rating), (-settings.c4, tremor)):
-        if weight == 0:
+    for outcome in OUTCOMES:
+        if outcome.end is None or outcome.end.weight(settings) == 0:
             continue
+        value = getattr(qoc, outcome.field)
         if value is None:
             return None
-        total += weight * float(value)
+        total += outcome.end.weight(settings) * (float(value) / outcome.end.scale(settings))
     return total

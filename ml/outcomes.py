@@ -74,6 +74,27 @@ class EndWeight:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """The facts that the outcome model of `ml.ope` and its posterior need of an outcome.
+
+    Attributes:
+        kind: the distribution: of a measured number, of a rounded rating, of minutes that have it or not (the unit is per cent then).
+        model_error: standard deviation of what structures of the model get wrong near the data, and what is added where no session is
+            near; of the value, or of the logit of minutes.
+        least_error: smallest standard deviation of a session, which is what its measurement resolves.
+    """
+
+    kind: Literal["gaussian", "rounded", "binomial"]
+    model_error: tuple[float, float]
+    least_error: float
+
+    @property
+    def percent(self) -> float:
+        """The unit of the outcome in shares: 100 of minutes, which the model takes as shares, else 1."""
+        return 100.0 if self.kind == "binomial" else 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Outcome:
     """One outcome of a session: what it is called, how it is measured, judged, tested and shown.
 
@@ -90,7 +111,7 @@ class Outcome:
         end: its part in r_end; None where it has none.
         scale: of the primary contrast. model: of the mixed model. resolution: the step between neighbouring values, 0 where continuous.
         bounded: sessions reach an end of the range.
-        derived: uploaded files may give it. predicted: the outcome model of `ml.ope.outcomes` knows it.
+        derived: uploaded files may give it. prediction: how evaluation predicts it; None where it does not.
     """
 
     key: str
@@ -124,7 +145,7 @@ class Outcome:
     resolution: float = 0.0
     bounded: bool = False
     derived: bool = False
-    predicted: bool = False
+    prediction: Prediction | None = None
 
     def __post_init__(self) -> None:
         if not self.low < self.high:
@@ -159,6 +180,11 @@ class Outcome:
         if self.margin.kind == "share":
             return own - (1 - margin) * cdbs if self.higher_is_better else (1 + margin) * cdbs - own
         return own - cdbs + margin if self.higher_is_better else cdbs + margin - own
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The range."""
+        return self.low, self.high
 
     @property
     def worst_possible(self) -> float:
@@ -222,7 +248,7 @@ OUTCOMES: tuple[Outcome, ...] = (
         failure=None,
         end=EndWeight(setting="c2", sign=1.0),
         derived=True,
-        predicted=True,
+        prediction=Prediction(kind="gaussian", model_error=(0.10, 0.03), least_error=0.02),
     ),
     Outcome(
         key="rating",
@@ -265,7 +291,7 @@ OUTCOMES: tuple[Outcome, ...] = (
         model="ordinal",
         resolution=1.0,
         bounded=True,
-        predicted=True,
+        prediction=Prediction(kind="rounded", model_error=(0.13, 0.08), least_error=0.25),
     ),
     Outcome(
         key="tremor",
@@ -308,12 +334,15 @@ OUTCOMES: tuple[Outcome, ...] = (
         resolution=1.0,
         bounded=True,
         derived=True,
-        predicted=True,
+        prediction=Prediction(kind="binomial", model_error=(0.25, 0.27), least_error=0.5),
     ),
 )
 """Every outcome, in the order in which forms and tables have them."""
 
 FIELDS = tuple(o.field for o in OUTCOMES)
 KEYS = tuple(o.key for o in OUTCOMES)
+PREDICTED: tuple[tuple[Outcome, Prediction], ...] = tuple((o, o.prediction) for o in OUTCOMES if o.prediction is not None)
+"""The outcomes that evaluation predicts."""
+
 BY_KEY: Mapping[str, Outcome] = {o.key: o for o in OUTCOMES}
 BY_FIELD: Mapping[str, Outcome] = {o.field: o for o in OUTCOMES}

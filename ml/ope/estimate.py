@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ml.ope.flags import Flag
+from ml.outcomes import PREDICTED
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.trajectories import ReplayBuffer
@@ -19,7 +20,7 @@ LEVEL = 0.90
 STORED_VERSION = 2
 """Version of `Estimate.to_json`."""
 
-OUTCOMES = ("r_end", "grasp_hz", "rating", "tremor_percent")
+OUTCOMES = ("r_end", *(o.field for o, _ in PREDICTED))
 """End-of-session outcomes, in the order of every array that holds them."""
 
 
@@ -35,8 +36,8 @@ class Estimate:
         standard_error: of `value`.
         step_return: the part of `value` from the steps.
         end_reward: the part from r_end; None where no session of the buffer has an r_end (then `value` lacks it and a flag says so).
-        predicted: what the method predicts besides: `energy` (mean a^2), `mean_amplitude`, `mean_beta` (participant's unit), `grasp_hz`,
-            `rating`, `tremor_percent`; a key is absent where the method cannot say.
+        predicted: what the method predicts besides: `energy` (mean a^2), `mean_amplitude`, `mean_beta` (participant's unit), and outcomes
+            by their field; a key is absent where the method cannot say.
         supported: False when the data cannot speak about this policy.
         flags: the reasons why the data cannot speak, and warnings.
         n: sessions or roll-outs behind the value.

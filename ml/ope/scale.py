@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.estimate import OUTCOMES
+from ml.outcomes import OUTCOMES as RECORDS
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
@@ -26,7 +27,7 @@ class Scale:
         log: True when beta enters as its logarithm: all valid amplitudes are positive and their logarithm is less skewed.
         beta_mean, beta_std: of (log) beta. beta_low, beta_high: range of the raw beta, participant's unit.
         reward_mean, reward_std: of the usable rewards.
-        outcome_mean, outcome_std: of `OUTCOMES`, four each; 0 and 1 where the outcome is not seen. The deviation is 0 where
+        outcome_mean, outcome_std: of `OUTCOMES`, each; 0 and 1 where the outcome is not seen. The deviation is 0 where
             all sessions have the same value, which is then the prediction.
         outcome_seen: which of `OUTCOMES` at least `FEWEST_OUTCOMES` sessions have.
     """
@@ -66,13 +67,13 @@ class Scale:
 
 
 def outcome_table(buffer: ReplayBuffer) -> Floats:
-    """`OUTCOMES` of every session, shape [n, 4]; NaN where not measured. Where C2 = C3 = C4 = 0 r_end is 0 for all, measured or not."""
+    """`OUTCOMES` of every session, shape [n, K]; NaN where not measured. Where none has a weight r_end is 0 for all, measured or not."""
     settings = buffer.settings
-    weighted = settings.c2 + settings.c3 + settings.c4 > 0
+    weighted = any(o.end is not None and o.end.weight(settings) for o in RECORDS)
     rows = []
     for s in buffer.sessions:
         qoc, end = s.counted_qoc, s.end_reward(settings) if weighted else 0.0
-        rows.append([np.nan if v is None else float(v) for v in (end, qoc.grasp_hz, qoc.rating, qoc.tremor_percent)])
+        rows.append([np.nan if v is None else float(v) for v in (end, *(getattr(qoc, name) for name in OUTCOMES[1:]))])
     return np.array(rows, dtype=np.float64)
 
 

@@ -26,7 +26,7 @@ from ml.ope.dlsm.held_out import FreeRuns, shares
 from ml.ope.dlsm.rollout import Rollouts, roll_out
 from ml.ope.dlsm.selection import Selection, SelectionRun, resampled, usable_folds
 from ml.ope.dlsm.training import Member, MemberTraining
-from ml.ope.estimate import LEVEL, OUTCOMES, Estimate, checked_horizon
+from ml.ope.estimate import LEVEL, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS, Flag
 from ml.ope.observed import day_noise
 from ml.ope.outcomes.minutes import Minutes
@@ -34,6 +34,7 @@ from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale
 from ml.ope.support.coverage import AmplitudeSupport, Coverage, flags_of
+from ml.outcomes import PREDICTED
 from ml.policies.policy import Policy
 from ml.progress import Report, part_of, silent
 from ml.trajectories import ReplayBuffer, content_hash, to_parquet
@@ -360,10 +361,10 @@ class FittedDlsm:
             "mean_amplitude": float(np.mean([run.amplitude[i].mean() for run in runs])),
             "mean_beta": float(np.mean([run.beta[i].mean() for run in runs])),
         }
-        ranges = {"grasp_hz": (0.0, np.inf), "rating": (1.0, 10.0), "tremor_percent": (0.0, 100.0)}
-        for j, name in enumerate(OUTCOMES):
-            if name in ranges and self.scale.outcome_seen[j]:
-                predicted[name] = float(np.mean([np.clip(self._outcomes(run)[i, :, j], *ranges[name]).mean() for run in runs]))
+        for j, (outcome, _) in enumerate(PREDICTED, start=1):  # 0 is r_end
+            if self.scale.outcome_seen[j]:
+                values = [np.clip(self._outcomes(run)[i, :, j], *outcome.limits).mean() for run in runs]
+                predicted[outcome.field] = float(np.mean(values))
         return predicted
 
 

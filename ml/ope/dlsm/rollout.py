@@ -29,7 +29,7 @@ class Rollouts:
         return_head: discounted step return by the learnt reward head's mean.
         return_known: discounted step return by the known reward on sampled beta (never on its mean: a policy whose mean beta lies just
             under the threshold would look perfect).
-        outcomes: r_end, grasp, rating, tremor in their units, [P, M, 4].
+        outcomes: `ml.ope.estimate.OUTCOMES` in their units, [P, M, K].
         minutes: what outcomes follow in every simulated session.
         actions: one in `keep_every` of all actions, [P, K], for the coverage of the policy's own states.
     """

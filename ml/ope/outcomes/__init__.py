@@ -1,1 +1,1 @@
-"""End-of-session outcomes (grasp, rating, tremor, r_end) from the minutes of a session: one hierarchical model for all methods."""
+"""End-of-session outcomes and r_end from the minutes of a session: one hierarchical model for all methods."""

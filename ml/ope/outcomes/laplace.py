@@ -29,7 +29,7 @@ PRIOR_SESSIONS: Final = 3.0
 """Sessions that the prior of the dispersion counts for."""
 
 DISPERSION: Final = {"gaussian": 0.15**2, "rounded": 0.6**2, "binomial": 2.5}
-"""Its prior value: variances of a grasp test (Hz^2) and of a rating, and a binomial's factor."""
+"""Its prior value: variances of a measured number (Hz^2) and of a rounded one, and a binomial's factor."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def log_likelihood(kind: Kind, y: Floats, size: Floats, eta: Floats, parts: Floa
     if kind == "rounded":
         return np.log(_interval(y, (parts * eta).sum(-1), np.sqrt(s))[0])
     share = np.clip((parts * expit(eta)).sum(-1), 1e-9, 1 - 1e-9)
-    # Less its value at the best p = y, so that sessions without tremor fit perfectly.
+    # Less its value at the best p = y, so that sessions without such minutes fit perfectly.
     with np.errstate(divide="ignore", invalid="ignore"):
         best = np.where((y > 0) & (y < 1), y * np.log(y) + (1 - y) * np.log1p(-y), 0.0)
     return np.asarray(size / s * (y * np.log(share) + (1 - y) * np.log1p(-share) - best) - 0.5 * np.log(s), dtype=np.float64)
@@ -242,7 +242,7 @@ def _dispersion(p: Problem, theta: Floats, dispersion: Floats) -> Floats:
     eta, s = _eta(p, theta), dispersion[:, None]
     mean = (p.parts * (expit(eta) if p.kind == "binomial" else eta)).sum(-1)
     if p.kind == "binomial":
-        # without a floor one minute of tremor where hardly any is expected would count for all others
+        # without a floor one such minute where hardly any is expected would count for all others
         floor = 0.5 / p.size
         square = p.size * (p.y - mean) ** 2 / np.maximum(mean * (1 - mean), floor * (1 - floor))
     elif p.kind == "gaussian":

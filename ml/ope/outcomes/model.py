@@ -1,7 +1,7 @@
 """One hierarchical model of the end-of-session outcomes and r_end, for all methods of off-policy evaluation.
 
-Grasp, rating and tremor follow the minutes of a session (`regressions`); r_end is C2 grasp + C3 rating - C4 tremor of what is predicted, so
-that a session without one QoC still counts for the others. Draws are those of one joint posterior: draw d of two policies shares its
+Outcomes follow the minutes of a session (`regressions`); r_end is their weighted sum, of what is predicted, so that a session without one
+outcome still counts for the others. Draws are those of one joint posterior: draw d of two policies shares its
 coefficients, and what the model gets wrong for both cancels in their difference.
 """
 
@@ -17,29 +17,30 @@ from ml.mdp import MdpSettings
 from ml.ope.estimate import OUTCOMES
 from ml.ope.outcomes.medication import worn_off
 from ml.ope.outcomes.minutes import ABOVE, BETA, Minutes, of_buffer
-from ml.ope.outcomes.regressions import ORDER, WIDER, Left, Outcome, Regression, Sessions, burden_of, fit
+from ml.ope.outcomes.regressions import FOLLOWING, LEADING, ORDER, PERCENT, WIDER, Left, Outcome, Regression, Sessions, burden_of, fit
 from ml.ope.scale import FEWEST_OUTCOMES, outcome_table
+from ml.outcomes import PREDICTED
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
 
-COLUMN: dict[Outcome, int] = {"grasp": 1, "rating": 2, "tremor": 3}
+COLUMN: dict[Outcome, int] = {o.key: OUTCOMES.index(o.field) for o, _ in PREDICTED}
 """Place of an outcome in `ml.ope.estimate.OUTCOMES`; r_end is 0."""
 
-RANGES = {1: (0.0, np.inf), 2: (1.0, 10.0), 3: (0.0, 100.0)}
-"""Possible grasp (Hz), rating and tremor (%)."""
+RANGES = {COLUMN[o.key]: o.limits for o, _ in PREDICTED}
+"""Possible values of the outcome in a column, in its unit."""
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What is said of sessions that are left out; columns are r_end, grasp, rating and tremor.
+    """What is said of sessions that are left out; columns are `OUTCOMES`.
 
     Attributes:
         predicted: [n, 4]; NaN where there is none.
-        mean: what to say without a model, [n, 4]: the mean of the sessions, for a left-out visit that of the other visits; NaN where none
+        mean: what to say without a model, [n, K]: the mean of the sessions, for a left-out visit that of the other visits; NaN where none
             is known.
-        residual: root mean squared error, [4]; of sessions 0 where unseen, of visits NaN where unseen or where there is one visit.
-        skill: 1 - squared error / that of saying the mean, [4]; NaN where unseen.
+        residual: root mean squared error, [K]; of sessions 0 where unseen, of visits NaN where unseen or where there is one visit.
+        skill: 1 - squared error / that of saying the mean, [K]; NaN where unseen.
     """
 
     predicted: Floats
@@ -50,18 +51,18 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class EndModel:
-    """Outcomes of sessions; columns of every result are r_end, grasp, rating and tremor in their units.
+    """Outcomes of sessions; columns of every result are the K `OUTCOMES` in their units.
 
     Attributes:
-        constants: r_end = constants . (grasp, rating, tremor), [3].
-        regressions: of the outcomes that enough sessions have. unseen: mean of the others' few sessions, 0 without one, [4].
+        constants: r_end = constants . outcomes, [K - 1].
+        regressions: of the outcomes that enough sessions have. unseen: mean of the others' few sessions, 0 without one, [K].
         centre, spread: of beta and of the share above the threshold between sessions, [2].
         sessions: of the buffer.
         draws: D.
         seen: outcomes that are predicted; r_end where every QoC that counts in it is, or where none counts.
-        by_session: predictions of sessions from all others; ratings given the tremor that the session had. by_visit: from the other visits,
-            as a day to come is predicted.
-        day_share: share of an outcome's unexplained variance that sessions of one visit have in common, [4]; NaN where unseen.
+        by_session: predictions of sessions from all others; an outcome that follows another given that of the session. by_visit: from the
+            other visits, as a day to come is predicted.
+        day_share: share of an outcome's unexplained variance that sessions of one visit have in common, [K]; NaN where unseen.
     """
 
     constants: Floats
@@ -77,20 +78,20 @@ class EndModel:
     day_share: Floats
 
     def predict(self, minutes: Minutes, own: Sessions | None = None) -> Floats:
-        """Posterior mean [..., 4] of sessions of any leading shape on a new day; with `own` their last axis is those sessions."""
+        """Posterior mean [..., K] of sessions of any leading shape on a new day; with `own` their last axis is those sessions."""
         burden = burden_of(minutes, self.centre, self.spread)
         result = self._unseen(minutes.share.shape[:-1])
-        tremor: Floats | None = None
+        leading: Floats | None = None
         for outcome, r in self.ordered():
             mean = np.zeros(minutes.share.shape[:-1])
             for weight, member in zip(r.weights, r.members, strict=True):
-                mean += weight * r.mean(member, minutes, burden, tremor, own)
-            tremor = mean if outcome == "tremor" else tremor
-            result[..., COLUMN[outcome]] = 100 * mean if outcome == "tremor" else mean
+                mean += weight * r.mean(member, minutes, burden, leading, own)
+            leading = mean if outcome == LEADING else leading
+            result[..., COLUMN[outcome]] = PERCENT[outcome] * mean
         return self.joined(result)
 
     def each(self, minutes: Minutes, own: Sessions | None = None) -> Floats:
-        """The same by every draw: sessions [..., D, n] (the d-th by draw d) or [..., 1, n] (all by all); [..., D, n, 4].
+        """The same by every draw: sessions [..., D, n] (the d-th by draw d) or [..., 1, n] (all by all); [..., D, n, K].
 
         Raises:
             ValueError: the model has no draws, or the sessions are those of another number of them.
@@ -103,22 +104,22 @@ class EndModel:
             k = d if given > 1 else 0
             one = Minutes(minutes.features[..., k, :, :, :], minutes.share[..., k, :, :], minutes.late[..., k, :, :])
             burden = burden_of(one, self.centre, self.spread)
-            tremor: Floats | None = None
+            leading: Floats | None = None
             for outcome, r in self.ordered():
-                mean = r.mean(r.drawn[d], one, burden, tremor, own)
-                tremor = mean if outcome == "tremor" else tremor
-                result[..., d, :, COLUMN[outcome]] = 100 * mean if outcome == "tremor" else mean
+                mean = r.mean(r.drawn[d], one, burden, leading, own)
+                leading = mean if outcome == LEADING else leading
+                result[..., d, :, COLUMN[outcome]] = PERCENT[outcome] * mean
         return self.joined(result)
 
     def carried(self, predicted: Floats, known: Floats, seen: Floats) -> Floats:
-        """Outcomes [..., n, 4] of sessions under another policy, where what each session had of its own stays with it.
+        """Outcomes [..., n, K] of sessions under another policy, where what each session had of its own stays with it.
 
         A share y that was s on average becomes y p / s where p < s and y + (1 - y)(p - s) / (1 - s) where p > s: what is left on
         average is p, the range is kept, and p = s gives back y. (Of a yes or no this is the same uniform number held against s and p.)
 
         Args:
-            predicted: under the other policy, [..., n, 4]. known: measured, [n, 4], NaN where not. seen: prediction of the session as it
-                was, [..., n, 4].
+            predicted: under the other policy, [..., n, K]. known: measured, [n, K], NaN where not. seen: prediction of the session as it
+                was, [..., n, K].
         """
         result = predicted.copy()
         for column, (low, high) in RANGES.items():
@@ -136,7 +137,7 @@ class EndModel:
         return replace(self, regressions=chosen, draws=number)
 
     def joined(self, outcomes: Floats) -> Floats:
-        """The outcomes with r_end made of the three QoCs."""
+        """The outcomes with r_end made of them."""
         outcomes[..., 0] = outcomes[..., 1:] @ self.constants if self.seen[0] else self.unseen[0]
         return outcomes
 
@@ -163,7 +164,7 @@ class EndModel:
         return [(outcome, self.regressions[outcome]) for outcome in ORDER if outcome in self.regressions]
 
     def _unseen(self, shape: tuple[int, ...]) -> Floats:
-        return np.broadcast_to(self.unseen, (*shape, 4)).copy()
+        return np.broadcast_to(self.unseen, (*shape, len(OUTCOMES))).copy()
 
 
 def fit_end_model(
@@ -202,29 +203,29 @@ def fit_end_model(
         column = COLUMN[outcome]
         if known[column] < FEWEST_OUTCOMES:
             continue
-        y = table[:, column] / (100.0 if outcome == "tremor" else 1.0)
-        tremor: Floats | None = None
+        y = table[:, column] / PERCENT[outcome]
+        leading: Floats | None = None
         said: Floats | None = None
-        if outcome == "rating" and "tremor" in regressions:
-            tremor = _filled(table[:, 3] / 100.0)
-            said = _put(tremor, regressions["tremor"])
+        if outcome == FOLLOWING and LEADING in regressions:
+            leading = _filled(table[:, COLUMN[LEADING]] / PERCENT[LEADING])
+            said = _put(leading, regressions[LEADING])
         prior = (shape_priors or {}).get(outcome)
-        regressions[outcome] = fit(outcome, y, minutes, burden, tremor, sessions, size, draws, wider, rng, said, prior)
+        regressions[outcome] = fit(outcome, y, minutes, burden, leading, sessions, size, draws, wider, rng, said, prior)
     seen = (
         all(outcome in regressions or constants[column - 1] == 0 for outcome, column in COLUMN.items()),
-        *(outcome in regressions for outcome in ("grasp", "rating", "tremor")),
+        *(outcome in regressions for outcome in COLUMN),
     )
     unseen = np.array([float(np.nanmean(column)) if np.isfinite(column).any() else 0.0 for column in table.T])
     by_session, by_visit = (_left_out(how, table, regressions, constants, seen, visit) for how in ("session", "visit"))
-    share = np.full(4, np.nan)
+    share = np.full(len(OUTCOMES), np.nan)
     for outcome, r in regressions.items():
         share[COLUMN[outcome]] = r.day_share
     return EndModel(constants, regressions, unseen, centre, spread, sessions, draws, seen, by_session, by_visit, share)
 
 
 def _constants(settings: MdpSettings) -> Floats:
-    """C2, C3, -C4 per percent of tremor."""
-    return np.array([settings.c2, settings.c3, -settings.c4 / (100.0 if settings.tremor_as_fraction else 1.0)])
+    """Return what one unit of each predicted outcome adds to r_end, [K - 1]."""
+    return np.array([o.end.per_unit(settings) if o.end is not None else 0.0 for o, _ in PREDICTED])
 
 
 def _standardised(severity: Floats) -> Floats:
@@ -253,13 +254,13 @@ def _left_out(
 ) -> LeftOut:
     predicted = np.full(table.shape, np.nan)
     for outcome, r in regressions.items():
-        predicted[r.sessions, COLUMN[outcome]] = r.left_out[how] * (100.0 if outcome == "tremor" else 1.0)
+        predicted[r.sessions, COLUMN[outcome]] = r.left_out[how] * PERCENT[outcome]
     counted = np.flatnonzero(constants) + 1
     predicted[:, 0] = predicted[:, counted] @ constants[counted - 1]
     rest = [visit != v if how == "visit" else np.ones(len(visit), dtype=bool) for v in visit]
     mean = np.array([[_mean(column[others]) for column in table.T] for others in rest])
-    skill, residual = np.full(4, np.nan), np.zeros(4) if how == "session" else np.full(4, np.nan)
-    for j in range(4):
+    skill, residual = np.full(len(OUTCOMES), np.nan), np.full(len(OUTCOMES), 0.0 if how == "session" else np.nan)
+    for j in range(len(OUTCOMES)):
         both = np.isfinite(table[:, j]) & np.isfinite(predicted[:, j]) & np.isfinite(mean[:, j])
         if not seen[j] or not both.any():
             continue

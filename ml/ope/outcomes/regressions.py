@@ -23,9 +23,11 @@ from scipy.special import logsumexp
 
 from ml.ope.outcomes.laplace import Kind, Problem, Solved, mean_of, solve
 from ml.ope.outcomes.minutes import ABOVE, BETA, DOSE, OVER, SHAPES, Minutes
+from ml.outcomes import PREDICTED
 
 Floats = NDArray[np.float64]
-Outcome = Literal["tremor", "grasp", "rating"]
+Outcome = str
+"""A key of `ml.outcomes`."""
 
 Left = Literal["session", "visit"]
 """What is left out at a time: a session, of whose visit the others are known, or a visit, as a day to come is predicted."""
@@ -33,7 +35,13 @@ Left = Literal["session", "visit"]
 ORDER: Final[tuple[Outcome, ...]] = ("tremor", "grasp", "rating")
 """In which outcomes are predicted: the rating follows the tremor."""
 
-KINDS: Final[dict[Outcome, Kind]] = {"grasp": "gaussian", "rating": "rounded", "tremor": "binomial"}
+LEADING: Final = "tremor"
+FOLLOWING: Final = "rating"
+"""The outcome whose predicted share another one follows, and that other one."""
+
+KINDS: Final[dict[Outcome, Kind]] = {o.key: p.kind for o, p in PREDICTED}
+PERCENT: Final[dict[Outcome, float]] = {o.key: p.percent for o, p in PREDICTED}
+"""The unit of an outcome in those of its regression: 100 where this has shares of minutes."""
 
 PRIORS: Final[dict[Outcome, dict[str, tuple[float, float]]]] = {
     "grasp": {

@@ -1,6 +1,6 @@
 """What every step of a session adds to its expected outcomes: the outcome model taken apart into steps.
 
-The model is of sessions and minutes, and bends: a minute's tremor is a logistic, a rating is cut at its ends, a dose saturates. At a
+The model is of sessions and minutes, and bends: a share of minutes is a logistic, a rating is cut at its ends, a dose saturates. At a
 session as it was, a step adds what its minute has, and beyond that what its own dose and beta differ by from the minute, times the slope
 there. So the shares of a session have the mean that the model expects of the session, a dose counts for more in a minute that is
 about to tremble than in a quiet one, and one noisy beta is not taken for a minute of it.
@@ -15,7 +15,7 @@ from ml.mdp import MdpSettings
 from ml.ope.outcomes.laplace import mean_of
 from ml.ope.outcomes.minutes import Minutes, minute_bounds, step_features
 from ml.ope.outcomes.model import COLUMN, EndModel
-from ml.ope.outcomes.regressions import KINDS, Regression, burden_of
+from ml.ope.outcomes.regressions import KINDS, LEADING, PERCENT, Regression, burden_of
 from ml.trajectories import SessionTrajectory
 
 Floats = NDArray[np.float64]
@@ -43,12 +43,12 @@ def end_reward_by_step(model: EndModel, session: SessionTrajectory, settings: Md
     means = (of_minute @ features) / np.maximum(counts, 1)[:, None]
     whole = Minutes(means, counts / known.sum(), counts / known.sum())
     each = Minutes(features[:, None, :], np.ones((known.size, 1)), np.ones((known.size, 1)))
-    outcomes = np.broadcast_to(model.unseen, (known.size, 4)).copy()
-    tremor: Floats | None = None
+    outcomes = np.broadcast_to(model.unseen, (known.size, model.unseen.size)).copy()
+    lead: Floats | None = None
     for outcome, regression in model.ordered():
-        shares = _shares(model, regression, whole, each, minute, known, tremor)
-        tremor = shares if outcome == "tremor" else tremor
-        outcomes[:, COLUMN[outcome]] = 100 * shares if outcome == "tremor" else shares
+        shares = _shares(model, regression, whole, each, minute, known, lead)
+        lead = shares if outcome == LEADING else lead
+        outcomes[:, COLUMN[outcome]] = PERCENT[outcome] * shares
     result[known] = model.joined(outcomes)[known, 0]
     return result
 
@@ -60,14 +60,14 @@ def _shares(
     each: Minutes,
     minute: NDArray[np.int64],
     known: NDArray[np.bool_],
-    tremor: Floats | None,
+    lead: Floats | None,
 ) -> Floats:
-    """Shares of one outcome, [T], over the members of its posterior; `tremor` [T] are those of the tremor."""
+    """Shares of one outcome, [T], over the members of its posterior; `lead` [T] are those of the outcome that this one follows."""
     of_session, of_steps = (burden_of(m, model.centre, model.spread) for m in (whole, each))
-    middle = None if tremor is None else np.asarray(tremor[known].mean())
+    middle = None if lead is None else np.asarray(lead[known].mean())
     total = np.zeros(known.size)
     for weight, member in zip(r.weights, r.members, strict=True):
-        own = r.predictor(member, each, of_steps, tremor, None)[0][:, 0]
+        own = r.predictor(member, each, of_steps, lead, None)[0][:, 0]
         parts = r.predictor(member, whole, of_session, middle, None)[0]
         at = parts[minute] if parts.size > 1 else np.broadcast_to(parts, own.shape)
         low, mean, high = (

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.outcomes import PREDICTED
+
 Floats = NDArray[np.float64]
 
 VERSION = 2
@@ -32,14 +34,13 @@ class ModelError:
 
 MODEL_ERRORS = {
     "steps": ModelError(0.0135, 0.03),
-    "grasp_hz": ModelError(0.10, 0.03),
-    "rating": ModelError(0.13, 0.08),
-    "tremor_percent": ModelError(0.25, 0.27),
-}
+} | {o.field: ModelError(*p.model_error) for o, p in PREDICTED}
 """By component, in the units of `error_unit`."""
 
-LEAST_TREMOR = 0.2
-"""Percentage points: the least unit of an error of tremor, for participants who never tremble."""
+LEAST_POINTS = 0.2
+"""Percentage points: the least unit of an error of a share of the minutes, for participants who never have them."""
+
+_OF_MINUTES = frozenset(o.field for o, p in PREDICTED if p.kind == "binomial")
 
 COMMON_SHARE = 0.6
 """Share of the error of a mean over few days, common to all policies, that is drawn: its prior of how days differ is wider than they do."""
@@ -48,7 +49,7 @@ COMMON_SHARE = 0.6
 def error_unit(component: str, expected: Floats, reach: float) -> Floats:
     """Unit of what structures get wrong, [P].
 
-    A share of time that is nearly 0 or 1 can hardly be wrong by ten points: an error of the tremor is one of its logit, and moves the share
+    A share of time that is nearly 0 or 1 can hardly be wrong by ten points: an error of it is one of its logit, and moves the share
     p by p (1 - p) of that.
 
     Args:
@@ -57,7 +58,7 @@ def error_unit(component: str, expected: Floats, reach: float) -> Floats:
     """
     if component == "steps":
         return np.full(expected.shape, reach)
-    if component == "tremor_percent":
+    if component in _OF_MINUTES:
         share = np.clip(expected / 100.0, 0.0, 1.0)
-        return np.asarray(np.maximum(100.0 * share * (1 - share), LEAST_TREMOR), dtype=np.float64)
+        return np.asarray(np.maximum(100.0 * share * (1 - share), LEAST_POINTS), dtype=np.float64)
     return np.ones(expected.shape)

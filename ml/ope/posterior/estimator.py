@@ -33,6 +33,7 @@ from ml.ope.posterior.verdict import NEARLY_OFF
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale
 from ml.ope.support.coverage import AmplitudeSupport
+from ml.outcomes import PREDICTED
 from ml.policies.policy import ConstantPolicy, Policy
 from ml.progress import Report, silent
 from ml.trajectories import ReplayBuffer
@@ -47,7 +48,7 @@ LEAST_DRAWS = 6
 LEAST_WEIGHT = 0.02
 """Structures below this weight have none."""
 
-LIMITS = {"energy": (0.0, 1.0), "grasp_hz": (0.0, np.inf), "rating": (1.0, 10.0), "tremor_percent": (0.0, 100.0)}
+LIMITS = {"energy": (0.0, 1.0)} | {o.field: o.limits for o, _ in PREDICTED}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,8 +212,7 @@ class FittedPosterior:
     @property
     def _parts(self) -> dict[str, float]:
         """What one unit of each QoC adds to the return."""
-        s = self.buffer.settings
-        parts = {"grasp_hz": s.c2, "rating": s.c3, "tremor_percent": -s.c4 / (100.0 if s.tremor_as_fraction else 1.0)}
+        parts = {o.field: o.end.per_unit(self.buffer.settings) for o, _ in PREDICTED if o.end is not None}
         return {name: weight for name, weight in parts.items() if weight}
 
     def _replays(self, policies: list[Policy], horizon: int, report: Report) -> Replays:

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from ml.designs import LOW_AMPLITUDE, NEAR_SPREAD, near_doses
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.support import FEWEST_SESSIONS, FEWEST_VISITS, NEAR
-from ml.ope.posterior.verdict import OUTCOMES, Levels, outcome_draws, slacks
+from ml.ope.posterior.verdict import Levels, outcome_draws, slacks
+from ml.outcomes import PREDICTED
 from ml.qoc import Margins, Qoc
 from ml.returns import actual_return
 from ml.trajectories import ReplayBuffer
@@ -141,7 +142,7 @@ def session_noise(buffer: ReplayBuffer) -> dict[str, float]:
         groups.setdefault((s.visit, s.controller, s.policy_id), []).append(s.qoc)
     steady = [rows for key, rows in groups.items() if key[1] != "random"]
     found = {}
-    for name in OUTCOMES:
+    for name in (o.field for o, _ in PREDICTED):
         for counted in (steady, list(groups.values())):
             deviation = _within_groups([[getattr(qoc, name) for qoc in rows] for rows in counted])
             if deviation:
@@ -286,7 +287,7 @@ def _shown(dose: float, cdbs: Estimate, held: Sequence[tuple[float, Estimate]]) 
     (low, lower), (high, upper) = rows[above - 1], rows[above]
     share = min(max((dose - low) / (high - low), 0.0), 1.0)
     found = {}
-    for name in OUTCOMES:
+    for name in (o.field for o, _ in PREDICTED):
         a, b, reference = (outcome_draws(e, name) for e in (lower, upper, cdbs))
         if a is not None and b is not None and reference is not None and a.size == b.size == reference.size:
             found[name] = (1 - share) * a + share * b - reference

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.outcomes import PREDICTED
 from ml.policies.policy import Policy
 
 Floats = NDArray[np.float64]
 
-QUANTITIES = ("return", "energy", "grasp_hz", "rating", "tremor_percent")
+QUANTITIES = ("return", "energy", *(o.field for o, _ in PREDICTED))
 """What a policy is judged by; the draws of each are aligned over policies and quantities."""
 
 LENGTH = 0.15

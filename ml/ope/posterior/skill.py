@@ -26,12 +26,12 @@ NO_BETTER, LEVELS, CONTRASTS = "no_better_than_equal", "levels_follow_dose", "co
 TOO_FEW = "too_few_left_out_sessions"
 MARGIN = 2.0
 """Squared errors of left-out sessions must fall by more than so many of their standard errors below those of calling all doses equal: of
-the reward by beta, or of one of grasp, rating and tremor.
+the reward by beta, or of one of the outcomes.
 
 From part A of the virtual population (60 worlds of 21 sessions, `benchmarks/development/verdicts.py`): an order is told in 82 % of the
 worlds with stratified sessions and 77 % with the paper's, and in 20 and 17 % of the data in which nothing answers to the amplitude. With
 r_end instead of the three outcomes and a margin of 1 for beta, as before, it was told in 65 and 62 %, and in 30 % where nothing answers:
-the noise of the rating hides in r_end what the grasp tells, and where no outcome counts in r_end nothing of them was asked."""
+the noise of one outcome hides in r_end what another tells, and where no outcome counts in r_end nothing of them was asked."""
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 """How much of the level of a visit may be told by its other sessions; the share that errs least counts."""
 CHANCE = 0.001
@@ -60,8 +60,8 @@ def ordering_skill(buffer: ReplayBuffer, predictions: HeldOut, equal: Floats, en
     """Predictions of left-out sessions against calling all doses equal, and against contrasts between controllers.
 
     The reward of the amplitude's price is known and orders nothing by itself. The level of a visit, or of the window before a session,
-    orders no doses either: what predictions are held against knows both. Beta may answer to nothing while outcomes do: where one of grasp,
-    rating and tremor of left-out sessions is predicted better than by its visit's level, that alone is skill. Outcomes are asked whether
+    orders no doses either: what predictions are held against knows both. Beta may answer to nothing while outcomes do: where an outcome
+    of left-out sessions is predicted better than by its visit's level, that alone is skill. Outcomes are asked whether
     or not they count in r_end, because verdicts rest on each of them.
 
     Args:

@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
 from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference
+from ml.outcomes import PREDICTED
 from ml.returns import actual_return
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
 
-LEAST_ERROR = {"return": 0.1, "energy": 0.005, "grasp_hz": 0.02, "rating": 0.25, "tremor_percent": 0.5}
+LEAST_ERROR = {"return": 0.1, "energy": 0.005} | {o.field: p.least_error for o, p in PREDICTED}
 """Smallest standard deviation of a session, by quantity: what its measurement resolves. Sessions that happen to agree prove no more."""
 
 PRIOR_FREEDOM = 3

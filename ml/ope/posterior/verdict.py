@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag
+from ml.outcomes import PREDICTED
 from ml.qoc import Margins
 
 Floats = NDArray[np.float64]
@@ -38,8 +39,6 @@ HAZARDS = frozenset({"adverse_event", "nearly_off", "beyond_margin"})
 
 SETTLED_BY_SESSIONS = frozenset({"undecided", "few_near_sessions", "few_near_visits"})
 """Deciding reasons of *cannot tell* that more sessions near a policy may settle; whether they would is simulated."""
-
-OUTCOMES = ("grasp_hz", "rating", "tremor_percent")
 
 
 @dataclass(frozen=True)
@@ -149,18 +148,14 @@ def slacks(own: Estimate, cdbs: Estimate, margins: Margins) -> dict[str, Floats]
         ValueError: draws of the policy and of cDBS that are not aligned.
     """
     found = {}
-    for name in OUTCOMES:
+    for outcome, _ in PREDICTED:
+        name = outcome.field
         ours, theirs = outcome_draws(own, name), outcome_draws(cdbs, name)
         if ours is None or theirs is None:
             continue
         if ours.size != theirs.size:
             raise ValueError(f"draws of {name} are not aligned: {ours.size} of the policy, {theirs.size} of cDBS")
-        if name == "grasp_hz":
-            found[name] = ours - (1 - margins.grasp_share) * theirs
-        elif name == "rating":
-            found[name] = ours - theirs + margins.rating_points
-        else:
-            found[name] = theirs + margins.tremor_points - ours
+        found[name] = outcome.slack(ours, theirs, margins.of(outcome))
     return found
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ml.ope.posterior.constants import LEAST_TREMOR, ModelError, error_unit
+from ml.ope.posterior.constants import LEAST_POINTS, ModelError, error_unit
 from ml.ope.posterior.estimator import Posterior, PosteriorConfig
 from ml.policies.policy import ConstantPolicy
 from tests.ml.ope.posterior.known_system import KnownSystem
@@ -16,7 +16,7 @@ POLICIES = {"half": ConstantPolicy(0.5), "cdbs": ConstantPolicy(1.0)}
 
 def test_a_share_of_time_that_is_nearly_none_or_all_is_hardly_wrong() -> None:
     found = error_unit("tremor_percent", np.array([0.0, 10.0, 50.0, 90.0, 100.0]), 80.0)
-    assert found == pytest.approx([LEAST_TREMOR, 9.0, 25.0, 9.0, LEAST_TREMOR])
+    assert found == pytest.approx([LEAST_POINTS, 9.0, 25.0, 9.0, LEAST_POINTS])
 
 
 def test_step_returns_err_in_units_of_what_they_can_reach_and_others_in_their_own() -> None:
