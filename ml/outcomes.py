@@ -7,7 +7,7 @@ and its margin (a migration). Source: Gao et al. 2023, section 3.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -104,7 +104,8 @@ class Outcome:
         unit: of a value. entry_unit: the same beside a field. difference_unit: of a change. contrast_unit: of the primary comparison.
         share: what share per cent are of; empty of other units. help: what is measured. explained: the same for a glossary.
         description: of the interface. exported: of the data package.
-        low, high: the range; an infinite `high` has no end. below: what a plausible value stays below; None where the range says it all.
+        low, high: the range; an infinite `high` has no end. below: what a value stays below that may be entered; None where any may.
+        usual: a value outside is asked about; None where none is. far: so is one that differs by so much from several of its visit.
         whole: values are whole numbers. decimals: of a shown value. mean_decimals: of a shown mean or change.
         higher_is_better: the better direction. margin: how much worse counts as no worse.
         failure: the value of a stopped session; None for the participant's worst measured one.
@@ -133,6 +134,8 @@ class Outcome:
     low: float
     high: float = math.inf
     below: float | None = None
+    usual: tuple[float, float] | None = None
+    far: float | None = None
     whole: bool = False
     decimals: int
     mean_decimals: int
@@ -229,6 +232,7 @@ OUTCOMES: tuple[Outcome, ...] = (
         exported="Grasp frequency, Hz, newest revision.",
         low=0.0,
         below=20.0,
+        usual=(0.3, 6.0),  # hands open and close about 1 to 4 times per second in Parkinson disease, seldom above 6 in health
         decimals=2,
         mean_decimals=2,
         higher_is_better=True,
@@ -268,6 +272,7 @@ OUTCOMES: tuple[Outcome, ...] = (
         exported="The participant's rating, 1 worst to 10 best, newest revision.",
         low=1.0,
         high=10.0,
+        far=5.0,
         whole=True,
         decimals=0,
         mean_decimals=1,
@@ -312,6 +317,7 @@ OUTCOMES: tuple[Outcome, ...] = (
         exported="Share of the session with mild or worse tremor, %, newest revision.",
         low=0.0,
         high=100.0,
+        usual=(0.0, 95.0),
         decimals=0,
         mean_decimals=0,
         higher_is_better=False,
@@ -346,3 +352,13 @@ PREDICTED: tuple[tuple[Outcome, Prediction], ...] = tuple((o, o.prediction) for 
 
 BY_KEY: Mapping[str, Outcome] = {o.key: o for o in OUTCOMES}
 BY_FIELD: Mapping[str, Outcome] = {o.field: o for o in OUTCOMES}
+
+
+def enumerated(words: Sequence[str], last: str = "and") -> str:
+    """Return words as a list within a sentence: `a, b and c`."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
+
+
+ALL = enumerated([o.noun for o in OUTCOMES])
+ANY = enumerated([o.noun for o in OUTCOMES], "or")
+"""Every outcome within a sentence: of all together, and of one of them."""

@@ -26,6 +26,7 @@ from app.study import service as study
 from app.study.models import Controller, Participant, StudySession, Visit
 from app.study.schemas import QocIn
 from app.study.threshold import mdp_settings
+from ml.outcomes import BY_FIELD
 from ml.population import SimulatedSession, run_session
 from ml.population.outcomes import GRASP_TEST_S, Outcomes
 
@@ -92,7 +93,7 @@ class VisitDay:
 
     def tremor(self, db: Session, session: StudySession, item: PlanItem, start_minute: float) -> None:
         """Enter the tremor of a confirmed session, as the watch gave it; what is known already stays."""
-        if session.qoc is not None and session.qoc.tremor_percent is not None:
+        if session.qoc is not None and session.qoc.value(BY_FIELD["tremor_percent"]) is not None:
             return
         # what was held before a stop is run again, on a tablet of its own: its time lies before that of the day's
         percent = self._run(db, item, start_minute, self.tablet / f"again-{item.position}").outcomes.qoc.tremor_percent

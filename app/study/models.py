@@ -15,7 +15,9 @@ from app.platform.database import ONE_STANDING, Base
 from app.study.characteristics.models import CharacteristicsVersion
 from app.study.doses.models import Dose
 from app.study.margins.models import MarginsLock, MarginsVersion
+from app.study.outcome_fields import add_value_columns, value_checks
 from app.study.sessions.models import Activity, SessionConditions
+from ml.outcomes import Outcome
 
 
 class Controller(StrEnum):
@@ -376,25 +378,28 @@ class Trace(Base):
 
 
 class QocRevision(Base):
-    """End-of-session QoCs of a session; a correction is a new revision."""
+    """End-of-session QoCs of a session, a column per outcome; a correction is a new revision."""
 
     __tablename__ = "qoc"
     __table_args__ = (
         UniqueConstraint("session_id", "revision"),
-        CheckConstraint("rating between 1 and 10", name="rating"),
-        CheckConstraint("tremor_percent between 0 and 100", name="tremor"),
-        CheckConstraint("grasp_hz >= 0 and grasp_hz < 20", name="grasp"),
+        *value_checks(),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
     session_id: Mapped[int] = mapped_column(ForeignKey("session.id", ondelete="CASCADE"), index=True)
     revision: Mapped[int]
-    grasp_hz: Mapped[float | None]
-    rating: Mapped[int | None] = mapped_column(SmallInteger)
-    tremor_percent: Mapped[float | None]
     entered_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
     derived: Mapped[list[Any]] = mapped_column(server_default="[]")
     """Names of the QoCs that stand in this revision as they were derived from uploaded files, not as a person typed them."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     session: Mapped[StudySession] = relationship(back_populates="qocs")
+
+    def value(self, outcome: Outcome) -> float | None:
+        """Return the value of an outcome; None where not measured."""
+        found: float | None = getattr(self, outcome.field)
+        return found
+
+
+add_value_columns(QocRevision)

@@ -13,10 +13,12 @@ from app.platform.signatures.schemas import SignatureOut, Signing
 from app.platform.signatures.service import SignatureState
 from app.platform.web.schemas import Bool, Day, Int, Model, Number, Text
 from app.study.models import Controller, Hemisphere
+from app.study.outcome_fields import DerivedField, EnteredOutcomes, OutcomeField, StoredOutcomes
 from app.study.sessions.models import Activity
 from app.study.settings.schemas import CDBS_MA, SettingsOut
 from app.study.usual.values import SURE
 from ml.designs import SessionDesign
+from ml.outcomes import OUTCOMES
 
 Code = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$")]
 
@@ -79,22 +81,16 @@ class VisitOut(Model):
     cdbs_amplitudes: list[CdbsAmplitudeOut]
 
 
-class QocIn(Model):
+class QocIn(EnteredOutcomes):
     """End-of-session QoCs; a value left out keeps what is known, null takes it back."""
 
-    grasp_hz: Number | None = Field(None, ge=0, lt=20, description="Grasp frequency, Hz.")
-    rating: Int | None = Field(None, ge=1, le=10, description="The participant's rating, 1-10.")
-    tremor_percent: Number | None = Field(None, ge=0, le=100, description="Share of the session with mild or worse tremor, %.")
     reason: Text | None = Field(None, max_length=1000, description="Why, when values are corrected.")
-    sure: list[Literal["grasp_hz", "rating", "tremor_percent"]] | None = Field(None, max_length=3, description=SURE)
+    sure: list[OutcomeField] | None = Field(None, max_length=len(OUTCOMES), description=SURE)
 
 
-class QocOut(Model):
+class QocOut(StoredOutcomes):
     """Newest revision of a session's QoCs."""
 
-    grasp_hz: float | None
-    rating: int | None
-    tremor_percent: float | None
     derived: list[str] = Field(description="Members that were derived from uploaded files and not typed.")
     revision: int
     entered_by: str
@@ -104,14 +100,14 @@ class QocOut(Model):
 class DerivedChoice(Model):
     """A derived QoC that shall replace what a person typed; `value` is the one that was shown."""
 
-    name: Literal["grasp_hz", "tremor_percent"]
+    name: DerivedField
     value: Number = Field(ge=0, le=100)
 
 
 class OutcomeOut(Model):
     """A QoC as uploaded files give it; null where they do not suffice, for the reason in `basis`."""
 
-    name: Literal["grasp_hz", "tremor_percent"]
+    name: DerivedField
     value: float | None
     unit: str
     basis: str

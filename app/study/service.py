@@ -19,7 +19,7 @@ from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision
 from app.study.outcomes import service as outcomes
 from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, QocIn, SessionChange, VisitChange, VisitIn
 from app.study.sessions import repeated
-from app.study.sessions.repository import other_ratings
+from app.study.sessions.repository import other_values
 from app.study.settings.schemas import SettingsIn
 from app.study.threshold import MDP_FIELDS
 from app.study.traces import NO_CONTROL, control_programs
@@ -27,6 +27,7 @@ from app.study.usual import questions
 from app.study.usual.values import Question, question
 from app.study.visits.service import require_unlocked
 from ml.mdp import MdpSettings
+from ml.outcomes import FIELDS, OUTCOMES, enumerated
 
 WITHDRAWN = "withdrawn"
 NOT_AFTER_WITHDRAWAL = frozenset(
@@ -128,12 +129,13 @@ def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller
     repository.lock_session(db, session)
     known = session.qoc
     given = values.model_dump(exclude_unset=True, exclude={"reason", "sure"})
-    merged = {name: getattr(known, name, None) for name in outcomes.QOC_FIELDS} | given
+    merged = {name: getattr(known, name, None) for name in FIELDS} | given
     if known is not None and all(getattr(known, name) == value for name, value in merged.items()):
         return known
     if known is None and all(value is None for value in merged.values()):
-        raise Invalid("No outcome was given.", "Enter at least one of grasp frequency, rating and tremor.")
-    questions.require_sure(given, values.sure, known, {"rating": other_ratings(db, session)})
+        raise Invalid("No outcome was given.", f"Enter at least one of {enumerated([o.label.lower() for o in OUTCOMES])}.")
+    others = {o.field: other_values(db, session, o) for o in OUTCOMES if o.far is not None}
+    questions.require_sure(given, values.sure, known, others)
     kept = [name for name in (known.derived if known else ()) if merged[name] == getattr(known, name)]
     return outcomes.add_revision(db, session, given, caller.label, values.reason, kept)
 

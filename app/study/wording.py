@@ -17,6 +17,7 @@ from app.study.sessions.designs import Drawn
 from app.study.sessions.models import Activity
 from app.study.settings.form import LABELS as SETTING_LABELS
 from app.study.usual.values import Question, Why
+from ml.outcomes import BY_FIELD, OUTCOMES
 
 DEVICE_NAMES = {"rcs": "RC+S", "percept": "Percept"}
 """Of kinds of devices that are not called by their own word."""
@@ -69,11 +70,18 @@ def unusual(asked: Question) -> str:
         case Why.SHARE:
             return f"{value}: less than one per cent. Was it meant as a share, {stated(100 * asked.value, 3)} %?"
         case Why.FAR_FROM_VISIT:
-            return f"{value}, where the other sessions of this visit have {usual}: 1 is worst, 10 is best. Is it right?"
+            return f"{value}, where the other sessions of this visit have {usual}: {_ends(asked.field)}. Is it right?"
         case Why.BELOW:
             return f"{value} is below what is usual ({usual}). Is it right?"
         case Why.ABOVE:
             return f"{value} is above what is usual ({usual}). Is it right?"
+
+
+def _ends(field: str) -> str:
+    """Which end of an outcome's scale is the worst, and which the best."""
+    outcome = BY_FIELD[field]
+    best = outcome.high if outcome.higher_is_better else outcome.low
+    return f"{outcome.worst_possible:g} is worst, {best:g} is best"
 
 
 CODE_QUESTIONS = {
@@ -85,9 +93,7 @@ CODE_HINT = "Choose a code that tells nothing about the person, or confirm that 
 CODE_CONFIRMED = "looked at by a person: a study code"
 
 QUERIED_FIELDS = {
-    "grasp_hz": "Grasp frequency",
-    "rating": "Rating",
-    "tremor_percent": "Tremor",
+    **{o.field: o.label for o in OUTCOMES},
     "controller": "Controller",
     "started_at": "Start",
     "hemisphere": "Hemisphere",

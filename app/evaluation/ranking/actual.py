@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ml.mdp import MdpSettings
+from ml.outcomes import FIELDS
 from ml.returns import ActualReturn, actual_return
 from ml.trajectories import SessionTrajectory
 
-QUANTITIES = ("energy", "mean_beta", "grasp_hz", "rating", "tremor_percent")
-"""What methods predict beside the return and sessions show: mean a^2, mean beta (participant's unit), grasp, rating, tremor."""
+QUANTITIES = ("energy", "mean_beta", *FIELDS)
+"""What methods predict beside the return and sessions show: mean a^2, mean beta (participant's unit), outcomes."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,7 @@ def _shown(session: SessionTrajectory) -> dict[str, float]:
     found = {
         "energy": float(np.mean(amplitude**2)) if amplitude.size else None,
         "mean_beta": float(beta.mean()) if beta.size else None,
-        "grasp_hz": session.qoc.grasp_hz,
-        "rating": session.qoc.rating,
-        "tremor_percent": session.qoc.tremor_percent,
+        **{name: getattr(session.qoc, name) for name in FIELDS},
     }
     return {name: float(value) for name, value in found.items() if value is not None}
 

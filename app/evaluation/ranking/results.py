@@ -21,6 +21,7 @@ from app.study import blinding
 from app.study import repository as study_repository
 from app.study.blinding import Arm
 from app.study.margins.models import MarginsVersion
+from app.study.margins.service import margins_of
 from app.study.models import Controller, Participant, SettingsVersion, StudySession
 from app.study.sessions.data import failed_qoc_of
 from app.study.sessions.repository import ReadOnce
@@ -28,11 +29,9 @@ from app.study.threshold import mdp_settings
 from app.study.traces import TracesOf, laid_out, traces_of
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
 from ml.mdp import MdpSettings
-from ml.qoc import Qoc
+from ml.outcomes import BY_FIELD, OUTCOMES, Outcome
+from ml.qoc import Margins, Qoc
 from ml.trajectories import SessionTrajectory
-
-WORST = {"grasp_hz": min, "rating": min, "tremor_percent": max}
-"""The outcomes of a session, each with what makes the worst of several."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +91,7 @@ def results_by_policy(ran: list[DrivenSession], settings: MdpSettings, horizon_s
             mean_end_reward=mean_of([a.end_reward for a in found]),
             energy=mean_of([a.energy for a in found]),
             mean_beta=mean_of([a.shown.get("mean_beta") for a in found]),
-            grasp_hz=mean_of([a.shown.get("grasp_hz") for a in found]),
-            rating=mean_of([a.shown.get("rating") for a in found]),
-            tremor_percent=mean_of([a.shown.get("tremor_percent") for a in found]),
+            **{o.field: mean_of([a.shown.get(o.field) for a in found]) for o in OUTCOMES},
         )
         for policy_id, found in results.items()
     }
@@ -181,14 +178,15 @@ def random_sessions(
         return None
     factor, unit = (100.0, "% of cDBS") if cdbs_ma is None else (cdbs_ma, "mA")
     held = settings.design != "paper"  # the paper's draws change every step and know no rule for low amplitudes
-    differences, worst, usual = {}, {}, {}
-    for name, worse in WORST.items():
+    differences, worst, usual, allowed = {}, {}, {}, margins_of(margins)
+    for outcome in OUTCOMES:
+        name = outcome.field
         pairs = [(_values(arms[Controller.RANDOM], name), _values(arms[Controller.CDBS], name)) for arms in by_visit.values()]
         both = [(fmean(ours), fmean(theirs)) for ours, theirs in pairs if ours and theirs]
         if both:
             differences[name], usual[name] = fmean(ours - theirs for ours, theirs in both), fmean(theirs for _, theirs in both)
         if values := _values(drawn, name):
-            worst[name] = worse(values)
+            worst[name] = outcome.worst(values)
     return RandomSessions(
         sessions=len(drawn),
         visits=len({s.visit_id for s in drawn}),
@@ -201,19 +199,13 @@ def random_sessions(
         low_minutes=LOW_SECONDS / 60,
         differences=differences,
         worst=worst,
-        beyond=tuple(name for name, apart in differences.items() if _loss(name, apart) > _allowed(name, margins, usual[name])),
+        beyond=tuple(name for name, apart in differences.items() if _is_beyond(BY_FIELD[name], apart, allowed, usual[name])),
     )
 
 
-def _loss(name: str, difference: float) -> float:
-    """By how much an outcome is worse, in its unit: more tremor, less of the others."""
-    return difference if name == "tremor_percent" else -difference
-
-
-def _allowed(name: str, margins: MarginsVersion, under_cdbs: float) -> float:
-    """The margin of an outcome in its unit."""
-    of = {"grasp_hz": margins.grasp_share * under_cdbs, "rating": margins.rating_points, "tremor_percent": margins.tremor_points}
-    return of[name]
+def _is_beyond(outcome: Outcome, difference: float, margins: Margins, under_cdbs: float) -> bool:
+    """Whether an outcome is worse by more than its margin."""
+    return bool(outcome.loss(difference) > outcome.margin.amount(margins.of(outcome), under_cdbs))
 
 
 def _values(sessions: Sequence[StudySession], name: str) -> list[float]:

@@ -9,6 +9,7 @@ from datetime import date, datetime
 from typing import Any
 
 from app import __version__
+from ml.outcomes import ANY, OUTCOMES
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,10 @@ class Days:
         return None if day is None else (day - self._enrolled.date()).days
 
 
+_INDENT = "\n        "
+_VALUES = _INDENT.join(f"{o.column} {'integer' if o.whole else 'number'} {o.exported}" for o in OUTCOMES)
+_MARGINS = _INDENT.join(f"{o.margin.field} number {o.margin.exported}" for o in OUTCOMES)
+
 TITLES = {
     "sessions": "one row per confirmed session",
     "steps": "beta and amplitude on the 2 s grid of every session",
@@ -42,6 +47,7 @@ TITLES = {
     "policies": "every policy of the participant",
     "estimates": "every estimate of a return, with its interval",
     "coverage": "what the data could say about each policy, checked before it was estimated",
+    "outcomes": "what outcomes are called, which way is better, and how they are compared",
     "doses": "medication taken at each visit; times since a dose count those of drugs whose effect comes and goes within hours",
     "margins": "versions of the non-inferiority margins, and when they were locked",
     "primary": "controllers and policies against the same visit's cDBS; recompute.py checks those of controllers",
@@ -55,7 +61,7 @@ def _fields(text: str) -> tuple[Field, ...]:
 
 
 FIELDS: dict[str, tuple[Field, ...]] = {
-    "sessions": _fields("""
+    "sessions": _fields(f"""
         session_id integer Number of the session.
         visit integer Number of the visit.
         ordinal integer Place in the visit.
@@ -74,9 +80,7 @@ FIELDS: dict[str, tuple[Field, ...]] = {
         stopped_reason string Why it was stopped for the patient's sake; a failure of its controller.
         hours_since_dose number Hours from the last dose to its start, as stated, else by doses.csv.
         activity string What the participant did in the half hour before: rest, light, exercise, meal or sleep.
-        grasp_hz number Grasp frequency, Hz, newest revision.
-        rating_1_10 integer The participant's rating, 1 worst to 10 best, newest revision.
-        tremor_percent number Share of the session with mild or worse tremor, %, newest revision.
+        {_VALUES}
         qoc_revision integer Revision of these QoCs.
         problem string Why it has no steps; such a session counts in no analysis.
     """),
@@ -129,6 +133,16 @@ FIELDS: dict[str, tuple[Field, ...]] = {
         limit_is string least or greatest.
         verdict string Outcome of the check.
     """),
+    "outcomes": _fields("""
+        outcome string Name of the outcome in primary.csv and noninferiority.csv.
+        column string Its column in sessions.csv.
+        unit string Its unit.
+        higher_is_better boolean Whether more is better.
+        resolution number Step between neighbouring values; 0 where it is continuous.
+        bounded boolean Whether sessions reach an end of its scale.
+        ordinal boolean Whether pairs are compared, and no differences.
+        failure number Value of a session that was stopped for the patient's sake; empty of the worst that any session measured.
+    """),
     "doses": _fields("""
         visit integer Number of the visit.
         drug string What was taken.
@@ -136,21 +150,19 @@ FIELDS: dict[str, tuple[Field, ...]] = {
         levodopa_equivalent_mg number What it counts as, mg of levodopa; empty where no equivalent is stated.
         taken_day number When it was taken, days since enrolment.
     """),
-    "margins": _fields("""
+    "margins": _fields(f"""
         version integer Version of the margins.
-        grasp_share number Grasp may be slower by this share of the frequency under cDBS.
-        rating_points number The rating may be lower by this.
-        tremor_points number Tremor may take up this many more percentage points.
+        {_MARGINS}
         created_day number Days since enrolment.
         locked_day number When this version was locked, days since enrolment; empty where it was not.
     """),
-    "primary": _fields("""
+    "primary": _fields(f"""
         controller string Controller.
         policy_id integer Policy; empty for the controller with all its policies.
         name string Its name.
         role string planned (adjusted by Holm) or exploration (by Benjamini and Hochberg).
         basis string all, confirmation or selection: which sessions of a policy count.
-        metric string energy (mean squared amplitude fraction), mean_beta, grasp, rating or tremor.
+        metric string energy (mean squared amplitude fraction), mean_beta, {ANY}.
         unit string Unit of the metric.
         estimate number Average over visits of the controller's mean less that of the same visit's cDBS.
         low number Lower end of its interval.
@@ -169,16 +181,16 @@ FIELDS: dict[str, tuple[Field, ...]] = {
         adjustment string What the contrasts are freed from.
         not_available string Why there is no number.
     """),
-    "noninferiority": _fields("""
+    "noninferiority": _fields(f"""
         controller string Controller.
         confirmatory boolean Whether the margins were locked before every session that it rests on.
         margins_version integer Version of the margins that it goes by, in margins.csv.
         locked_day number When these margins were locked, days since enrolment; empty where nobody locked them.
         superseded_day number When a newer lock followed, days since enrolment; empty of the margins in force.
-        outcome string grasp, rating or tremor.
+        outcome string {ANY}, in outcomes.csv.
         margin number Largest loss that is accepted, in the unit of the outcome.
-        grasp_share number The margin of grasp as a share of the frequency under cDBS.
-        estimate number Average over visits, turned so that higher is better; of the rating the share of pairs won once the margin is added.
+        margin_share number The margin as a share of the value under cDBS; empty where it is none.
+        estimate number Average over visits, turned so that higher is better; of ordinal ones the share of pairs won with the margin added.
         p_non_inferior number One-sided, of a loss of the margin or more.
         failures integer Sessions of the controller that were stopped for the patient's sake.
         visits string Visits whose sessions it rests on.

@@ -32,6 +32,8 @@ from app.study.doses.since import hours_since_dose
 from app.study.models import Participant
 from app.study.sessions.data import session_data
 from app.study.settings.schemas import SettingsOut
+from ml.outcomes import BY_KEY, OUTCOMES, Outcome
+from ml.qoc import Margins
 from ml.statistics.within_visits.contrasts import Average
 
 
@@ -59,6 +61,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
         "doses": _dose_rows(participant, day),
         "primary": [row[1:] for row in csv_rows(found)],
         "noninferiority": _noninferiority_rows(found, day),
+        "outcomes": _outcome_rows(),
     }
     settings = [SettingsOut.model_validate(s).model_dump(mode="json", exclude={"created_at"}) for s in participant.settings]
     contents = {
@@ -100,7 +103,7 @@ def _sessions(
              day.of(session.started_at), day.of(session.created_at), session.duration_s, beta and beta.unit, beta and beta.source,
              session.id in compared, table and table.cdbs_ma, table and table.above_one, session.excluded_reason, session.stopped_reason,
              hours_since_dose(session), session.activity,
-             qoc and qoc.grasp_hz, qoc and qoc.rating, qoc and qoc.tremor_percent, qoc and qoc.revision, problem)
+             *(qoc and qoc.value(o) for o in OUTCOMES), qoc and qoc.revision, problem)
         )  # fmt: skip
         if table is not None:
             rows = zip(table.t_s, table.beta, table.amplitude_ma, table.fraction, strict=True)
@@ -111,9 +114,18 @@ def _sessions(
 def _margin_rows(participant: Participant, day: Days) -> list[tuple[Any, ...]]:
     locked = {lock.margins_version_id: lock.created_at for lock in participant.margins_locks}
     return [
-        (m.version, m.grasp_share, m.rating_points, m.tremor_points, day.of(m.created_at), day.of(locked.get(m.id)))
+        (m.version, *(getattr(m, o.margin.field) for o in OUTCOMES), day.of(m.created_at), day.of(locked.get(m.id)))
         for m in participant.margins
     ]
+
+
+def _outcome_rows() -> list[tuple[Any, ...]]:
+    return [(o.key, o.column, o.unit, o.higher_is_better, o.resolution, o.bounded, o.scale == "ordinal", o.failure) for o in OUTCOMES]
+
+
+def _share(outcome: Outcome, margins: Margins) -> float | None:
+    """Return the margin of an outcome as a share of the value under cDBS; None where it is none."""
+    return margins.of(outcome) if outcome.margin.kind == "share" else None
 
 
 def _dose_rows(participant: Participant, day: Days) -> list[tuple[Any, ...]]:
@@ -131,7 +143,7 @@ def _noninferiority_rows(found: Primary, day: Days) -> list[tuple[Any, ...]]:
         under = lock.version, day.of(lock.locked_at), day.of(lock.until)
         for o in v.assessment.outcomes if v.assessment else ():
             estimate = o.average.estimate if isinstance(o.average, Average) else None
-            judged = o.name, o.margin, lock.margins.grasp_share, estimate, o.p_non_inferior, o.failures
+            judged = o.name, o.margin, _share(BY_KEY[o.name], lock.margins), estimate, o.p_non_inferior, o.failures
             rows.append((v.controller.value, v.confirmatory, *under, *judged, drawn))
     return rows
 

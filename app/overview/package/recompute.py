@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,11 +21,7 @@ from scipy.stats import rankdata, t
 Row = dict[str, str]
 KNOWN_SHARE = 0.5
 UNBALANCED = 0.5
-RESOLUTION = {"rating": 1.0, "tremor": 1.0, "energy": 0.05}
-BOUNDED = ("rating", "tremor")
-COLUMNS = {"grasp": "grasp_hz", "rating": "rating_1_10", "tremor": "tremor_percent"}
-WORST = {"rating": 1.0, "tremor": 100.0}
-HIGHER_IS_BETTER = {"grasp": True, "rating": True, "tremor": False}
+ENERGY_RESOLUTION = 0.05
 TOLERANCE = 1e-6
 
 
@@ -40,7 +36,32 @@ def number(text: str) -> float:
     return float(text) if text else math.nan
 
 
-def metrics(folder: Path) -> list[dict[str, Any]]:
+class Outcome(NamedTuple):
+    """One row of outcomes.csv; `failure` is the value of a stopped session, NaN where no session says what the worst is."""
+
+    column: str
+    higher_is_better: bool
+    resolution: float
+    bounded: bool
+    ordinal: bool
+    failure: float
+
+
+def outcomes_of(folder: Path) -> dict[str, Outcome]:
+    """The outcomes by name. A failure without a stated value counts as the worst of all sessions that nobody excluded."""
+    found = {}
+    for row in read(folder, "outcomes.csv"):
+        better, failure = row["higher_is_better"] == "true", number(row["failure"])
+        if math.isnan(failure):
+            measured = [number(s[row["column"]]) for s in read(folder, "sessions.csv") if not s["excluded_reason"]]
+            failure = (min if better else max)((v for v in measured if math.isfinite(v)), default=math.nan)
+        found[row["outcome"]] = Outcome(
+            row["column"], better, float(row["resolution"]), row["bounded"] == "true", row["ordinal"] == "true", failure
+        )
+    return found
+
+
+def metrics(folder: Path, outcomes: Mapping[str, Outcome]) -> list[dict[str, Any]]:
     """Every session that counts, with its metrics: energy is the mean of a^2, both it and beta from at least half of the steps."""
     steps: dict[str, list[Row]] = {}
     for row in read(folder, "steps.csv"):
@@ -53,7 +74,7 @@ def metrics(folder: Path) -> list[dict[str, Any]]:
         mine = steps.get(s["session_id"], [])
         a = np.array([number(r["amplitude_fraction"]) for r in mine])
         beta = np.array([number(r["beta"]) for r in mine])
-        values: dict[str, float] = {name: number(s[column]) for name, column in COLUMNS.items()}
+        values: dict[str, float] = {name: number(s[o.column]) for name, o in outcomes.items()}
         values["energy"] = float(np.nanmean(a**2)) if known(a) else math.nan
         values["mean_beta"] = float(np.nanmean(beta)) if known(beta) and s["beta_compared"] == "true" else math.nan
         session: dict[str, Any] = dict(s)
@@ -207,16 +228,19 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return adjusted
 
 
-def primary_table(sessions: Sequence[dict[str, Any]], controllers: Sequence[str]) -> dict[tuple[str, str], dict[str, float]]:
+def primary_table(
+    sessions: Sequence[dict[str, Any]], controllers: Sequence[str], outcomes: Mapping[str, Outcome]
+) -> dict[tuple[str, str], dict[str, float]]:
     """Primary result and the paper's test, by controller and metric."""
     found: dict[tuple[str, str], dict[str, float]] = {}
     for controller in controllers:
         taken = [s for s in sessions if s["controller"] in (controller, "cdbs")]
-        for metric in ("energy", "mean_beta", "grasp", "rating", "tremor"):
+        for metric in ("energy", "mean_beta", *outcomes):
             tested = [s["controller"] == controller for s in taken]
             c = Contrasts([s[metric] for s in taken], [s["visit"] for s in taken], tested, [s["order"] for s in taken])
             row: dict[str, float] = {}
-            result = primary(c, RESOLUTION.get(metric, 0.0), metric in BOUNDED)
+            of = outcomes.get(metric)
+            result = primary(c, of.resolution if of else ENERGY_RESOLUTION * (metric == "energy"), of is not None and of.bounded)
             if result is not None:
                 low, high = result.interval()
                 row = {"estimate": result.estimate, "low": low, "high": high, "p": result.p_value()}
@@ -232,39 +256,31 @@ def primary_table(sessions: Sequence[dict[str, Any]], controllers: Sequence[str]
     return found
 
 
-def worst_grasp(folder: Path) -> float:
-    """Return the slowest grasp of all sessions that nobody excluded, which a stopped session counts as; NaN without one."""
-    measured = [number(s["grasp_hz"]) for s in read(folder, "sessions.csv") if not s["excluded_reason"]]
-    return min((v for v in measured if math.isfinite(v)), default=math.nan)
-
-
-def noninferiority(sessions: Sequence[dict[str, Any]], row: Row, grasp_share: float, slowest: float) -> dict[str, float]:
+def noninferiority(sessions: Sequence[dict[str, Any]], row: Row, outcome: Outcome) -> dict[str, float]:
     """One outcome of one verdict: a stopped session of the controller counts as the worst; the one-sided p of a loss of the margin or more.
 
-    The margin of grasp is a share of cDBS: the cDBS values are lowered by that share and lifted by the margin. Ratings of the controller
-    are raised by the margin, and must then win at least half of the pairs with the same visit's cDBS.
+    Where the margin is a share of cDBS, the cDBS values are made worse by that share and better by the margin. Ordinal values of the
+    controller are made better by the margin, and must then win at least half of the pairs with the same visit's cDBS.
     """
-    visits, outcome, controller = {int(v) for v in row["visits"].split()}, row["outcome"], row["controller"]
+    visits, controller = {int(v) for v in row["visits"].split()}, row["controller"]
     taken = [s for s in sessions if s["visit"] in visits and s["controller"] in (controller, "cdbs")]
-    margin, sign = float(row["margin"]), 1.0 if HIGHER_IS_BETTER[outcome] else -1.0
+    margin, sign = float(row["margin"]), 1.0 if outcome.higher_is_better else -1.0
     tested = np.array([s["controller"] == controller for s in taken])
-    value = np.array([s[outcome] for s in taken])
-    if outcome == "grasp":
-        value = np.where(tested, value, (1 - grasp_share) * value + margin)
+    value = np.array([s[row["outcome"]] for s in taken])
+    if row["margin_share"]:
+        value = np.where(tested, value, (1 - sign * float(row["margin_share"])) * value + sign * margin)
     value = sign * value
     failed = tested & np.array([bool(s["stopped_reason"]) for s in taken])
-    ordinal = outcome == "rating"
-    if ordinal:
+    if outcome.ordinal:
         value = np.where(tested, value + margin, value)
-    value = np.where(failed, sign * WORST.get(outcome, slowest), value)
+    value = np.where(failed, sign * outcome.failure, value)
     c = Contrasts(value.tolist(), [s["visit"] for s in taken], tested.tolist(), [s["order"] for s in taken])
     if len(c.arms) < 3:
         return {}
-    resolution = RESOLUTION.get(outcome, 0.0)
-    candidates = [primary(c, resolution, False, ordinal)]
+    candidates = [primary(c, outcome.resolution, False, outcome.ordinal)]
     if failed.any():
-        candidates.append(average(c, resolution, False, False, ordinal))  # a drift must not explain a failure away
-    loss = 0.5 if ordinal else -margin
+        candidates.append(average(c, outcome.resolution, False, False, outcome.ordinal))  # a drift must not explain a failure away
+    loss = 0.5 if outcome.ordinal else -margin
     found = [(one.estimate, one.p_above(loss)) for one in filter(None, candidates)]
     if not found:
         return {}
@@ -281,9 +297,10 @@ def differs(stored: str, computed: float | None) -> bool:
 
 def main(folder: Path) -> int:
     """Compute, write, compare."""
-    sessions = metrics(folder)
+    outcomes = outcomes_of(folder)
+    sessions = metrics(folder, outcomes)
     stored = [r for r in read(folder, "primary.csv") if not r["policy_id"]]
-    table = primary_table(sessions, list(dict.fromkeys(r["controller"] for r in stored)))
+    table = primary_table(sessions, list(dict.fromkeys(r["controller"] for r in stored)), outcomes)
     wrong = []
     with (folder / "recomputed.csv").open("w", newline="", encoding="utf-8") as file:
         out = csv.writer(file)
@@ -297,10 +314,10 @@ def main(folder: Path) -> int:
             wrong += [
                 f"{r['controller']} {r['metric']} {n}: {r[n]} stored, {mine.get(n)} here" for n in checked if differs(r[n], mine.get(n))
             ]
-    count, slowest = len(stored), worst_grasp(folder)
+    count = len(stored)
     for r in read(folder, "noninferiority.csv"):
         count += 1
-        again = noninferiority(sessions, r, float(r["grasp_share"]), slowest)
+        again = noninferiority(sessions, r, outcomes[r["outcome"]])
         named = f"{r['controller']} {r['outcome']} (margins_version {r['margins_version']}, confirmatory {r['confirmatory']})"
         wrong += [f"{named} {n}: {r[n]} stored, {again.get(n)} here" for n in ("estimate", "p_non_inferior") if differs(r[n], again.get(n))]
     said = "\n".join(wrong) if wrong else f"{count} rows of primary.csv and noninferiority.csv recomputed: all agree."

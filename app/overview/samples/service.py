@@ -25,6 +25,7 @@ from app.settings import get_settings
 from app.study import blinding
 from app.study.models import Recording, StudySession
 from app.study.traces import recorded_traces, session_offset_s
+from ml.outcomes import OUTCOMES
 
 WRITE = "app.overview.samples.compute:write"
 """What the child runs."""
@@ -109,9 +110,7 @@ def _params(db: Session, session: StudySession, caller: Caller, folder: Path) ->
         "control_stream": session.control_stream,
         "control_channel": session.control_channel,
         "excluded": session.excluded_reason is not None,
-        "grasp_hz": qoc and qoc.grasp_hz,
-        "rating": qoc and qoc.rating,
-        "tremor_percent": qoc and qoc.tremor_percent,
+        **{o.field: qoc and qoc.value(o) for o in OUTCOMES},
     }
     return {"files": files_of(db, session), "traces": str(folder / "traces.npz"), "headers": headers, "session": about}
 

@@ -13,12 +13,12 @@ from app.study.data_queries.models import Subject
 from app.study.doses.models import Dose
 from app.study.models import Hemisphere, Participant, StudySession, Visit
 from app.study.settings.schemas import SettingsFields
+from ml.outcomes import FIELDS as OUTCOME_FIELDS
 
 OTHER = "other"
 """Anything else, said in the text."""
-QOC_FIELDS = ("grasp_hz", "rating", "tremor_percent")
 FIELDS: Mapping[Subject, tuple[str, ...]] = {
-    Subject.SESSION: (*QOC_FIELDS, "controller", "started_at", "hemisphere", "medication_h", "stopped_reason", OTHER),
+    Subject.SESSION: (*OUTCOME_FIELDS, "controller", "started_at", "hemisphere", "medication_h", "stopped_reason", OTHER),
     Subject.UPLOAD: ("file", OTHER),
     Subject.VISIT: ("date", "cdbs_left", "cdbs_right", "note", OTHER),
     Subject.DOSE: ("drug", "mg", "taken_at", OTHER),
@@ -47,7 +47,7 @@ def value_of(subject: Subject, field: str, found: Found) -> str | None:
 
 
 def _of_session(session: Any, field: str) -> Any:
-    return getattr(session.qoc, field, None) if field in QOC_FIELDS else getattr(session, field)
+    return getattr(session.qoc, field, None) if field in OUTCOME_FIELDS else getattr(session, field)
 
 
 def _of_visit(visit: Any, field: str) -> Any:

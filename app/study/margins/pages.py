@@ -20,17 +20,14 @@ from app.study.margins.schemas import MarginsIn, MarginsLockFields
 from app.study.models import Participant
 from app.study.service import may
 from app.study.settings.form import SettingField, SettingGroup, history, texts
+from ml.outcomes import OUTCOMES
 
 router = APIRouter()
 
 GROUPS = (
     SettingGroup(
         "Margins: no worse than under cDBS",
-        (
-            SettingField("grasp_share", "Grasp slower by", "Share of the grasp frequency under cDBS, 0.1 being 10 %.", "of cDBS"),
-            SettingField("rating_points", "Rating lower by", "On the participant's scale of 1 to 10.", "points"),
-            SettingField("tremor_points", "Tremor more by", "Of the time: 10 allows 30 % where cDBS has 20 %.", "% points"),
-        ),
+        tuple(SettingField(m.field, m.label, m.help, m.form_unit) for m in (o.margin for o in OUTCOMES)),
     ),
     SettingGroup(
         "When a policy is worth a test",

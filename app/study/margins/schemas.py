@@ -9,12 +9,12 @@ from pydantic import ConfigDict, Field, ValidationInfo, field_validator
 from app.platform.signatures.schemas import SignatureOut, Signing
 from app.platform.signatures.service import SignatureState
 from app.platform.web.schemas import Int, Model, Number, Text
+from app.study.outcome_fields import StatedMargins
 from app.study.settings.schemas import Bound, published
+from ml.outcomes import OUTCOMES
 
 BOUNDS = {
-    "grasp_share": Bound(0.01, 0.5, "of the grasp frequency under cDBS"),
-    "rating_points": Bound(0.1, 5, "points"),
-    "tremor_points": Bound(0.5, 50, "percentage points"),
+    **{o.margin.field: Bound(o.margin.least, o.margin.most, o.margin.unit) for o in OUTCOMES},
     "test_within": Bound(0.5, 0.99),
     "test_saves": Bound(0.5, 0.99),
     "unsafe_beyond": Bound(0.05, 0.9),
@@ -23,12 +23,9 @@ BOUNDS = {
 """What may be stated. A level of *unsafe* above 0.9 would let a policy pass that is nearly surely worse."""
 
 
-class MarginsFields(Model):
+class MarginsFields(StatedMargins):
     """By how much an outcome may be worse than under cDBS, and how sure a proposal must be of it."""
 
-    grasp_share: Number = Field(0.10, description="Grasp may be slower by this share of the frequency under cDBS.")
-    rating_points: Number = Field(1.0, description="The rating may be lower by this many points.")
-    tremor_points: Number = Field(10.0, description="Tremor may take up this many more percentage points of the time.")
     test_within: Number = Field(0.8, description="Probability of keeping all outcomes within the margins from which a test is proposed.")
     test_saves: Number = Field(0.9, description="Probability of using less energy than cDBS from which a test is proposed.")
     unsafe_beyond: Number = Field(0.5, description="Probability that an outcome lies beyond its margin from which a policy is unsafe.")

@@ -14,12 +14,13 @@ from app.study.margins import sign_off
 from app.study.margins.models import MarginsLock, MarginsVersion
 from app.study.margins.schemas import MarginsIn
 from app.study.models import Participant
+from ml.outcomes import OUTCOMES
 from ml.qoc import Margins
 
 
 def margins_of(version: MarginsVersion) -> Margins:
     """The margins of a version, for science."""
-    return Margins(version.grasp_share, version.rating_points, version.tremor_points)
+    return Margins(**{o.margin.field: getattr(version, o.margin.field) for o in OUTCOMES})
 
 
 def change_margins(db: Session, participant: Participant, change: MarginsIn, reason: str, caller: Caller) -> MarginsVersion:

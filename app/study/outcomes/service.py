@@ -27,9 +27,8 @@ from app.study.outcomes import values as outcome_values
 from app.study.outcomes.models import GraspTest, TremorSeries
 from app.study.outcomes.tremor import Minutes
 from app.study.outcomes.values import Derived
+from ml.outcomes import FIELDS
 from ml.qoc import TREMOR_CLASSES
-
-QOC_FIELDS = ("grasp_hz", "rating", "tremor_percent")
 
 
 @dataclass(frozen=True)
@@ -224,7 +223,7 @@ def add_revision(
 ) -> QocRevision:
     """A new revision under the session's lock: `given` values, the others as they are; `derived` names those that come from files."""
     known = session.qoc
-    merged = {name: getattr(known, name, None) for name in QOC_FIELDS} | dict(given)
+    merged = {name: getattr(known, name, None) for name in FIELDS} | dict(given)
     set_reason(db, reason)
     revision = QocRevision(
         session_id=session.id,

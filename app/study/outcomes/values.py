@@ -18,9 +18,8 @@ from app.study.outcomes import repository as of_files
 from app.study.outcomes import tremor
 from app.study.outcomes.models import GraspTest
 from app.study.outcomes.tremor import SessionMinutes
+from ml.outcomes import BY_FIELD
 from ml.qoc import PLAUSIBLE_INTERVAL_S, TremorReading, grasp_frequency, read_tremor
-
-LABELS = {"grasp_hz": ("Grasp frequency", "Hz"), "tremor_percent": ("Tremor", "%")}
 
 MIN_COVERAGE = 0.9
 """Share of a session that minutes must cover. What they do not cover counts as time without tremor (the paper divides by the whole
@@ -28,9 +27,6 @@ session), so that with less the QoC would say too little."""
 
 MAX_UNKNOWN = 0.5
 """Share of a session that the watch may call unknown (active movement). It counts as time without tremor too, by the same division."""
-
-MAX_GRASP_HZ = 20.0
-"""No hand opens and closes this often; a tracker that says so has lost it."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +46,12 @@ class Derived:
     @property
     def label(self) -> str:
         """The QoC as a page names it."""
-        return LABELS[self.name][0]
+        return BY_FIELD[self.name].label
 
     @property
     def unit(self) -> str:
         """Its unit."""
-        return LABELS[self.name][1]
+        return BY_FIELD[self.name].entry_unit
 
     @property
     def sentence(self) -> str:
@@ -217,7 +213,8 @@ def _grasp_value(counted: list[GraspView], how: str) -> tuple[float | None, str]
         basis += f", {odd} intervals outside {low:g} to {high:g} s counted"
         left = f"without them {stated(float(np.mean(without)), 4)} Hz" if len(without) == len(counted) else "nothing left without them"
         basis += f", {left}"
-    if value >= MAX_GRASP_HZ:
+    fastest = BY_FIELD["grasp_hz"].below  # a tracker that gives more has lost the hand
+    if fastest is not None and value >= fastest:
         return None, f"{basis}; {stated(value, 4)} Hz is faster than any hand"
     return value, basis
 

@@ -38,10 +38,11 @@ from app.study.traces import NO_CONTROL, control_programs, session_offset_s
 from app.study.visits.blinded import blinded_page
 from app.study.wording import ACTIVITIES, DEVICE_NAMES, EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
 from ml.energy import relative_energy
+from ml.outcomes import FIELDS, OUTCOMES
 
 router = APIRouter()
 
-_QOC_LABELS = {"grasp_hz": "Grasp frequency", "rating": "Rating", "tremor_percent": "Tremor", "reason": "Reason"}
+_QOC_LABELS = {o.field: o.label for o in OUTCOMES} | {"reason": "Reason"}
 _CORRECTION_LABELS = {
     "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "control": "Control trace", "correction_reason": "Reason",
     "control_program": "Program",
@@ -239,7 +240,7 @@ def _qoc_revisions(session: StudySession) -> list[Shown]:
 
 def _shown_qoc(revision: QocRevision | None) -> dict[str, str]:
     """QoCs as the form shows them."""
-    values = {n: getattr(revision, n, None) for n in ("grasp_hz", "rating", "tremor_percent")}
+    values = {n: getattr(revision, n, None) for n in FIELDS}
     return {name: typed(value) for name, value in values.items()}
 
 

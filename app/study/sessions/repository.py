@@ -32,6 +32,7 @@ from app.study.doses.models import Dose
 from app.study.models import CdbsAmplitude, QocRevision, Recording, SessionSegment, SettingsVersion, StudySession, Trace, Visit
 from app.study.repository import CONFIRMED, sessions_of_participant
 from app.study.sessions.models import CountedTime, SessionConditions
+from ml.outcomes import Outcome
 
 
 def fingerprints(db: Session, participant_ids: Collection[int]) -> dict[int, str]:
@@ -130,12 +131,13 @@ def slot_head(db: Session, participant_id: int, slot_id: int) -> SlotHead | None
     return None if row is None else SlotHead(*row)
 
 
-def other_ratings(db: Session, session: StudySession) -> list[float]:
-    """The newest ratings of the visit's other confirmed sessions that have one."""
+def other_values(db: Session, session: StudySession, outcome: Outcome) -> list[float]:
+    """The newest values of an outcome in the visit's other confirmed sessions that have one."""
     mine = (StudySession.visit_id == session.visit_id) & (StudySession.status == "confirmed") & (StudySession.id != session.id)
-    revisions = select(QocRevision.session_id, QocRevision.rating).join(StudySession, StudySession.id == QocRevision.session_id).where(mine)
-    newest = {row.session_id: row.rating for row in db.execute(revisions.order_by(QocRevision.revision))}
-    return [float(rating) for rating in newest.values() if rating is not None]
+    value = getattr(QocRevision, outcome.field)
+    revisions = select(QocRevision.session_id, value).join(StudySession, StudySession.id == QocRevision.session_id).where(mine)
+    newest = {row[0]: row[1] for row in db.execute(revisions.order_by(QocRevision.revision))}
+    return [float(found) for found in newest.values() if found is not None]
 
 
 SLACK_S = 2.0

@@ -8,7 +8,7 @@ from typing import Any
 
 from app.platform.errors import Invalid
 from app.study import wording
-from app.study.usual.values import USUAL, Question, question
+from app.study.usual.values import FAR, USUAL, Question, question
 
 
 class Unusual(Invalid):
@@ -34,7 +34,7 @@ def require_sure(
     asked = [
         question(name, value, (others or {}).get(name, ()))
         for name, value in given.items()
-        if (name in USUAL or name == "rating") and value != getattr(known, name, None)
+        if (name in USUAL or name in FAR) and value != getattr(known, name, None)
     ]
     refuse(replace(q, confirmed=q.field in sure) for q in asked if q is not None)
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
+from ml.outcomes import OUTCOMES
+
 SURE = (
     "Values outside the usual that a person has looked at: they are right. Where it is given, an empty list too, other unusual values are"
     " refused with `questions` (422); left out, as by a program that can ask nobody, values are kept as they are."
@@ -21,7 +23,7 @@ class Why(StrEnum):
     SHARE = "share_not_percent"
     """Between 0 and 1 where per cent are asked for."""
     FAR_FROM_VISIT = "far_from_visit"
-    """A rating far from every other one of the visit: the scale may have been read the other way round."""
+    """Far from every other value of the visit: the scale may have been read the other way round."""
 
 
 class Usual(NamedTuple):
@@ -32,14 +34,11 @@ class Usual(NamedTuple):
     unit: str
 
 
-USUAL = {
-    "grasp_hz": Usual(0.3, 6.0, "Hz"),
-    "tremor_percent": Usual(0.0, 95.0, "%"),
-    "cdbs_amplitude_ma": Usual(0.5, 6.0, "mA"),
-}
-"""Hands open and close about 1 to 4 times per second in Parkinson disease, seldom above 6 in health; chronic stimulation has 1 to 4 mA."""
-FAR, LEAST_OTHERS = 5, 3
-"""Points that a rating differs by from each of so many others of its visit before it is asked about."""
+USUAL = {o.field: Usual(*o.usual, o.entry_unit) for o in OUTCOMES if o.usual is not None} | {"cdbs_amplitude_ma": Usual(0.5, 6.0, "mA")}
+"""Chronic stimulation has 1 to 4 mA."""
+FAR = {o.field: o.far for o in OUTCOMES if o.far is not None}
+"""By how much a value differs from each of `LEAST_OTHERS` others of its visit before it is asked about."""
+LEAST_OTHERS = 3
 
 
 @dataclass(frozen=True)
@@ -67,16 +66,16 @@ def question(name: str, value: float | None, others: Sequence[float] = ()) -> Qu
     """What to ask about one value; None where it is usual.
 
     Args:
-        name: `grasp_hz`, `rating`, `tremor_percent` or `cdbs_amplitude_ma`. value: Hz, 1-10, % or mA.
+        name: the field of an outcome, or `cdbs_amplitude_ma`. value: in its unit.
         others: the same value of the visit's other sessions.
     """
     if value is None:
         return None
-    if name == "rating":
-        far = len(others) >= LEAST_OTHERS and all(abs(value - other) >= FAR for other in others)
+    if name in FAR:
+        far = len(others) >= LEAST_OTHERS and all(abs(value - other) >= FAR[name] for other in others)
         return Question(name, Why.FAR_FROM_VISIT, value, "", min(others), max(others)) if far else None
     low, high, unit = USUAL[name]
-    if name == "tremor_percent" and 0 < value < 1:
+    if unit == "%" and 0 < value < 1:
         return Question(name, Why.SHARE, value, unit, low, high)
     if low <= value <= high:
         return None

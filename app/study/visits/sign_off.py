@@ -20,6 +20,7 @@ from app.study import repository
 from app.study.blinding import stated_arm
 from app.study.models import StudySession, Visit, VisitLock
 from app.study.traces import sources
+from ml.outcomes import FIELDS
 
 KIND: Final = "visit_lock"
 MEANING: Final = "data of this visit are complete and reviewed"
@@ -27,7 +28,7 @@ _SESSION = (
     "ordinal", "hemisphere", "status", "started_at", "duration_s", "plan_item_id", "control_stream", "control_channel", "control_program",
     "excluded_reason", "stopped_reason", "medication_h", "activity",
 )  # fmt: skip
-_QOC = ("revision", "grasp_hz", "rating", "tremor_percent", "derived", "entered_by", "reason")
+_QOC = ("revision", *FIELDS, "derived", "entered_by", "reason")
 _CONDITIONS = (
     "revision", "origin", "lower_bound", "window", "period_s", "xi_beta", "min_ma", "max_ma", "seed", "design", "design_parameters",
     "lead_amplitude_ma", "cdbs_amplitude_ma", "programming", "entered_by", "reason",

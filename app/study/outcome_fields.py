@@ -1,0 +1,99 @@
+"""Columns of tables and fields of the interface, one per outcome, made from the records of `ml.outcomes`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field, create_model
+from sqlalchemy import CheckConstraint, Float, SmallInteger
+from sqlalchemy.orm import mapped_column
+
+from app.platform.database import Base
+from app.platform.web.schemas import Int, Model, Number
+from ml.outcomes import OUTCOMES, Outcome
+
+if TYPE_CHECKING:
+    OutcomeField = str
+    DerivedField = str
+else:
+    OutcomeField = Literal[tuple(o.field for o in OUTCOMES)]
+    DerivedField = Literal[tuple(o.field for o in OUTCOMES if o.derived)]
+
+
+def value_checks() -> tuple[CheckConstraint, ...]:
+    """Return the range of each outcome as a constraint of its column."""
+    return tuple(CheckConstraint(_range(o), name=o.key) for o in OUTCOMES)
+
+
+def margin_check() -> CheckConstraint:
+    """Return the constraint that every margin is above 0, and a share below 1."""
+    shares = {o.margin.field for o in OUTCOMES if o.margin.kind == "share"}
+    bounds = (f"{o.margin.field} > 0" + (f" and {o.margin.field} < 1" if o.margin.field in shares else "") for o in OUTCOMES)
+    return CheckConstraint(" and ".join(bounds), name="margins")
+
+
+def add_value_columns(table: type[Base]) -> None:
+    """Add a column per outcome to a table, null where not measured."""
+    for o in OUTCOMES:
+        setattr(table, o.field, mapped_column(SmallInteger if o.whole else Float, nullable=True))
+
+
+def add_margin_columns(table: type[Base]) -> None:
+    """Add a column per margin to a table."""
+    for o in OUTCOMES:
+        setattr(table, o.margin.field, mapped_column(Float, nullable=False))
+
+
+def fields_model(name: str, field_of: Callable[[Outcome], Mapping[str, Any]], base: type[Model] = Model) -> type[Model]:
+    """Return an API type with the fields of `base`, then those that `field_of` gives for each outcome, as (type, field) by name."""
+    fields = {field: made for o in OUTCOMES for field, made in field_of(o).items()}
+    return create_model(name, __base__=base, __module__=__name__, **fields)
+
+
+def _entered(o: Outcome) -> Mapping[str, Any]:
+    ends: dict[str, Any] = {"lt": o.below} if o.below is not None else {"le": o.high}
+    kind = Int if o.whole else Number
+    return {o.field: (kind | None, Field(None, ge=o.low, **ends, description=o.description))}
+
+
+def _stored(o: Outcome) -> Mapping[str, Any]:
+    return {o.field: ((int if o.whole else float) | None, ...)}
+
+
+def _stated_margin(o: Outcome) -> Mapping[str, Any]:
+    return {o.margin.field: (Number, Field(o.margin.default, description=o.margin.description))}
+
+
+if TYPE_CHECKING:
+
+    class EnteredOutcomes(Model):
+        """A field per outcome: its value, or null to take it back."""
+
+    class StoredOutcomes(Model):
+        """A field per outcome: its value, null where not measured."""
+
+    class MeanOutcomes(Model):
+        """A field per outcome: its mean over sessions, null where not measured."""
+
+    class StatedMargins(Model):
+        """A field per margin, the default where left out."""
+
+    class VersionOfMargins(Model):
+        """A version of margins: its number, and a field per margin."""
+
+        version: int
+
+else:
+    EnteredOutcomes = fields_model("EnteredOutcomes", _entered)
+    StoredOutcomes = fields_model("StoredOutcomes", _stored)
+    MeanOutcomes = fields_model("MeanOutcomes", lambda o: {o.field: (float | None, ...)})
+    StatedMargins = fields_model("StatedMargins", _stated_margin)
+    _Version = create_model("_Version", __base__=Model, version=(int, ...))
+    VersionOfMargins = fields_model("VersionOfMargins", lambda o: {o.margin.field: (float, ...)}, _Version)
+
+
+def _range(o: Outcome) -> str:
+    if o.below is not None:
+        return f"{o.field} >= {o.low:g} and {o.field} < {o.below:g}"
+    return f"{o.field} between {o.low:g} and {o.high:g}"
