@@ -53,7 +53,7 @@ from ml.statistics.noninferiority import assess
 from ml.statistics.ranksum import as_in_the_paper
 from ml.statistics.within_visits.averages import primary
 from ml.statistics.within_visits.contrasts import Average, Measurements, Unavailable, average, visit_contrasts
-from ml.statistics.within_visits.mixed_models import linear_comparison, rating_comparison, tremor_comparison
+from ml.statistics.within_visits.mixed_models import linear_comparison, minutes_comparison, ordinal_comparison
 from ml.statistics.within_visits.stratified import aligned_rank_test, shift_interval, van_elteren
 
 out = sys.stdout.write
@@ -162,10 +162,10 @@ def one_null(name: str, metric: str, data: Measurements, tally: Tally, study: in
 def mixed(metric: str, data: Measurements) -> Average | None:
     """The effect of the mixed model that the metric calls for."""
     if metric == "rating":
-        found = rating_comparison(data)
+        found = ordinal_comparison(data)
     elif metric == "tremor":
         counts = Measurements.of(np.round(data.value * MINUTES / 100), data.visit, data.tested)
-        found = tremor_comparison(counts, np.where(np.isfinite(data.value), float(MINUTES), 0.0))
+        found = minutes_comparison(counts, np.where(np.isfinite(data.value), float(MINUTES), 0.0))
     else:
         found = linear_comparison(data)
     return None if isinstance(found, Unavailable) else found.effect

@@ -10,7 +10,7 @@ from app.analysis.primary.verdict import LockedMargins, NoVerdict, VerdictResult
 from app.platform.web.charts import counted
 from app.platform.web.numbers import p_text
 from app.study.blinding import CONTROLLER_NAMES
-from ml.outcomes import OUTCOMES
+from ml.outcomes import ALL, BY_KEY, OUTCOMES, Outcome, enumerated
 from ml.statistics.noninferiority import (
     ENERGY,
     LEAST_VISITS,
@@ -27,9 +27,7 @@ from ml.statistics.within_visits.contrasts import Adjustment, Reason, Unavailabl
 TITLES: dict[str, tuple[str, str]] = {
     "energy": ("Stimulation energy", "share of cDBS"),
     "mean_beta": ("Mean beta amplitude", ""),
-    "grasp": ("Grasp frequency", "Hz"),
-    "rating": ("Rating", "1\u201310"),
-    "tremor": ("Tremor", "% of session"),
+    **{o.key: (o.label, o.unit) for o in OUTCOMES},
 }
 """The paper's five metrics: title and unit; the unit of beta is the participant's."""
 
@@ -39,6 +37,7 @@ the share."""
 
 JUDGED = {o.key: o.the_noun for o in OUTCOMES} | {ENERGY: "the energy saved"}
 """Names of what a verdict judges, within a sentence."""
+_SHARED = enumerated([o.label.lower() for o in OUTCOMES if o.margin.kind == "share"], "or")
 
 FAMILY = (
     "Planned family: the five metrics of RL and of distilled RL, each against the same visit's cDBS; p-values are adjusted by Holm over "
@@ -123,7 +122,7 @@ def verdict(result: VerdictResult) -> str:
             return f"No verdict on {name}: no visit began while these margins were locked."
         if result.no_verdict is NoVerdict.NO_VISIT_AFTER_LOCK:
             return f"No verdict on {name} yet: no visit was recorded after the margins were locked."
-        return f"No verdict on {name}: no cDBS session has a grasp frequency above 0, of which the margin would be a share."
+        return f"No verdict on {name}: no cDBS session has a {_SHARED} above 0, of which the margin would be a share."
     return verdict_sentence(name, result.assessment.verdict, len(result.visits), planned=result.locked.until is None)
 
 
@@ -132,14 +131,14 @@ def verdict_sentence(name: str, found: Verdict, visits: int, *, planned: bool) -
     over = f"over {counted(visits, 'visit')}"
     if isinstance(found, NonInferiorAndSaving):
         return (
-            f"{name} is non-inferior to cDBS on grasp, rating and tremor and saves {found.percent:.0f} % of the stimulation energy "
+            f"{name} is non-inferior to cDBS on {ALL} and saves {found.percent:.0f} % of the stimulation energy "
             f"(95 % interval {found.low:.0f} to {found.high:.0f} %), {over}."
         )
     if isinstance(found, Inferior):
         return f"{name} is inferior to cDBS: {_listed(found.outcomes)} {_are(found.outcomes)} worse by more than the margin, {over}."
     open_ = f"{name} is not shown to be non-inferior on {_listed(found.open)}"
     if found.open == (ENERGY,):
-        open_ = f"{name} is non-inferior on grasp, rating and tremor, but a saving of energy is not shown"
+        open_ = f"{name} is non-inferior on {ALL}, but a saving of energy is not shown"
     more = _more(found, planned=planned)
     if not visits and more:
         return f"Nothing can be said of {name} yet: {more}."
@@ -197,7 +196,7 @@ def outlook(result: VerdictResult, sessions_per_arm: int) -> str:
 
 def judged_as(outcome: str, unit: str) -> str:
     """In what an outcome of a verdict and its margin are stated."""
-    return {"rating": "points, in pairs", "tremor": "% points"}.get(outcome, unit)
+    return BY_KEY[outcome].contrast_unit if outcome in BY_KEY else unit
 
 
 def verdict_kind(result: VerdictResult) -> str:
@@ -228,12 +227,14 @@ def _superseded(locked: LockedMargins) -> str:
 
 def margins(found: LockedMargins) -> str:
     """Margins in a line."""
-    m = found.margins
-    return f"grasp {100 * m.grasp_share:g} % of cDBS, rating {_n_points(m.rating_points)}, tremor {m.tremor_points:g} % points"
+    return ", ".join(f"{o.noun} {margin(o, found.margins.of(o))}" for o in OUTCOMES)
 
 
-def _n_points(points: float) -> str:
-    return counted(points, "point")
+def margin(outcome: Outcome, value: float) -> str:
+    """A margin with its unit."""
+    if outcome.margin.kind == "share":
+        return f"{100 * value:g} % of cDBS"
+    return counted(value, "point") if outcome.margin.form_unit == "points" else f"{value:g} {outcome.margin.form_unit}"
 
 
 def disagreement(found: Comparison) -> str:
@@ -293,8 +294,7 @@ def no_population_claim(found: Summary) -> str:
 
 
 def _listed(names: Sequence[str]) -> str:
-    words = [JUDGED.get(n, n) for n in names]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    return enumerated([JUDGED.get(n, n) for n in names])
 
 
 def _are(names: Sequence[str]) -> str:

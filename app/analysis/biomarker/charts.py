@@ -5,14 +5,14 @@ from __future__ import annotations
 from app.analysis.biomarker.service import Pairing
 from app.platform.web.charts import Cell, Chart, Link, apart_where_equal, axis, counted, figure
 from app.platform.web.numbers import number
+from ml.outcomes import OUTCOMES
 
 NAMES = {
     "mean_beta": "Mean beta amplitude", "amplitude": "Mean amplitude", "medication_h": "Time since the last dose", "months": "Months",
-    "grasp": "Grasp frequency", "rating": "Rating", "tremor": "Tremor", "energy": "Stimulation energy",
+    **{o.key: o.label for o in OUTCOMES}, "energy": "Stimulation energy",
 }  # fmt: skip
 UNITS = {
-    "amplitude": "% of cDBS", "medication_h": "h", "months": "since the first visit", "grasp": "Hz", "rating": "1\u201310",
-    "tremor": "% of session",
+    "amplitude": "% of cDBS", "medication_h": "h", "months": "since the first visit", **{o.key: o.unit for o in OUTCOMES},
 }  # fmt: skip
 
 FACTORS = {"amplitude": 100.0}

@@ -15,6 +15,7 @@ from app.analysis.evidence.service import evidence
 from app.platform.kept import kept
 from app.study import repository as study
 from app.study.models import Controller, Participant
+from ml.outcomes import KEYS
 from ml.statistics.association import Association, between_visits, within_visits
 from ml.statistics.within_visits.contrasts import Unavailable
 
@@ -63,7 +64,7 @@ def biomarker(db: Session, participant: Participant, caller: Caller) -> Biomarke
         return Biomarker(
             held.participant,
             kind.unit if kind else "",
-            tuple(_pair(sessions, "mean_beta", y) for y in ("amplitude", "grasp", "rating", "tremor")),
+            tuple(_pair(sessions, "mean_beta", y) for y in ("amplitude", *KEYS)),
             tuple(_pair(cdbs, "months", y, months) for y in METRICS if y != "energy"),
             tuple(_pair(sessions, "medication_h", y) for y in METRICS if y != "energy"),
             tuple(sorted({s.visit for s in sessions} - days.keys())),

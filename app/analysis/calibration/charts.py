@@ -10,11 +10,10 @@ from app.evaluation.ranking.charts import style
 from app.platform.web.charts import MUTED, Chart, axis, counted, figure
 from app.platform.web.numbers import hover
 from ml.ope.registry import shown as method_of
+from ml.outcomes import OUTCOMES
 
 QUANTITY_NAMES = {
-    "grasp_hz": ("Grasp frequency", "Hz", 1.0),
-    "rating": ("Rating", "1–10", 1.0),
-    "tremor_percent": ("Tremor", "% of the time", 1.0),
+    **{o.field: (o.label, o.unit, 1.0) for o in OUTCOMES},
     "energy": ("Energy", "% of cDBS", 100.0),
     "mean_beta": ("Mean beta", "", 1.0),
 }

@@ -7,13 +7,15 @@ from typing import Literal
 
 from pydantic import Field
 
+from app.evaluation.ranking.actual import QUANTITIES
 from app.platform.web.schemas import Model
+from ml.outcomes import enumerated
 
 
 class QuantityOut(Model):
     """One quantity of one method, policy and visit: predicted, and the mean over the sessions that have it."""
 
-    name: str = Field(description="`energy`, `mean_beta`, `grasp_hz`, `rating` or `tremor_percent`.")
+    name: str = Field(description=f"{enumerated([f'`{name}`' for name in QUANTITIES], 'or')}.")
     predicted: float
     actual: float
     sessions: int

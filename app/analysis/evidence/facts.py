@@ -19,11 +19,12 @@ from app.study.sessions.data import qoc_of
 from app.study.sessions.stimulation import delivered_by
 from app.study.traces import AMPLITUDE_STREAM, StepTable, TracesOf, amplitude_program, laid_out
 from ml.energy import mean_square_ma, relative_energy
+from ml.outcomes import KEYS, OUTCOMES
 
 KNOWN_SHARE = 0.5
 """Share of a session's steps that must be known for its energy and its mean beta to stand for the session (ours)."""
 
-METRICS = ("energy", "mean_beta", "grasp", "rating", "tremor")
+METRICS = ("energy", "mean_beta", *KEYS)
 """The paper's five metrics, in its order."""
 
 
@@ -139,9 +140,7 @@ def read(session: StudySession, arm: Arm, traces: TracesOf) -> Facts:
     found = {
         "energy": fraction.square,
         "mean_beta": _means(beta).mean,
-        "grasp": qoc.grasp_hz,
-        "rating": qoc.rating,
-        "tremor": qoc.tremor_percent,
+        **{o.key: getattr(qoc, o.field) for o in OUTCOMES},
     }
     values = {name: float(value) for name, value in found.items() if value is not None and math.isfinite(value)}
     return Facts(

@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 
 from app.analysis.evidence.facts import BetaKind, Facts, Missing
 from app.study.models import Controller
+from ml.outcomes import OUTCOMES
 from ml.statistics.within_visits.contrasts import Measurements
 
-HIGHER_IS_BETTER = {"energy": False, "mean_beta": False, "grasp": True, "rating": True, "tremor": False}
-RESOLUTION = {"rating": 1.0, "tremor": 1.0, "energy": 0.05}
+HIGHER_IS_BETTER = {"energy": False, "mean_beta": False} | {o.key: o.higher_is_better for o in OUTCOMES}
+RESOLUTION = {"energy": 0.05} | {o.key: o.resolution for o in OUTCOMES}
 """Step between neighbouring values of a metric; 0 where it is continuous. Stimulators deliver steps of 0.1 mA: at cDBS of 4 mA, 0.05 of its
 energy. Without it, a controller of one constant amplitude would save the same at every visit, and no test could say so; nor could one say
-of a participant who never trembles that no tremor came, if shares of the time were taken for more exact than to 1 %."""
+of a participant who never trembles that none came, if shares of the time were taken for more exact than to 1 %."""
 
-BOUNDED = frozenset({"rating", "tremor"})
-"""Metrics that end at a floor or a ceiling which sessions reach: a rating of 1 to 10, a share of the time."""
+BOUNDED = frozenset(o.key for o in OUTCOMES if o.bounded)
+"""Metrics that end at a floor or a ceiling which sessions reach."""
 
 
 @dataclass(frozen=True)

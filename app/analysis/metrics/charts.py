@@ -14,6 +14,7 @@ from app.platform.kept import kept
 from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, counted, figure, marker, side_by_side
 from app.platform.web.numbers import hover, p_text
 from app.study.models import Controller
+from ml.outcomes import BY_KEY
 
 SHORT = {Controller.DISTILLED: "Distilled"}
 """Names that must fit under a narrow box."""
@@ -57,8 +58,9 @@ def metric_chart(metric: MetricResult) -> Chart:
         "showlegend": False,
         "dragmode": False,
     }
-    if metric.metric == "rating":
-        layout["yaxis"] |= {"range": [0.5, 10.5], "dtick": 1}
+    outcome = BY_KEY.get(metric.metric)
+    if outcome is not None and outcome.whole:
+        layout["yaxis"] |= {"range": [outcome.low - 0.5, outcome.high + 0.5], "dtick": 1}
     rows = [_row(g, tests.get(g.controller)) for g in metric.groups]
     subtitle = f"{metric.unit} \u00b7 n = {counted(metric.n, 'session')}"
     return Chart(f"metric-{metric.metric}", metric.title, subtitle, figure(data, **layout), COLUMNS, rows, height=270)
@@ -76,7 +78,8 @@ def box(at: int, g: Group) -> dict[str, Any]:
 def points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
     """Every session of a group, to the four digits that its label shows: a page of many participants has thousands."""
     height = max((max(other.values) for other in metric.groups if other.n), default=0.0)
-    unit = metric.unit if metric.metric != "rating" else "of 10"
+    outcome = BY_KEY.get(metric.metric)
+    unit = outcome.entry_unit if outcome is not None and outcome.whole else metric.unit
     return {
         "type": "scatter", "mode": "markers", "x": [round(at + s, 3) for s in side_by_side(g.values, height / _ROWS, _HALF, _STEP)],
         "y": [float(f"{v:.4g}") for v in g.values], "cliponaxis": False,
@@ -94,7 +97,7 @@ def above(test: Comparison | None, metric: str) -> str:
 
 
 def is_better(test: Comparison, metric: str) -> bool:
-    """Whether a difference is below .05 and in the desired direction: less energy, beta and tremor, faster grasps, a higher rating."""
+    """Whether a difference is below .05 and in the desired direction."""
     if test.p_value is None or test.difference is None or test.p_value >= ALPHA or test.difference == 0:
         return False
     return (test.difference > 0) is HIGHER_IS_BETTER[metric]

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from app.platform.web.schemas import Model
 from app.study.models import Controller
+from ml.outcomes import ANY
 
 
 class GroupOut(Model):
@@ -49,7 +50,7 @@ class PolicyMetricOut(Model):
 class MetricOut(Model):
     """One of the five metrics."""
 
-    metric: str = Field(description="energy, mean_beta, grasp, rating or tremor.")
+    metric: str = Field(description=f"energy, mean_beta, {ANY}.")
     title: str
     unit: str
     groups: list[GroupOut]

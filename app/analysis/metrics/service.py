@@ -127,7 +127,7 @@ class FiveMetrics:
 
 
 def five_metrics(db: Session, participant: Participant, caller: Caller, held: Evidence | None = None) -> FiveMetrics:
-    """Energy, mean beta, grasp, rating and tremor of every session, by controller and by policy, each compared with cDBS.
+    """Energy, mean beta and outcomes of every session, by controller and by policy, each compared with cDBS.
 
     `held`: the evidence, where it is at hand.
     """

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from app.platform.web.schemas import Model
 from app.study.models import Controller
+from app.study.outcome_fields import VersionOfMargins
 
 
 class AverageOut(Model):
@@ -88,13 +89,9 @@ class OutcomeVerdictOut(Model):
     text: str
 
 
-class MarginsLockedOut(Model):
+class MarginsLockedOut(VersionOfMargins):
     """The margins that a verdict goes by."""
 
-    version: int
-    grasp_share: float
-    rating_points: float
-    tremor_points: float
     locked_at: datetime | None
     locked_by: str | None
     superseded_at: datetime | None = Field(description="When a newer lock followed.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 from app.analysis import wording
 from app.analysis.primary.results import LEVEL, Comparison, ControllerResult
 from app.analysis.primary.schemas import (
@@ -49,9 +51,7 @@ def margins_out(locked: LockedMargins) -> MarginsLockedOut:
     """Margins with their lock."""
     return MarginsLockedOut(
         version=locked.version,
-        grasp_share=locked.margins.grasp_share,
-        rating_points=locked.margins.rating_points,
-        tremor_points=locked.margins.tremor_points,
+        **asdict(locked.margins),
         locked_at=locked.locked_at,
         locked_by=locked.locked_by,
         superseded_at=locked.until,

@@ -21,9 +21,10 @@ from app.platform.errors import NotFound
 from app.platform.kept import kept
 from app.study.margins.service import margins_of
 from app.study.models import Controller, Participant
+from ml.outcomes import BY_KEY
 from ml.statistics.power import Power, Target, power
 from ml.statistics.within_visits.contrasts import Unavailable
-from ml.statistics.within_visits.mixed_models import MixedComparison, linear_comparison, rating_comparison, tremor_comparison
+from ml.statistics.within_visits.mixed_models import MixedComparison, linear_comparison, minutes_comparison, ordinal_comparison
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ MixedFits = tuple[tuple[str, MixedComparison | Unavailable], ...]
 
 
 def mixed_models(found: Primary, controller: Controller) -> MixedFits:
-    """Mixed models by metric, policies nested in the controller: linear, ordinal for the rating, minutes for tremor. Slow: up to 0.3 s."""
+    """Mixed models by metric, policies nested in the controller, of the kind that an outcome's record names. Slow: up to 0.3 s."""
     return kept(("mixed", found.evidence.key, controller), lambda: tuple((m, _fit(found.sessions, m, controller)) for m in METRICS))
 
 
@@ -131,12 +132,13 @@ def policy_names(db: Session, participant: Participant) -> dict[int, str]:
 def _fit(sessions: Sequence[Facts], metric: str, controller: Controller) -> MixedComparison | Unavailable:
     chosen = choose(sessions, metric, of_controller(controller))
     policies = chosen.policy if len({int(p) for p in chosen.policy[chosen.data.tested]}) > 1 else None
-    if metric == "rating":
-        return rating_comparison(chosen.data, policies)
-    if metric == "tremor":
+    model = BY_KEY[metric].model if metric in BY_KEY else "linear"
+    if model == "ordinal":
+        return ordinal_comparison(chosen.data, policies)
+    if model == "minutes":
         minutes = np.array([s.duration_s / 60 for s in chosen.sessions])
         counted = replace(chosen.data, value=chosen.data.value / 100 * minutes)
-        return tremor_comparison(counted, minutes, policies)
+        return minutes_comparison(counted, minutes, policies)
     return linear_comparison(chosen.data, policies)
 
 

@@ -31,7 +31,7 @@ class NoVerdict(StrEnum):
     """Why nothing was assessed."""
 
     NO_VISIT_AFTER_LOCK = "no_visit_after_lock"
-    NO_GRASP_REFERENCE = "no_grasp_reference"
+    NO_REFERENCE = "no_reference"
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def _judge(
     ]
     used = {s.visit for s in sessions}
     seen = {s.visit for s in sessions if tested(s)} & {s.visit for s in sessions if s.controller is Controller.CDBS}
-    result, lacking = None, NoVerdict.NO_GRASP_REFERENCE if used else NoVerdict.NO_VISIT_AFTER_LOCK
+    result, lacking = None, NoVerdict.NO_REFERENCE if used else NoVerdict.NO_VISIT_AFTER_LOCK
     if all(o is not None for o in outcomes):
         result = assess([o for o in outcomes if o is not None], energy.data, energy.stopped, plan=plan)
     return VerdictResult(

@@ -4,7 +4,7 @@ within it.
 They use every session at once and say how far visits and policies differ. All are tested on t with one degree of freedom fewer than visits
 with both arms, never as a normal deviate: the spread between visits is what they know least. Where Satterthwaite's approximation has fewer
 degrees (policies that differ, and few of them), the linear model takes those. Metrics that are measured on a scale follow
-the linear model; a rating follows ordered categories, and minutes with tremor are counts out of the minutes watched, with a level of each
+the linear model; a scale without equal steps follows ordered categories, and minutes are counts of those watched, with a level of each
 session because the minutes of one session resemble each other.
 """
 
@@ -48,9 +48,9 @@ class MixedComparison:
     """A mixed model of one metric.
 
     Attributes:
-        effect: of the controller, in the metric's unit (linear) or in log odds (rating: of a higher one; tremor: of a minute with it).
+        effect: of the controller, in the metric's unit (linear) or in log odds (of a higher category, or of a counted minute).
         visit_sd: standard deviation of visits' levels. slope_sd: of the effect between visits. policy_sd: between policies; None where
-            fewer than two policies were tested. session_sd: of sessions within a visit and arm; None for the rating, where the odds hold
+            fewer than two policies were tested. session_sd: of sessions within a visit and arm; None for ordered categories: the odds hold
             it.
         policies: effects of single policies.
     """
@@ -89,8 +89,12 @@ def linear_comparison(data: Measurements, policy: Integers | None = None, level:
     return MixedComparison(effect, roots["visit"], roots["slope"], roots.get("policy"), session_sd, policies)
 
 
-def rating_comparison(data: Measurements, policy: Integers | None = None, level: float = 0.95) -> MixedComparison | Unavailable:
-    """Proportional-odds mixed model of a rating; arguments as in `linear_comparison`. The effect is the log odds of a higher rating."""
+def ordinal_comparison(data: Measurements, policy: Integers | None = None, level: float = 0.95) -> MixedComparison | Unavailable:
+    """Proportional-odds mixed model of ordered categories; the effect is the log odds of a higher one.
+
+    Args:
+        data, policy, level: as in `linear_comparison`.
+    """
     prepared = _prepare(data, policy)
     if isinstance(prepared, Unavailable):
         return prepared
@@ -105,17 +109,17 @@ def rating_comparison(data: Measurements, policy: Integers | None = None, level:
     return prepared.generalised(cumulative(category, design), start, fixed, steps - 1, level)
 
 
-def tremor_comparison(
+def minutes_comparison(
     data: Measurements, minutes: Floats, policy: Integers | None = None, level: float = 0.95
 ) -> MixedComparison | Unavailable:
-    """Binomial mixed model of minutes with tremor; the effect is the log odds of a minute with tremor.
+    """Binomial mixed model of counted minutes; the effect is the log odds of such a minute.
 
     Args:
-        data: value is the number of minutes with tremor (or a share of them, summed over time). minutes: watched, [n], NaN or 0 where none.
+        data: value is the number of counted minutes (or a share of them, summed over time). minutes: watched, [n], NaN or 0 where none.
         policy: as in `linear_comparison`.
 
     Raises:
-        ValueError: minutes with tremor below zero or above those watched.
+        ValueError: counted minutes below zero or above those watched.
     """
     watched = np.isfinite(minutes) & (minutes > 0)
     prepared = _prepare(data.take(watched), None if policy is None else policy[watched])

@@ -10,7 +10,7 @@ import pytest
 
 from app.analysis import wording
 from app.analysis.evidence.facts import Facts
-from app.analysis.evidence.measurements import BOUNDED, RESOLUTION
+from app.analysis.evidence.measurements import RESOLUTION
 from app.analysis.primary.verdict import LockedMargins, NoVerdict, VerdictResult, verdicts
 from app.overview.package import recompute
 from app.study.blinding import Arm
@@ -109,8 +109,8 @@ def test_an_outcome_of_two_visits_is_told_from_a_study_of_two_visits() -> None:
 
 def test_no_grasp_frequency_to_take_a_share_of_gives_no_verdict() -> None:
     for grasp in (None, 0.0):
-        assert judged(varied(6, grasp=grasp)).no_verdict is NoVerdict.NO_GRASP_REFERENCE
-    assert judged([s for s in varied(6) if s.controller is RL]).no_verdict is NoVerdict.NO_GRASP_REFERENCE
+        assert judged(varied(6, grasp=grasp)).no_verdict is NoVerdict.NO_REFERENCE
+    assert judged([s for s in varied(6) if s.controller is RL]).no_verdict is NoVerdict.NO_REFERENCE
 
 
 def test_a_participant_who_never_trembles_gets_a_verdict() -> None:
@@ -132,6 +132,5 @@ def test_each_reason_has_a_sentence_of_its_own() -> None:
     assert ";" in wording.verdict_sentence("RL", tied, 5, planned=False)
 
 
-def test_the_script_of_the_data_package_takes_the_steps_and_bounds_of_the_service() -> None:
-    assert recompute.RESOLUTION == RESOLUTION
-    assert set(recompute.BOUNDED) == BOUNDED
+def test_the_script_of_the_data_package_takes_the_step_of_energy_of_the_service() -> None:
+    assert RESOLUTION["energy"] == recompute.ENERGY_RESOLUTION

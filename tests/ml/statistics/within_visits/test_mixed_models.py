@@ -9,7 +9,7 @@ from scipy.special import expit
 
 from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavailable, average, visit_contrasts
 from ml.statistics.within_visits.generalised import binomial, cumulative, fit
-from ml.statistics.within_visits.mixed_models import linear_comparison, rating_comparison, tremor_comparison
+from ml.statistics.within_visits.mixed_models import linear_comparison, minutes_comparison, ordinal_comparison
 
 
 def layout(visits, each):
@@ -84,7 +84,7 @@ def test_two_categories_are_a_logistic_regression():
 def test_the_rating_model_finds_the_log_odds_that_made_the_ratings():
     eta, visit, arms, rng = latent(visits=30, each=8, effect=1.0, seed=4)
     rating = 5 + np.digitize(eta + rng.logistic(size=visit.size), [-1.5, -0.5, 0.5, 1.5])
-    found = rating_comparison(Measurements.of(rating, visit, arms, resolution=1))
+    found = ordinal_comparison(Measurements.of(rating, visit, arms, resolution=1))
     assert found.effect.estimate == pytest.approx(1.0, abs=0.35)
     assert found.effect.low < 1.0 < found.effect.high
     assert found.visit_sd == pytest.approx(0.7, abs=0.45)
@@ -94,21 +94,21 @@ def test_the_tremor_model_finds_the_log_odds_and_that_minutes_of_a_session_go_to
     eta, visit, arms, rng = latent(visits=30, each=5, effect=-1.0, seed=5)
     minutes = rng.integers(5, 20, visit.size).astype(float)
     count = rng.binomial(minutes.astype(int), expit(-0.5 + eta + rng.standard_normal(visit.size)))
-    found = tremor_comparison(Measurements.of(count, visit, arms), minutes)
+    found = minutes_comparison(Measurements.of(count, visit, arms), minutes)
     assert found.effect.estimate == pytest.approx(-1.0, abs=0.35)
     assert found.session_sd == pytest.approx(1.0, abs=0.45)
     without = np.where(np.arange(visit.size) == 0, 0.0, minutes)
-    assert tremor_comparison(Measurements.of(count, visit, arms), without).effect.n_cdbs == found.effect.n_cdbs - 1
+    assert minutes_comparison(Measurements.of(count, visit, arms), without).effect.n_cdbs == found.effect.n_cdbs - 1
 
 
 def test_an_arm_wholly_above_the_other_keeps_a_finite_effect():
     visit, arms = layout(4, 3)
-    found = rating_comparison(Measurements.of(np.where(arms, 9, 6) + (np.arange(24) % 3 == 0), visit, arms))
+    found = ordinal_comparison(Measurements.of(np.where(arms, 9, 6) + (np.arange(24) % 3 == 0), visit, arms))
     assert 0 < found.effect.estimate < 30
     assert np.isfinite(found.effect.high)
 
 
-@pytest.mark.parametrize("model", [linear_comparison, rating_comparison, lambda d: tremor_comparison(d, np.full(d.value.size, 5.0))])
+@pytest.mark.parametrize("model", [linear_comparison, ordinal_comparison, lambda d: minutes_comparison(d, np.full(d.value.size, 5.0))])
 def test_nothing_to_fit_is_a_typed_reason(model):
     visit, arms = layout(3, 2)
     assert model(Measurements.of(np.zeros(12), visit, arms)) == Unavailable(Reason.ALL_EQUAL)
@@ -120,4 +120,4 @@ def test_nothing_to_fit_is_a_typed_reason(model):
 def test_more_minutes_with_tremor_than_minutes_are_refused():
     visit, arms = layout(3, 2)
     with pytest.raises(ValueError, match="between 0 and its total"):
-        tremor_comparison(Measurements.of(np.arange(12), visit, arms), np.full(12, 5.0))
+        minutes_comparison(Measurements.of(np.arange(12), visit, arms), np.full(12, 5.0))
