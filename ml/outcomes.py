@@ -101,12 +101,14 @@ class Outcome:
     Attributes:
         key: its name in analyses. field: in tables, forms and the interface. column: in the data package.
         label: its whole name. short: the name in columns. noun: within a sentence. the_noun: as the subject of one.
-        unit: of a value. entry_unit: the same beside a field. difference_unit: of a change. contrast_unit: of the primary comparison.
-        share: what share per cent are of; empty of other units. help: what is measured. explained: the same for a glossary.
+        unit: of a value. entry_unit: the same beside a field and in columns. sentence_unit: the same within a sentence.
+        difference_unit: of a change. difference_words: the same within a sentence. contrast_unit: of the primary comparison.
+        help: what is measured. explained: the same for a glossary.
+        worse: the word for a worse value. note: for a reader of a value within a sentence.
         description: of the interface. exported: of the data package.
         low, high: the range; an infinite `high` has no end. below: what a value stays below that may be entered; None where any may.
         usual: a value outside is asked about; None where none is. far: so is one that differs by so much from several of its visit.
-        whole: values are whole numbers. decimals: of a shown value. mean_decimals: of a shown mean or change.
+        whole: values are whole numbers. decimals: of a value or its change within a sentence. mean_decimals: of a mean in a table.
         higher_is_better: the better direction. margin: how much worse counts as no worse.
         failure: the value of a stopped session; None for the participant's worst measured one.
         end: its part in r_end; None where it has none.
@@ -124,9 +126,12 @@ class Outcome:
     the_noun: str
     unit: str
     entry_unit: str
+    sentence_unit: str
     difference_unit: str
+    difference_words: str
     contrast_unit: str
-    share: str = ""
+    worse: str
+    note: str = ""
     help: str
     explained: str
     description: str
@@ -224,8 +229,11 @@ OUTCOMES: tuple[Outcome, ...] = (
         the_noun="grasp",
         unit="Hz",
         entry_unit="Hz",
+        sentence_unit="Hz",
         difference_unit="Hz",
+        difference_words="Hz",
         contrast_unit="Hz",
+        worse="slower",
         help="Full hand openings per second at the end of the session.",
         explained="Full openings of the hand per second, at the end of a session; more is better.",
         description="Grasp frequency, Hz.",
@@ -233,7 +241,7 @@ OUTCOMES: tuple[Outcome, ...] = (
         low=0.0,
         below=20.0,
         usual=(0.3, 6.0),  # hands open and close about 1 to 4 times per second in Parkinson disease, seldom above 6 in health
-        decimals=2,
+        decimals=1,
         mean_decimals=2,
         higher_is_better=True,
         margin=Margin(
@@ -264,8 +272,12 @@ OUTCOMES: tuple[Outcome, ...] = (
         the_noun="the rating",
         unit="1\u201310",
         entry_unit="of 10",
+        sentence_unit="of 10",
         difference_unit="points",
+        difference_words="points",
         contrast_unit="points, in pairs",
+        worse="lower",
+        note="by the patient (10 is best)",
         help="The participant's own, 1 worst to 10 best.",
         explained="The participant's own, 1 worst to 10 best.",
         description="The participant's rating, 1-10.",
@@ -274,7 +286,7 @@ OUTCOMES: tuple[Outcome, ...] = (
         high=10.0,
         far=5.0,
         whole=True,
-        decimals=0,
+        decimals=1,
         mean_decimals=1,
         higher_is_better=True,
         margin=Margin(
@@ -308,9 +320,11 @@ OUTCOMES: tuple[Outcome, ...] = (
         the_noun="tremor",
         unit="% of session",
         entry_unit="%",
+        sentence_unit="% of the time",
         difference_unit="% points",
+        difference_words="percentage points",
         contrast_unit="% points",
-        share="of the session",
+        worse="more",
         help="Share of the session with mild or worse tremor.",
         explained="Share of the session with mild or worse tremor. A change is told in percentage points of that time.",
         description="Share of the session with mild or worse tremor, %.",

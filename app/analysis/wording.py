@@ -35,8 +35,14 @@ ENERGY_SHOWN = ("% of cDBS", 100.0)
 """How every page and figure shows energy: unit, and factor of the stored share of the energy under cDBS. Files and the REST interface keep
 the share."""
 
+_MODELLED = {"ordinal": "ordered categories", "minutes": "minutes out of those watched (from the share and the length of the session)"}
+_EFFECTS = {"ordinal": "log odds of a higher one", "minutes": "log odds of a minute with it"}
 JUDGED = {o.key: o.the_noun for o in OUTCOMES} | {ENERGY: "the energy saved"}
 """Names of what a verdict judges, within a sentence."""
+ORDINAL = enumerated([o.the_noun for o in OUTCOMES if o.scale == "ordinal"])
+BOUNDED = enumerated([o.noun for o in OUTCOMES if o.bounded]).capitalize()
+MODELS = " ".join(f"{o.the_noun.capitalize()} is taken as {_MODELLED[o.model]}." for o in OUTCOMES if o.model in _MODELLED)
+"""How the mixed models take what is not measured on a scale."""
 _SHARED = enumerated([o.label.lower() for o in OUTCOMES if o.margin.kind == "share"], "or")
 
 FAMILY = (
@@ -192,6 +198,17 @@ def outlook(result: VerdictResult, sessions_per_arm: int) -> str:
     if found.fewest_visits is not None and found.fewest_visits < found.more_visits:
         return f"{settled}. With more sessions at each it is {counted(found.fewest_visits, 'visit')} at the least."
     return f"{settled}. More sessions at a visit would not replace one."
+
+
+def effect_unit(metric: str, unit: str) -> str:
+    """In what a mixed model states its effect on a metric."""
+    return _EFFECTS.get(BY_KEY[metric].model, unit) if metric in BY_KEY else unit
+
+
+def share_margins(locked: LockedMargins) -> str:
+    """Which margins are shares, and of what."""
+    shares = [o for o in OUTCOMES if o.margin.kind == "share"]
+    return " ".join(f"The margin of {o.noun} is {100 * locked.margins.of(o):g} % of the mean under cDBS." for o in shares)
 
 
 def judged_as(outcome: str, unit: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import ConfigDict, Field
 
@@ -11,6 +11,8 @@ from app.evaluation.estimates.methods import Method as Method
 from app.evaluation.estimates.methods import Methods
 from app.learning.schemas import PolicyIds, Preset
 from app.platform.web.schemas import Int, Model
+from app.study.outcome_fields import fields_model
+from ml.outcomes import FIELDS
 
 
 class EvaluateParams(Model):
@@ -63,11 +65,7 @@ class EstimateOut(EstimateSummary):
     n: int | None
 
 
-class TestedBefore(Model):
-    """What a policy did where it ran: actual returns with the H and gamma of the estimates."""
-
-    __test__ = False
-
+class _Steps(Model):
     sessions: int
     sessions_with_return: int
     mean_return: float | None
@@ -75,9 +73,18 @@ class TestedBefore(Model):
     mean_end_reward: float | None
     energy: float | None
     mean_beta: float | None
-    grasp_hz: float | None
-    rating: float | None
-    tremor_percent: float | None
+
+
+if TYPE_CHECKING:
+    _Means = _Steps
+else:
+    _Means = fields_model("_Means", lambda o: {o.field: (float | None, ...)}, _Steps)
+
+
+class TestedBefore(_Means):
+    """What a policy did where it ran: actual returns with the H and gamma of the estimates."""
+
+    __test__ = False
 
 
 Decision = Literal["test", "test_with_care", "same_as_cdbs", "unsafe", "cannot_tell"]
@@ -139,9 +146,7 @@ class RankedPolicy(Model):
     probability_best: float | None
     retired: bool
     estimates: dict[str, EstimateOut]
-    predicted: dict[str, float] = Field(
-        description="By the ranking's method: energy, mean_amplitude, mean_beta, grasp_hz, rating, tremor_percent."
-    )
+    predicted: dict[str, float] = Field(description=f"By the ranking's method: energy, mean_amplitude, mean_beta, {', '.join(FIELDS)}.")
     flags: list[FlagOut]
     coverage: CoverageOut | None = Field(description="Null for an evaluation that did not check it, and where it could not be checked.")
     tested: TestedBefore | None

@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from app.evaluation.ranking.answer import Difference
+from app.evaluation.ranking.results import RandomSessions
 from app.evaluation.schemas import Standing
 from app.evaluation.wording import OUTCOME_NAMES, amplitude, chance, number, percent, sentence, signed
+from app.platform.web.charts import counted
 from ml.ope.flags import Flag
+from ml.outcomes import ANY, OUTCOMES, Outcome
+from ml.qoc import Margins
 
 STANDING_NAMES: dict[Standing, str] = {
     "test": "test",
@@ -68,6 +72,34 @@ def further_sessions(reasons: Sequence[Flag]) -> str:
     return f"{' '.join(told)} would tell"
 
 
+def random_effects(found: RandomSessions) -> tuple[list[str], list[str]]:
+    """What random sessions changed against cDBS, and the worst of a single one, by outcome."""
+    known = [o for o in OUTCOMES if o.field in found.differences]
+    apart = [change(o.noun, found.differences[o.field], o.decimals, o.difference_words) for o in known]
+    return apart, [f"{o.noun} {found.worst[o.field]:.{0 if o.whole else o.decimals}f} {o.sentence_unit}" for o in known]
+
+
+def usual(under_cdbs: Mapping[str, float]) -> list[str]:
+    """What is to be expected under cDBS, by outcome."""
+    known = [o for o in OUTCOMES if o.field in under_cdbs]
+    return [f"{o.noun} {under_cdbs[o.field]:.{o.decimals}f} {o.sentence_unit} {o.note}".rstrip() for o in known]
+
+
+def allowed(margins: Margins, under_cdbs: Mapping[str, float]) -> list[str]:
+    """How much worse than under cDBS each outcome may be, and what that is of the value to expect."""
+    return [_allowed(o, margins.of(o), under_cdbs.get(o.field)) for o in OUTCOMES]
+
+
+def _allowed(outcome: Outcome, margin: float, under_cdbs: float | None) -> str:
+    amount = f"{100 * margin:.0f} %" if outcome.margin.kind == "share" else counted(margin, outcome.difference_words.removesuffix("s"))
+    of = ""
+    if under_cdbs is not None and outcome.margin.kind == "share":
+        of = f" ({outcome.margin.amount(margin, under_cdbs):.{outcome.mean_decimals}f} {outcome.sentence_unit})"
+    elif under_cdbs is not None and not outcome.higher_is_better:
+        of = f" (up to {min(outcome.high, under_cdbs + margin):.{outcome.decimals}f} {outcome.sentence_unit})"
+    return f"{outcome.noun} at most {amount} {outcome.worse}{of}"
+
+
 def effect(differences: Mapping[str, Difference], within: float | None = None) -> str:
     """What a policy is expected to change against cDBS, in one line.
 
@@ -94,12 +126,7 @@ def change(name: str, difference: float, digits: int, unit: str) -> str:
     return f"{name} {shown} {unit[:-1] if shown[1:] == '1' and unit.endswith('points') else unit}"
 
 
-_CHANGES = (
-    ("energy", "energy", 100, 0, "%"),
-    ("grasp_hz", "grasp", 1, 1, "Hz"),
-    ("rating", "rating", 1, 1, "points"),
-    ("tremor_percent", "tremor", 1, 0, "percentage points"),
-)
+_CHANGES = (("energy", "energy", 100, 0, "%"), *((o.field, o.noun, 1, o.decimals, o.difference_words) for o in OUTCOMES))
 """Of each quantity: name, scale, digits, unit."""
 
 _TEST_ASKS = {"within_margins": "likely no worse", "saves_energy": "likely to use less energy"}
@@ -112,8 +139,7 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "adverse_event": lambda f: "serious adverse event, not cleared by a clinician",
     "nearly_off": lambda f: f"nearly off {percent(f.value)} of the time",
     "beyond_margin": lambda f: (
-        f"{chance(number(f))} likely that grasp, rating or tremor is worse by more than its margin, "
-        f"most often {OUTCOME_NAMES[f.fact('outcome')]}"
+        f"{chance(number(f))} likely that {ANY} is worse by more than its margin, most often {OUTCOME_NAMES[f.fact('outcome')]}"
     ),
     "all_below_zero": lambda f: "its whole expected gain lies below that of cDBS",
     "few_near_sessions": lambda f: "hardly any session came near what it does",
@@ -127,7 +153,7 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "coverage_unchecked": lambda f: "what the recordings cover could not be checked",
     "reference_missing": lambda f: "nothing is known of cDBS to hold it against",
     "reference_unsupported": lambda f: "too few sessions of cDBS to hold it against",
-    "outcomes_unknown": lambda f: "no session has grasp, rating or tremor",
+    "outcomes_unknown": lambda f: f"no session has {ANY}",
     "energy_unknown": lambda f: "whether it uses less energy is not known",
     "undecided": lambda f: _undecided((f,)),
     "acts_like_cdbs": lambda f: f"{percent(f.value)} of the cDBS amplitude away from it on average",

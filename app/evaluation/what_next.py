@@ -8,6 +8,7 @@ from app.evaluation import verdict_wording, wording
 from app.evaluation.ranking.answer import OFF_SHARE
 from app.evaluation.ranking.judged import Judged
 from app.platform.web.templates import render_part
+from app.study.margins.service import margins_of
 from ml.ope.posterior.verdict import NEARLY_OFF
 
 
@@ -29,10 +30,12 @@ def what_next(judged: Judged, *, may_run: bool) -> Markup:
             minutes=round(minutes) if minutes >= 1 else round(minutes, 1),
             off_share=OFF_SHARE,
             nearly_off=NEARLY_OFF,
-            margins=judged.participant.margins_in_force,
+            margins=margins_of(judged.participant.margins_in_force),
             plainly=verdict_wording.plainly,
             effect=verdict_wording.effect,
-            change=verdict_wording.change,
+            random_effects=verdict_wording.random_effects,
+            usual=verdict_wording.usual,
+            allowed=verdict_wording.allowed,
             further=verdict_wording.further_sessions,
             amplitude=wording.amplitude,
             chance=wording.chance,

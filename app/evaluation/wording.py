@@ -8,6 +8,7 @@ from typing import Any
 from app.platform.web.charts import counted
 from ml.ope.flags import Flag
 from ml.ope.registry import shown
+from ml.outcomes import ALL, ANY, OUTCOMES
 
 UNSUPPORTED = "not supported by the data"
 
@@ -79,12 +80,10 @@ def shape_pooling(outcome: str, told: Mapping[str, Any]) -> str:
     return f"{outcome}: not pooled with {others}, because it does not help whoever is left out: gain {size}"
 
 
-OUTCOME_NAMES = {"grasp_hz": "grasp", "rating": "rating", "tremor_percent": "tremor"}
+OUTCOME_NAMES = {o.field: o.noun for o in OUTCOMES}
 OUTCOMES_WITH_UNITS = {
     "r_end": "End-of-session reward",
-    "grasp_hz": "Grasp (Hz)",
-    "rating": "Rating (points)",
-    "tremor_percent": "Tremor (% of minutes)",
+    **{o.field: f"{o.short} ({o.difference_unit})" for o in OUTCOMES},
 }
 
 _UNSKILLED = {
@@ -224,23 +223,21 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "coverage_unchecked": lambda f: f"what the data cover could not be checked: {f.fact('text')}",
     "reference_missing": lambda f: "the cDBS reference, which it is held against, has no estimate",
     "reference_unsupported": lambda f: "the data do not support the cDBS reference, which it is held against",
-    "outcomes_unknown": lambda f: "no session has grasp, rating or tremor: whether it is worse than cDBS cannot be told",
+    "outcomes_unknown": lambda f: f"no session has {ANY}: whether it is worse than cDBS cannot be told",
     "energy_unknown": lambda f: "its energy is not predicted",
     "no_ordering_skill": _no_ordering_skill,
     "undecided": lambda f: "neither likely enough to be within the margins nor likely enough to be beyond one",
     "adverse_event": lambda f: "a serious adverse event under it has not been cleared by a clinician",
     "nearly_off": lambda f: f"nearly off, below 20 % of the cDBS amplitude, {percent(f.value)} of the time (at most {percent(f.limit)})",
     "beyond_margin": lambda f: (
-        f"{chance(number(f))} likely beyond a margin of grasp, rating or tremor, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
+        f"{chance(number(f))} likely beyond a margin of {ANY}, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
         f"(unsafe from {percent(f.limit)})"
     ),
     "extrapolates": lambda f: (
         f"it would hold {percent(f.value)} of the cDBS amplitude on average; the lowest that two sessions held is {percent(f.limit)}"
     ),
     "acts_like_cdbs": lambda f: f"acts like cDBS: {percent(f.value)} of its amplitude away from it on average",
-    "within_margins": lambda f: (
-        f"{chance(number(f))} likely within the margins of grasp, rating and tremor (a test asks for {percent(f.limit)})"
-    ),
+    "within_margins": lambda f: f"{chance(number(f))} likely within the margins of {ALL} (a test asks for {percent(f.limit)})",
     "saves_energy": lambda f: f"{chance(number(f))} likely to use less energy (a test asks for {percent(f.limit)})",
     "visits_needed": lambda f: f"on {counted(int(number(f)), 'visit')}",
     "not_settled_by_sessions": lambda f: "more sessions held near what it does would not settle it",

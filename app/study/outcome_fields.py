@@ -73,9 +73,6 @@ if TYPE_CHECKING:
     class StoredOutcomes(Model):
         """A field per outcome: its value, null where not measured."""
 
-    class MeanOutcomes(Model):
-        """A field per outcome: its mean over sessions, null where not measured."""
-
     class StatedMargins(Model):
         """A field per margin, the default where left out."""
 
@@ -87,7 +84,6 @@ if TYPE_CHECKING:
 else:
     EnteredOutcomes = fields_model("EnteredOutcomes", _entered)
     StoredOutcomes = fields_model("StoredOutcomes", _stored)
-    MeanOutcomes = fields_model("MeanOutcomes", lambda o: {o.field: (float | None, ...)})
     StatedMargins = fields_model("StatedMargins", _stated_margin)
     _Version = create_model("_Version", __base__=Model, version=(int, ...))
     VersionOfMargins = fields_model("VersionOfMargins", lambda o: {o.margin.field: (float, ...)}, _Version)

@@ -15,6 +15,7 @@ from app.study.margins.service import margins_of
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.verdict import SAME_AMPLITUDE, chance_within, interval, outcome_draws
 from ml.ope.support.behaviour_map import BehaviourMap
+from ml.outcomes import FIELDS
 
 ORDER = ("test", "test_with_care", "cannot_tell", "not_advised", "unsafe", "same_as_cdbs")
 """Rows by what to do with them; within a verdict as the ranking has them."""
@@ -35,7 +36,7 @@ OFF_SHARE = 0.8
 LEAST_SAVING = 0.05
 """Of the energy of cDBS; a behaviour that saves less is not worth further sessions to know of."""
 
-QUANTITIES = ("energy", "grasp_hz", "rating", "tremor_percent")
+QUANTITIES = ("energy", *FIELDS)
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Fixed:
 
     Attributes:
         fraction: of the cDBS amplitude. ma: mA; None where the cDBS amplitude is not known. differences: to cDBS, by quantity.
-        within: probability that grasp, rating and tremor are all no worse than cDBS by more than their margins.
+        within: probability that no outcome is worse than under cDBS by more than its margin.
     """
 
     fraction: float
@@ -81,7 +82,7 @@ class Row:
 
     @property
     def within(self) -> float | None:
-        """Probability that grasp, rating and tremor are all no worse than cDBS by more than their margins."""
+        """Probability that no outcome is worse than under cDBS by more than its margin."""
         return self.decided.verdict.within if self.decided.verdict else None
 
     @property

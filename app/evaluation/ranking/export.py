@@ -11,8 +11,9 @@ from fastapi import Response
 from app.evaluation.estimates.coverage import CHECKS
 from app.evaluation.schemas import FlagOut, RankedPolicy, RankingOut, TestedBefore
 from app.platform.web.csv_files import download, safe_cell
+from ml.outcomes import FIELDS
 
-_PREDICTED = ("energy", "mean_amplitude", "mean_beta", "grasp_hz", "rating", "tremor_percent")
+_PREDICTED = ("energy", "mean_amplitude", "mean_beta", *FIELDS)
 _NUMBERS = ("value", "low", "high", "level", "standard_error", "n", "step_return", "end_reward")
 _OF_RANKING = ("participant", "evaluation_id", "created_at", "default_method", "horizon_steps", "gamma", "stale")
 _OF_POLICY = ("rank", "policy_id", "name", "kind", "algorithm", "reference", "retired", "decision", "decision_reason", "probability_best")

@@ -16,6 +16,7 @@ from app.platform.web.svg import Plane, apart, drawing
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.verdict import interval, outcome_draws
 from ml.ope.support.behaviour_map import DOSES, BehaviourMap
+from ml.outcomes import OUTCOMES
 
 MOST = 8
 """Behaviours that have a line in their colour, with their name; more would hide each other, and are thin. Every candidate has its dot."""
@@ -29,9 +30,7 @@ _GREY = TONES["same_as_cdbs"]
 SHAPES = ("circle", "diamond", "square", "up", "down")
 _PANELS = {
     "energy": ("Energy, % of cDBS", 100.0),
-    "grasp_hz": ("Grasp, Hz", 1.0),
-    "rating": ("Rating, of 10", 1.0),
-    "tremor_percent": ("Tremor, % of the time", 1.0),
+    **{o.field: (f"{o.short}, {o.sentence_unit}", 1.0) for o in OUTCOMES},
 }
 W, H = 620.0, 400.0
 PANEL_W, PANEL_H = 235.0, 120.0

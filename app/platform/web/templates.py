@@ -16,6 +16,7 @@ from app.platform.database import now
 from app.platform.web.charts import counted, written
 from app.platform.web.numbers import fixed, minutes, number, p_text, place, rate, size, stated, time_left, typed, when, whole
 from app.settings import get_settings
+from ml.outcomes import ALL, ANY, OUTCOMES
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -82,4 +83,20 @@ _environment.filters.update(
     size=size,
     when=when,
 )
-_environment.globals.update(static_url=static_url, plotly_url=plotly_url, now=now, sign_on_name=sign_on_name)
+
+
+def outcome_columns(unit: str) -> list[dict[str, Any]]:
+    """Return the head of a table's columns of outcomes, with the named unit of their records."""
+    return [{"label": o.short, "num": True, "unit": getattr(o, unit)} for o in OUTCOMES]
+
+
+_environment.globals.update(
+    static_url=static_url,
+    plotly_url=plotly_url,
+    now=now,
+    sign_on_name=sign_on_name,
+    OUTCOMES=OUTCOMES,
+    ALL_OUTCOMES=ALL,
+    ANY_OUTCOME=ANY,
+    outcome_columns=outcome_columns,
+)
