@@ -54,10 +54,14 @@ class EndWeight:
     Attributes:
         setting: the name of its weight in the settings. sign: 1, or -1 where more takes reward away.
         as_fraction: the setting that says that per cent enter as 0 to 1; None where the outcome enters as it is.
+        label, help: of the form. description: of the interface.
     """
 
     setting: str
     sign: float
+    label: str
+    help: str
+    description: str
     as_fraction: str | None = None
 
     def scale(self, settings: Any) -> float:
@@ -258,7 +262,13 @@ OUTCOMES: tuple[Outcome, ...] = (
             exported="Grasp may be slower by this share of the frequency under cDBS.",
         ),
         failure=None,
-        end=EndWeight(setting="c2", sign=1.0),
+        end=EndWeight(
+            setting="c2",
+            sign=1.0,
+            label="Weight of grasp C₂",
+            help="Times the grasp frequency, Hz. 10, or 25 where symptoms are subtle; 0 drops grasp.",
+            description="Weight of the grasp frequency in r_end, C2; 0 drops it.",
+        ),
         derived=True,
         prediction=Prediction(kind="gaussian", model_error=(0.10, 0.03), least_error=0.02),
     ),
@@ -303,7 +313,13 @@ OUTCOMES: tuple[Outcome, ...] = (
             exported="The rating may be lower by this.",
         ),
         failure=1.0,
-        end=EndWeight(setting="c3", sign=1.0),
+        end=EndWeight(
+            setting="c3",
+            sign=1.0,
+            label="Weight of rating C₃",
+            help="Times the rating, 1 to 10. 0 drops the rating.",
+            description="Weight of the rating, C3; 0 drops it.",
+        ),
         scale="ordinal",
         model="ordinal",
         resolution=1.0,
@@ -349,7 +365,14 @@ OUTCOMES: tuple[Outcome, ...] = (
             exported="Tremor may take up this many more percentage points.",
         ),
         failure=100.0,
-        end=EndWeight(setting="c4", sign=-1.0, as_fraction="tremor_as_fraction"),
+        end=EndWeight(
+            setting="c4",
+            sign=-1.0,
+            as_fraction="tremor_as_fraction",
+            label="Weight of tremor C₄",
+            help="Times the tremor share, taken off. 0 drops tremor.",
+            description="Weight of tremor, C4; 0 drops it.",
+        ),
         model="minutes",
         resolution=1.0,
         bounded=True,
@@ -366,6 +389,9 @@ PREDICTED: tuple[tuple[Outcome, Prediction], ...] = tuple((o, o.prediction) for 
 
 BY_KEY: Mapping[str, Outcome] = {o.key: o for o in OUTCOMES}
 BY_FIELD: Mapping[str, Outcome] = {o.field: o for o in OUTCOMES}
+
+
+END_WEIGHTS: Mapping[str, EndWeight] = {o.end.setting: o.end for o in OUTCOMES if o.end is not None}
 
 
 def enumerated(words: Sequence[str], last: str = "and") -> str:

@@ -14,6 +14,7 @@ from app.platform.web.charts import ACCENT, GRID, MUTED, SYMBOLS, TEXT, WARN, Ce
 from app.platform.web.numbers import hover
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.models import SettingsVersion, Visit
+from ml.outcomes import OUTCOMES
 
 _GAP = 0.022
 _SHARE = 0.7
@@ -99,9 +100,7 @@ def _quantities(held: Evidence, sessions: Sequence[Facts]) -> list[tuple[str, st
         ("Beta", held.beta_unit or "", beta),
         ("Amplitude", "mA", own),
         ("Energy", "% of cDBS", [None if v is None else 100 * v for v in of("energy")]),
-        ("Grasp", "Hz", of("grasp")),
-        ("Rating", "1–10", of("rating")),
-        ("Tremor", "% of time", of("tremor")),
+        *((o.short, o.unit, of(o.key)) for o in OUTCOMES),
         ("Last dose", "h before", [s.medication_h for s in sessions]),
     ]
 

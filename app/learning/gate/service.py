@@ -22,18 +22,13 @@ from app.platform.database import set_reason
 from app.platform.errors import Invalid
 from app.study import blinding
 from app.study import service as study
-from app.study.models import Controller, Participant, SettingsVersion, StudySession
+from app.study.models import Controller, Participant, StudySession
+from ml.outcomes import OUTCOMES, Outcome
 from ml.statistics.multiplicity import holm
 from ml.statistics.ranksum import p_greater
 
 ALPHA = 0.05
 LEARNED = (Controller.RL, Controller.DISTILLED)
-QOCS = (
-    ("grasp_hz", "Grasp frequency", "Hz", True),
-    ("rating", "Rating", "1\u201310", True),
-    ("tremor_percent", "Tremor", "% of time", False),
-)
-"""Field, name, unit, and whether more is better."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +84,7 @@ def gate(db: Session, participant: Participant, sessions: Sequence[StudySession]
     arms = [(s, blinding.arm(s, SYSTEM).controller) for s in live]
     learned = [s for s, controller in arms if controller in LEARNED]
     random = [s for s, controller in arms if controller is Controller.RANDOM]
-    raw = [_compare(q, learned, random) for q in QOCS if _counts(participant.current_settings, q[0])]
+    raw = [_compare(o, learned, random) for o in OUTCOMES if o.end and o.end.weight(participant.current_settings)]
     tests = _adjusted(raw)
     better = any(t.p_better is not None and t.p_better < ALPHA for t in tests)
     worse = any(t.p_worse is not None and t.p_worse < ALPHA for t in tests)
@@ -112,24 +107,19 @@ def decide(db: Session, participant: Participant, choice: GateChoice, reason: st
     return row
 
 
-def _counts(settings: SettingsVersion, field: str) -> bool:
-    return {"grasp_hz": settings.c2, "rating": settings.c3, "tremor_percent": settings.c4}[field] > 0
-
-
-def _compare(qoc: tuple[str, str, str, bool], learned: Sequence[StudySession], random: Sequence[StudySession]) -> QocTest:
-    """Unadjusted one-sided tests of one QoC."""
-    field, name, unit, more_is_better = qoc
-    x, y = _values(learned, field), _values(random, field)
+def _compare(outcome: Outcome, learned: Sequence[StudySession], random: Sequence[StudySession]) -> QocTest:
+    """Unadjusted one-sided tests of one outcome."""
+    named = outcome.field, outcome.label, outcome.unit
+    x, y = _values(learned, outcome), _values(random, outcome)
     medians = (median(x) if x else None, median(y) if y else None)
     if not x or not y or 1 / comb(len(x) + len(y), len(x)) >= ALPHA:
-        return QocTest(field, name, unit, len(x), len(y), *medians)
-    sign = 1 if more_is_better else -1
-    a, b = [sign * v for v in x], [sign * v for v in y]
-    return QocTest(field, name, unit, len(x), len(y), *medians, p_better=p_greater(a, b), p_worse=p_greater(b, a))
+        return QocTest(*named, len(x), len(y), *medians)
+    a, b = [-outcome.loss(v) for v in x], [-outcome.loss(v) for v in y]
+    return QocTest(*named, len(x), len(y), *medians, p_better=p_greater(a, b), p_worse=p_greater(b, a))
 
 
-def _values(sessions: Sequence[StudySession], field: str) -> list[float]:
-    found = (getattr(s.qoc, field) for s in sessions if s.qoc is not None)
+def _values(sessions: Sequence[StudySession], outcome: Outcome) -> list[float]:
+    found = (s.qoc.value(outcome) for s in sessions if s.qoc is not None)
     return [float(v) for v in found if v is not None]
 
 

@@ -10,13 +10,14 @@ from app.planning.plans.view import PlanView
 from app.planning.sheet.content import Card, card_of
 from app.planning.sheet.ink import INK, LINE, MUTED
 from app.planning.sheet.latin1_text import latin
+from ml.outcomes import OUTCOMES
 
 WIDTH = 277.0
 _GAP, _PAD = 5.0, 2.0
 _CARD = (WIDTH - _GAP) / 2
 _HEAD, _TEXT, _BLANKS = 6.4, 3.9, 10.5
 _FIELDS = (
-    ("Started hh:mm", 20.0), ("Grasp Hz", 15.0), ("Rating 1-10", 17.0), ("Tremor %", 15.0), ("Medication, notes, adverse effects", 0.0),
+    ("Started hh:mm", 20.0), *((f"{o.short} {o.entry_unit}", 16.0) for o in OUTCOMES), ("Medication, notes, adverse effects", 0.0),
 )  # fmt: skip
 
 

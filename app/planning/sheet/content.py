@@ -9,6 +9,7 @@ from app.planning import wording
 from app.planning.plans.view import PlanLine, PlanView
 from app.planning.sheet.ink import clock, printed_name, printed_warning, shade
 from app.study.models import Controller
+from ml.outcomes import OUTCOMES
 
 BUNDLE = "Bundle"
 HASH = 12
@@ -76,5 +77,5 @@ def _expected(line: PlanLine) -> str:
     if e is None:
         return ""
     told = [] if line.predicted_energy is None else [f"energy {100 * line.predicted_energy:.0f} % of cDBS"]
-    units = (("grasp_hz", "grasp {:.2f} Hz"), ("rating", "rating {:.1f}"), ("tremor_percent", "tremor {:.0f} %"))
-    return ", ".join([*told, *(words.format(e.predicted[name]) for name, words in units if name in e.predicted)])
+    known = [o for o in OUTCOMES if o.field in e.predicted]
+    return ", ".join([*told, *(f"{o.noun} {e.predicted[o.field]:.{o.mean_decimals}f} {o.entry_unit}" for o in known)])

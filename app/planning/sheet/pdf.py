@@ -22,6 +22,7 @@ from app.platform.signatures.service import SignatureState
 from app.study.cdbs_amplitude import held_settings
 from app.study.characteristics.service import fields_of
 from app.study.wording import MEDICATION, characteristics_words, doses_words
+from ml.outcomes import ALL
 
 _CLOSING_MM = 32.0
 
@@ -183,7 +184,7 @@ def _reading(pdf: _Sheet, view: PlanView) -> None:
     if evaluation and any(line.row for line in view.lines):
         sentences.append(
             f"Expected, and against cDBS: by the ranking of {evaluation.created_at:%Y-%m-%d}. Energy: the mean of the squared amplitude, "
-            "100 % under cDBS. Margins: how much worse grasp, rating and tremor may be, set for this participant."
+            f"100 % under cDBS. Margins: how much worse {ALL} may be, set for this participant."
         )
     start = "by the clinic's clock" if view.plan.starts_at else "h:mm from the start of the first session"
     sentences.append(f"Start: {start}. Washout: pause on clinical stimulation after it. Bundle: first {HASH} characters of its hash.")

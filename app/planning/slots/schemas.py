@@ -7,6 +7,7 @@ from pydantic import Field
 from app.planning.slots.matching import Deviation
 from app.platform.web.schemas import Bool, Model
 from app.study.models import Controller
+from ml.outcomes import FIELDS
 
 
 class SlotRowOut(Model):
@@ -19,7 +20,7 @@ class SlotRowOut(Model):
     session_id: int | None = Field(description="That fills it; null where none was found.")
     confirmed: bool = Field(description="Whether a person has put the session there.")
     deviations: list[Deviation]
-    predicted: dict[str, float] = Field(description="Energy (mean squared fraction of cDBS), grasp_hz, rating, tremor_percent; known ones.")
+    predicted: dict[str, float] = Field(description=f"Energy (mean squared fraction of cDBS), {', '.join(FIELDS)}; known ones.")
     done: dict[str, float]
 
 

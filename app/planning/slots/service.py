@@ -29,9 +29,10 @@ from app.study.sessions import logged
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.data import session_data
 from app.study.visits.service import require_unlocked
+from ml.outcomes import FIELDS
 
-QUANTITIES = ("energy", "grasp_hz", "rating", "tremor_percent")
-"""What is predicted of a session and seen in it: mean squared fraction of cDBS, grasp in Hz, rating 1-10, % of time with tremor."""
+QUANTITIES = ("energy", *FIELDS)
+"""What is predicted of a session and seen in it: mean squared fraction of cDBS, and outcomes in their units."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any, Generic, TypeVar
 
 from app.platform.web.numbers import typed
+from ml.outcomes import END_WEIGHTS
 
 Row = TypeVar("Row")
 
@@ -107,11 +108,9 @@ GROUPS = (
     SettingGroup(
         "End-of-session reward",
         (
-            SettingField("c2", "Weight of grasp C₂", "Times the grasp frequency, Hz. 10, or 25 where symptoms are subtle; 0 drops grasp."),
-            SettingField("c3", "Weight of rating C₃", "Times the rating, 1 to 10. 0 drops the rating."),
-            SettingField("c4", "Weight of tremor C₄", "Times the tremor share, taken off. 0 drops tremor."),
+            *(SettingField(name, weight.label, weight.help) for name, weight in END_WEIGHTS.items()),
             SettingField(
-                "tremor_as_fraction", "Tremor enters as", "As per cent, tremor would outweigh grasp a hundredfold.",
+                "tremor_as_fraction", "Tremor enters as", "As per cent, it would outweigh the others a hundredfold.",
                 options=(("yes", "a fraction, 0 to 1"), ("no", "per cent, 0 to 100")),
             ),
             SettingField(

@@ -11,6 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.usual.values import SURE
+from ml.outcomes import END_WEIGHTS
 
 
 def _one_spelling(unit: str) -> str:
@@ -86,9 +87,9 @@ class SettingsFields(Model):
     r_a: Number = Field(0.0, description="Reward below the threshold.")
     r_b: Number = Field(-1.0, description="Reward at or above the threshold.")
     c1: Number = Field(0.3, description="Price of amplitude, C1.")
-    c2: Number = Field(10.0, description="Weight of the grasp frequency in r_end, C2; 0 drops it.")
-    c3: Number = Field(10.0, description="Weight of the rating, C3; 0 drops it.")
-    c4: Number = Field(10.0, description="Weight of tremor, C4; 0 drops it.")
+    c2: Number = Field(10.0, description=END_WEIGHTS["c2"].description)
+    c3: Number = Field(10.0, description=END_WEIGHTS["c3"].description)
+    c4: Number = Field(10.0, description=END_WEIGHTS["c4"].description)
     gamma: Number = Field(0.99, description="Discount per step.")
     lower_bound: Number = Field(0.3, description="B, lowest fraction of the random controller; never bounds a policy.")
     tremor_as_fraction: Bool = Field(True, description="Tremor enters r_end as 0-1 instead of per cent.")
