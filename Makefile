@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow check audit format lock bench soak clean
+.PHONY: help install demo test test-slow check measure audit format lock bench soak clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -37,6 +37,9 @@ check: install ## Lint, types, the import contract, and known flaws of the pinne
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tests/packages/known_flaws.py
+
+measure: install ## Print the measures of the code with their goals.
+	$(BIN)/python -m tests.architecture.measure
 
 audit: install ## Ask a public list for known flaws of the pinned packages, and fail where it cannot be asked.
 	$(BIN)/python tests/packages/known_flaws.py --required

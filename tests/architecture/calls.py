@@ -1,0 +1,46 @@
+"""Modules that a call enters: those of `app` and `ml` whose functions run during it, in its thread and in threads begun by it.
+
+What every request passes is left away: `app.platform`, `app.accounts` and `app.settings`. So are templates.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import CodeType, FrameType
+from typing import Any
+
+from tests.architecture.texts import ROOT
+
+EVERY_REQUEST = ("app.platform.", "app.accounts.", "app.settings")
+
+
+@contextmanager
+def modules_entered() -> Iterator[set[str]]:
+    """Collect the modules whose functions are called; the set is filled at the end."""
+    called: set[CodeType] = set()
+
+    def note(frame: FrameType, event: str, _: Any) -> None:
+        if event == "call":
+            called.add(frame.f_code)
+
+    modules: set[str] = set()
+    threading.setprofile(note)
+    sys.setprofile(note)
+    try:
+        yield modules
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)
+        modules.update(filter(None, map(module_of, called)))
+
+
+def module_of(code: CodeType) -> str | None:
+    """Name the module of a function; None for what is counted as no step of a call."""
+    path = code.co_filename.removeprefix(f"{ROOT}/")
+    if code.co_name == "<module>" or not path.startswith(("app/", "ml/")) or not path.endswith(".py"):
+        return None
+    name = path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    return None if name.startswith(EVERY_REQUEST) else name
