@@ -1,8 +1,8 @@
 """Does one measurement of a session go with another, such as beta with a QoC or with amplitude: within visits and between them, kept apart.
 
-Within visits: the common slope after each visit's means are taken off, and the correlation of what is left (Bland and Altman 1995). Its
-interval is that of leaving out one visit at a time, on t with degrees of freedom between visits - 1 and effective visits - 1, so that
-sessions of one visit never count as independent. Between visits: the same of the visits' means.
+Within visits, each visit's means are subtracted; the common slope and the correlation describe the rest (Bland and Altman 1995). The
+interval comes from excluding one visit at a time. It uses t with degrees of freedom between visits - 1 and effective visits - 1. So
+sessions of one visit never count as independent. Between visits, the same is done with the visits' means.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Association:
 
 
 def within_visits(x: Floats, y: Floats, visit: Integers, level: float = 0.95) -> Association | Unavailable:
-    """Association of y with x within visits.
+    """Estimate the association of y with x within visits.
 
     Args:
         x, y: of every session, [n], NaN where not known. visit: numbers, [n]. level: coverage of the intervals.
@@ -70,7 +70,7 @@ def within_visits(x: Floats, y: Floats, visit: Integers, level: float = 0.95) ->
 
 
 def between_visits(x: Floats, y: Floats, visit: Integers, level: float = 0.95) -> Association | Unavailable:
-    """Association of the visits' means, by the ordinary regression of V points; arguments as in `within_visits`."""
+    """Estimate the association of the visits' means, by the ordinary regression of V points; arguments as in `within_visits`."""
     _check(x, y, visit, level)
     known = np.isfinite(x) & np.isfinite(y)
     numbers = np.unique(visit[known])
@@ -93,7 +93,7 @@ def between_visits(x: Floats, y: Floats, visit: Integers, level: float = 0.95) -
 
 
 def _jackknifed(total: Floats, without: Floats, visits: int, sessions: int, level: float) -> Association | Unavailable:
-    """Slope and correlation of sums (xx, xy, yy), with intervals from the sums without each visit."""
+    """Compute slope and correlation of sums (xx, xy, yy), with intervals from the sums without each visit."""
     if (without[:, [0, 2]] <= 1e-12 * total[[0, 2]]).any():
         return Unavailable(Reason.ONE_VISIT)
     slope, slopes = total[1] / total[0], without[:, 1] / without[:, 0]
@@ -102,8 +102,8 @@ def _jackknifed(total: Floats, without: Floats, visits: int, sessions: int, leve
     errors = [float(np.sqrt((visits - 1) / visits * np.sum((v - v.mean()) ** 2))) for v in (slopes, zs)]
     if errors[0] <= 1e-12 * abs(slope):
         return Unavailable(Reason.NO_VARIANCE)
-    # Visits in which x hardly varies tell little: the effective number of visits is that of equal shares of the spread of x. In simulations
-    # visits - 1 degrees covered .92-.95, effective visits - 1 .96-.99, their mean .94-.965.
+    # Visits in which x hardly varies contribute little: the effective number of visits is that of equal shares of the spread of x. In
+    # simulations visits - 1 degrees covered .92-.95, effective visits - 1 .96-.99, their mean .94-.965.
     share = (total[0] - without[:, 0]) / total[0]
     degrees = (visits - 1 + max(1 / float(share @ share) - 1, 1.0)) / 2
     q = float(stdtrit(degrees, (1 + level) / 2))

@@ -36,7 +36,7 @@ class Interval:
 
 
 def resamples(n: int, draws: int, seed: int) -> Indices:
-    """Session indices drawn with replacement, shape [draws, n]; the same seed gives the same resamples for every policy.
+    """Draw session indices with replacement, shape [draws, n]; the same seed gives the same resamples for every policy.
 
     Raises:
         ValueError: no session or no draw.
@@ -47,7 +47,7 @@ def resamples(n: int, draws: int, seed: int) -> Indices:
 
 
 def resampled(n: int, seed: int) -> str:
-    """Name of `resamples` of n sessions with a seed: equal names mean equal resamples, as far as both go."""
+    """Name the `resamples` of n sessions with a seed: equal names mean equal resamples, as far as both go."""
     return f"{n} sessions, seed {seed}"
 
 
@@ -60,7 +60,7 @@ def session_bootstrap(
     seed: int = 0,
     method: Literal["percentile", "bca"] = "percentile",
 ) -> Interval:
-    """Interval of a statistic of n sessions.
+    """Estimate the interval of a statistic of n sessions.
 
     Args:
         statistic: value for a list of session indices, shape [n] (or [n - 1] in the jackknife of BCa), repeats allowed.
@@ -84,7 +84,7 @@ def session_bootstrap(
 
 
 def percentile_interval(values: NDArray[Any], level: float) -> Interval:
-    """Percentile interval of bootstrap draws, shape [draws]. Raises ValueError as `bca_interval` does."""
+    """Compute the percentile interval of bootstrap draws, shape [draws]. Raises ValueError as `bca_interval` does."""
     _check(level, values)
     tail = (1 - level) / 2
     low, high = _quantiles(values, [tail, 1 - tail])
@@ -92,12 +92,12 @@ def percentile_interval(values: NDArray[Any], level: float) -> Interval:
 
 
 def bca_interval(values: NDArray[Any], estimate: float, jackknife: NDArray[Any], level: float) -> Interval:
-    """Bias-corrected and accelerated interval (Efron and Tibshirani, eq. 14.9-14.15).
+    """Compute the bias-corrected and accelerated interval (Efron and Tibshirani, eq. 14.9-14.15).
 
     Args:
         values: bootstrap draws, shape [draws].
         estimate: the statistic of the sessions as they are.
-        jackknife: the statistic with one session left out, shape [n].
+        jackknife: the statistic without one session at a time, shape [n].
         level: coverage, between 0 and 1.
 
     Returns:
@@ -138,7 +138,7 @@ def _quantiles(values: NDArray[Any], shares: list[float]) -> Floats:
 
 
 def _scaled(values: NDArray[Any]) -> tuple[Floats, float]:
-    """Values of at most 2, and the power of two that they were divided by: neither sums nor squares of them overflow."""
+    """Scale values to at most 2, so that neither sums nor squares overflow; also return the power of two that they were divided by."""
     exponent = min(int(np.frexp(np.abs(values).max(initial=0.0))[1]), 1023)
     return np.ldexp(np.asarray(values, dtype=np.float64), -exponent), float(np.ldexp(1.0, exponent))
 

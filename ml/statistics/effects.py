@@ -27,7 +27,7 @@ BOOTSTRAP_FROM = 5
 
 
 class SavingMethod(StrEnum):
-    """How the interval of a saving was found."""
+    """Method by which the interval of a saving was computed."""
 
     STUDENT = "t"
     BOOTSTRAP = "bootstrap_t"
@@ -54,7 +54,7 @@ class Saving:
 
 
 def cliffs_delta(data: Measurements, level: float = 0.95) -> Average | Unavailable:
-    """Cliff's delta within visits: how much more often the controller's value is the higher one than the lower one (Cliff 1993).
+    """Estimate Cliff's delta within visits: how much more often the controller's value is the higher one than the lower one (Cliff 1993).
 
     Returns:
         The average over visits, between -1 and 1 with its interval cut there; or why there is none, as in `visits.primary`.
@@ -67,7 +67,7 @@ def cliffs_delta(data: Measurements, level: float = 0.95) -> Average | Unavailab
 
 
 def saving_contrasts(energy: Measurements) -> VisitContrasts | Unavailable:
-    """Share of the energy saved at every visit: one less the ratio of the arms' means.
+    """Compute the share of energy saved at every visit: one less the ratio of the arms' means.
 
     Args:
         energy: energy of every session in one unit, or relative to cDBS. `resolution` in the same unit.
@@ -85,11 +85,11 @@ def saving_contrasts(energy: Measurements) -> VisitContrasts | Unavailable:
 
 
 def energy_saving(energy: Measurements, level: float = 0.95, *, draws: int = 1999, seed: int = 0) -> Saving | Unavailable:
-    """Energy saved on average over visits: by bootstrap of visits from five visits on, by t below and where they differ by less than the
-    energy's resolution.
+    """Estimate the energy saved on average over visits. From five visits on the interval is a bootstrap of visits. With fewer, or where
+    visits differ by less than the energy's resolution, it uses t.
 
-    The bootstrap is the one of Student's ratio (Efron and Tibshirani 1993, chapter 12.5): the percentile and BCa intervals of five visits
-    cover far less than they state.
+    The bootstrap is that of Student's ratio (Efron and Tibshirani 1993, chapter 12.5). Percentile and BCa intervals of five visits cover
+    far less than they state.
 
     Args:
         energy: as in `saving_contrasts`.
@@ -106,7 +106,7 @@ def energy_saving(energy: Measurements, level: float = 0.95, *, draws: int = 199
         return whole
     visits, by_visit = tuple(shares.visit.tolist()), tuple((100 * shares.contrast).tolist())
     low, high, p, method = whole.low, whole.high, whole.p_above(0.0), SavingMethod.STUDENT
-    # what varies less than its resolution tells nothing of its spread by resampling
+    # where the visits vary less than the resolution, resampling shows nothing of their spread
     if shares.visits >= BOOTSTRAP_FROM and float(shares.contrast.var(ddof=1)) > float(shares.floor.mean()):
         ratios = student_ratios(shares.contrast, draws, seed)
         top, bottom = np.quantile(ratios, [(1 + level) / 2, (1 - level) / 2])
@@ -119,7 +119,7 @@ def energy_saving(energy: Measurements, level: float = 0.95, *, draws: int = 199
 
 
 def student_ratios(values: Floats, draws: int, seed: int) -> Floats:
-    """Student's ratio of resamples of values [V] about their mean; resamples that hold one value alone have none."""
+    """Compute Student's ratio of resamples of values [V] about their mean; resamples with a single distinct value have none."""
     drawn = values[resamples(values.size, draws, seed)]
     spread = drawn.std(axis=1, ddof=1)
     usable = spread > 1e-12 * max(1.0, float(np.abs(values).max()))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's step-down adjustment: the k-th smallest of m p-values times (m - k + 1), never falling, at most 1 (Holm 1979)."""
+    """Apply Holm's step-down adjustment: the k-th smallest of m p-values times (m - k + 1), never falling, at most 1 (Holm 1979)."""
     order = np.argsort(p_values, kind="stable")
     adjusted = np.empty(len(p_values))
     adjusted[order] = np.minimum(1.0, np.maximum.accumulate(np.asarray(p_values)[order] * np.arange(len(p_values), 0, -1)))
@@ -18,7 +18,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def hommel(p_values: Sequence[float]) -> list[float]:
-    """Hommel's adjustment: closed testing with Simes' test of every intersection (Hommel 1988; Simes 1986). Never above Holm's.
+    """Apply Hommel's adjustment: closed testing with Simes' test of every intersection (Hommel 1988; Simes 1986). Never above Holm's.
 
     Holds its level where the tests are independent or positively dependent, as one-sided tests of outcomes of the same sessions are that
     get worse together.
@@ -33,12 +33,12 @@ def hommel(p_values: Sequence[float]) -> list[float]:
 
 
 def _simes(p: NDArray[np.float64]) -> float:
-    """Simes' p of the intersection: the least of m p_(k) / k."""
+    """Compute Simes' p of the intersection: the least of m p_(k) / k."""
     return float(np.min(np.sort(p) * p.size / np.arange(1, p.size + 1)))
 
 
 def benjamini_hochberg(p_values: Sequence[float]) -> list[float]:
-    """Benjamini and Hochberg's step-up adjustment: the k-th smallest of m p-values times m / k, never falling, at most 1 (1995).
+    """Apply Benjamini and Hochberg's step-up adjustment: the k-th smallest of m p-values times m / k, never falling, at most 1 (1995).
 
     Rejecting what is at most q keeps the expected share of false rejections at q where the tests are independent or positively dependent.
     """

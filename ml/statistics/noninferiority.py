@@ -1,9 +1,9 @@
 """Energy saved without loss: non-inferiority of every outcome first, then the saving.
 
-A controller is non-inferior where each outcome by itself is shown to be no worse than cDBS by its margin (intersection-union test, Berger
-1982: every outcome at the full level, all must pass). Only then is the saving tested, at the same level (gatekeeping, so that no correction
-is due). Sessions that were stopped for the patient's sake are failures and never missing. Fewer than three visits with both arms
-give no verdict, whatever they show. Margins are inputs: they are stated before the data are seen.
+A controller is non-inferior where each outcome is shown to be no worse than cDBS by its margin. This is an intersection-union test (Berger
+1982): every outcome is tested at the full level, and all must pass. Only then is the saving tested, at the same level, so that no
+correction is due (gatekeeping). Sessions that were stopped for the patient's sake are failures and never missing. Fewer than three visits
+with both arms give no verdict, whatever they show. Margins are inputs: they are stated before the data are seen.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ Floats = NDArray[np.float64]
 LEAST_VISITS = 3
 WANTED_POWER = 0.8
 PLANNED_SESSIONS = 3
-"""Sessions of either arm in a further visit, where nobody states another number."""
+"""Sessions of either arm in a further visit, unless another number is stated."""
 ENERGY = "energy"
 Reasons = tuple[tuple[str, Reason], ...]
-"""Outcomes (or `energy`), each with the reason why something cannot be told of it."""
+"""Outcomes (or `energy`), each with the reason why a result is missing."""
 
 
 class FailureRule(StrEnum):
-    """What a session that was stopped for the patient's sake counts as.
+    """Value of a session that was stopped for the patient's sake.
 
     WORST_CASE: the failure value under the controller; under cDBS what was measured, so that no failure of cDBS helps the controller.
     BOTH_ARMS: the failure value under either. AS_MEASURED: what was measured, or left out. END_OF_SCALE: under the controller the worst end
@@ -94,9 +94,9 @@ class Outcome:
             raise ValueError(f"`stopped` of {self.name} has the shape {self.stopped.shape}, its values {self.data.value.shape}")
 
     def counted(self, rule: FailureRule) -> Measurements:
-        """The sessions with failures filled in, turned so that higher is better; `ordinal` values with the margin added.
+        """Fill in failures and turn values so that higher is better; `ordinal` values of the controller get the margin added.
 
-        They count as unbounded: one-sided, to free Student's ratio from skewness mends little of its error and costs conclusions.
+        They count as unbounded. One-sided, to free Student's ratio from skewness corrects little of its error and costs conclusions.
         """
         sign = 1.0 if self.higher_is_better else -1.0
         value = sign * self.data.value
@@ -153,15 +153,15 @@ class Inferior:
 
 @dataclass(frozen=True)
 class Inconclusive:
-    """What is not shown.
+    """Verdict without a conclusion, and what is missing for one.
 
     Attributes:
         open: outcomes (or `energy`) that are not shown yet.
-        more_visits: further visits after which a conclusion has a probability of `WANTED_POWER`; None where `MOST_VISITS` are not enough,
-            or where `unplanned` says why it cannot be told.
+        more_visits: further visits after which a conclusion has a probability of `WANTED_POWER`. None where `MOST_VISITS` are not enough,
+            or where `unplanned` gives the reason why it is unknown.
         untested: of `open`, what could not be tested, with the reason.
         fewest_visits: the same with any number of sessions in each of them: what sessions cannot replace.
-        unplanned: outcomes (or `energy`) without which no number of further visits can be told, with the reason.
+        unplanned: outcomes (or `energy`) that prevent planning of further visits, with the reason.
     """
 
     open: tuple[str, ...]
@@ -203,7 +203,7 @@ def assess(
     seed: int = 0,
     plan: bool = True,
 ) -> Assessment:
-    """Non-inferiority of all outcomes, then the saving.
+    """Assess non-inferiority of all outcomes, then the saving.
 
     Args:
         outcomes: at least one. energy: of every session; a stopped session of the controller saves nothing. stopped: of `energy`'s
@@ -240,7 +240,7 @@ def assess(
 
 
 def counted_energy(energy: Measurements, stopped: NDArray[np.bool_], rule: FailureRule) -> Measurements:
-    """Energies in which a failed session of the controller takes what cDBS takes at that visit, or more where it did."""
+    """Give a failed session of the controller the energy of cDBS at that visit, or its own where that is more."""
     if rule is FailureRule.AS_MEASURED:
         return energy
     value = energy.value.copy()
@@ -271,7 +271,7 @@ def _outcome(outcome: Outcome, rule: FailureRule, level: float) -> OutcomeResult
 
 
 def _less_favourable(adjusted: Average, plain: Average | Unavailable, outcome: Outcome) -> Average:
-    """Where a session of the controller failed: the worse of the averages with and without adjustment for the order.
+    """Choose, where a session of the controller failed, the worse of the averages with and without adjustment for the order.
 
     Sessions that are stopped come late in a visit, so that a drift fitted through their failures would explain them away.
     """
@@ -302,8 +302,8 @@ def _verdict(results: Sequence[OutcomeResult], saving: Saving | Unavailable, alp
 def _planned(
     verdict: Inconclusive, outcomes: Sequence[Outcome], energy: Measurements, alpha: float, sessions: int, seed: int
 ) -> Inconclusive:
-    """With the fewest further visits after which all is shown with the wanted probability, outcomes taken as independent: with so many
-    sessions of either arm at each, and with any number of them."""
+    """Add the fewest further visits after which all is shown with the wanted probability. Outcomes count as independent. The number is
+    given for so many sessions of either arm per visit, and for any number of them."""
     chances, limit = np.ones(MOST_VISITS), np.ones(MOST_VISITS)
     shares = _energy_posterior(energy, seed)
     wanted = [(o.name, posterior(o.counted(FailureRule.WORST_CASE), o.scale, seed=seed + i), o.loss) for i, o in enumerate(outcomes)] + [
@@ -320,7 +320,7 @@ def _planned(
 
 
 def _energy_posterior(energy: Measurements, seed: int) -> Posterior | Unavailable:
-    """Posterior of the share saved: energies of each visit relative to the mean of its cDBS sessions."""
+    """Draw the posterior of the share saved: energies of each visit relative to the mean of its cDBS sessions."""
     shares = saving_contrasts(energy)
     if isinstance(shares, Unavailable):
         return shares

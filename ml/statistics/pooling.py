@@ -1,8 +1,7 @@
 """Several participants: each a result of its own, and a random-effects summary that claims nothing about a population.
 
-Sources: Paule and Mandel 1982 (the variance between participants), Hartung and Knapp 2001 with the factor of Roever, Knapp and Friede 2015
-that
-never makes an interval narrower than the normal one, Higgins, Thompson and Spiegelhalter 2009 (the prediction interval).
+Sources. Paule and Mandel 1982: variance between participants. Hartung and Knapp 2001: interval. Roever, Knapp and Friede 2015: the factor
+that never makes an interval narrower than the normal one. Higgins, Thompson and Spiegelhalter 2009: prediction interval.
 """
 
 from __future__ import annotations
@@ -50,14 +49,14 @@ class Summary:
 
 
 def pool(results: Sequence[Average | Unavailable], level: float = 0.95) -> Summary | Unavailable:
-    """Summary of the participants that have a result; needs two of them."""
+    """Summarise the participants that have a result; needs two of them."""
     averages = [r for r in results if isinstance(r, Average)]
     estimates = np.array([r.estimate - r.null for r in averages])
     return pool_estimates(estimates, np.array([r.standard_error for r in averages]), level)
 
 
 def pool_estimates(estimates: Floats, errors: Floats, level: float = 0.95) -> Summary | Unavailable:
-    """Summary of estimates [k] with standard errors [k].
+    """Summarise estimates [k] with standard errors [k].
 
     Raises:
         ValueError: a standard error that is not above zero, or a level outside (0, 1).
@@ -98,7 +97,7 @@ def pool_estimates(estimates: Floats, errors: Floats, level: float = 0.95) -> Su
 
 
 def paule_mandel(estimates: Floats, errors: Floats) -> float:
-    """Variance between participants at which the weighted sum of squares is its expectation k - 1; 0 where it is below it already."""
+    """Find the variance between participants at which the weighted sum of squares is its expectation k - 1; 0 where it is already below."""
 
     def excess(tau2: float) -> float:
         weight = 1 / (tau2 + errors**2)
@@ -112,7 +111,7 @@ def paule_mandel(estimates: Floats, errors: Floats) -> float:
 
 
 def sign_test(values: Floats) -> float:
-    """Two-sided p of the sign test: that values above and below zero are equally likely; zeros are left out."""
+    """Compute the two-sided p of the sign test: values above and below zero are equally likely. Zeros are excluded."""
     above, below = int(np.sum(values > 0)), int(np.sum(values < 0))
     if above + below == 0:
         return 1.0

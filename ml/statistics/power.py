@@ -1,4 +1,4 @@
-"""What more visits would show: simulated from the posterior of the average effect and of both variances.
+"""Power of further visits, simulated from the posterior of the average effect and of both variances.
 
 The contrast of visit v is normal about the average effect with variance tau^2 + sigma^2 (1/n + 1/m): tau between visits, sigma between
 sessions of a visit. More sessions shrink the second part alone; what is left is the floor that only visits lower. The prior of
@@ -66,7 +66,7 @@ class Power:
 
 @dataclass(frozen=True)
 class Target:
-    """What is to be shown.
+    """Conclusion that further visits are to show.
 
     Attributes:
         value: the effect that is to be excluded, such as 0, or minus a margin. alternative: that the effect is `greater`, or merely other.
@@ -80,10 +80,10 @@ class Target:
 
 
 def posterior(data: Measurements, scale: Scale = "difference", *, draws: int = 1000, seed: int = 0) -> Posterior | Unavailable:
-    """Posterior of the average effect, tau and sigma.
+    """Draw the posterior of the average effect, tau and sigma.
 
     Returns:
-        Draws, or why there are none: no visit with both arms, or not one degree of freedom to tell sigma from.
+        Draws, or why there are none: no visit with both arms, or not one degree of freedom to estimate sigma from.
     """
     contrasts = visit_contrasts(data, scale)
     if isinstance(contrasts, Unavailable):
@@ -110,7 +110,7 @@ def posterior(data: Measurements, scale: Scale = "difference", *, draws: int = 1
 
 
 def success(of: Posterior, target: Target, sessions_per_arm: float, *, seed: int = 0, most: int = MOST_VISITS) -> NDArray[np.bool_]:
-    """Whether the test of `visits.average` succeeds after 1 ... `most` more visits, for every draw of the posterior, [S, most].
+    """Simulate whether the test of `visits.average` succeeds after 1 ... `most` more visits, for every draw of the posterior, [S, most].
 
     Args:
         of: the posterior. target: what is to be shown. sessions_per_arm: in each further visit; infinity for the floor.
@@ -150,7 +150,7 @@ def power(
     draws: int = 1000,
     seed: int = 0,
 ) -> Power | Unavailable:
-    """Power after each number of further visits, and what more sessions in them could add.
+    """Compute the power after each number of further visits, and what more sessions in them could add.
 
     Raises:
         ValueError: fewer than one session per arm.
@@ -169,16 +169,16 @@ def power(
 
 
 def first_reaching(chances: Floats, wanted: float) -> int | None:
-    """The first of 1 ... K further visits whose probability reaches what is wanted."""
+    """Find the first of 1 ... K further visits whose probability reaches what is wanted."""
     reached = np.flatnonzero(chances >= wanted)
     return int(reached[0]) + 1 if reached.size else None
 
 
 def _within(data: Measurements, contrasts: VisitContrasts, scale: Scale) -> tuple[float, int]:
-    """Sum of squares within arms of visits, and its degrees of freedom."""
+    """Compute the sum of squares within arms of visits, and its degrees of freedom."""
     if scale != "difference":
-        # What one session adds to a share of pairs is the share that it wins by itself (DeLong, DeLong and Clarke-Pearson 1988). Where all
-        # of them win all, nothing is told of the spread: one session more, as without a difference (1/12), keeps it above zero.
+        # One session adds to a share of pairs the share that it wins alone (DeLong, DeLong and Clarke-Pearson 1988). Where every session
+        # wins all pairs, the spread is unknown: one session more, as without a difference (1/12), keeps it above zero.
         won = [pairs(data.value[one], data.value[two], step_of(data, scale)) for _, one, two in data.arms]
         squares = sum(float(np.sum((p.mean(axis) - p.mean()) ** 2)) for p in won for axis in (0, 1))
         return squares + 1 / 12, int(contrasts.n_tested.sum() + contrasts.n_cdbs.sum()) - 2 * len(won) + 1

@@ -1,5 +1,5 @@
-"""The primary comparison of a controller with the same visit's cDBS: the average of the visits' contrasts, freed from the order where the
-design puts one arm later than the other."""
+"""Primary comparison of a controller with the same visit's cDBS: the average of the visits' contrasts. Where the design puts one arm later
+than the other, the average is adjusted for the order."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from ml.statistics.within_visits.contrasts import (
 )
 
 UNBALANCED = 0.5
-"""Arms whose mean places in the order differ by more than this many standard deviations of the place, on average over visits, are compared
-with an adjustment for the order. The rule looks at the design alone, never at what was measured."""
+"""Limit of the mean difference in place between arms, in standard deviations of the place, averaged over visits. Above it the comparison is
+adjusted for the order. The rule looks at the design alone, never at what was measured."""
 
 
 def order_imbalance(data: Measurements) -> float | None:
-    """How much later the controller's sessions come than cDBS, on average over visits, in standard deviations of the place in the visit.
+    """Measure how much later the controller's sessions come than cDBS, on average over visits, in standard deviations of the place in the
+    visit.
 
     None where no order is known or no visit has both arms.
     """
@@ -34,10 +35,10 @@ def order_imbalance(data: Measurements) -> float | None:
 
 
 def primary(data: Measurements, level: float = 0.95, scale: Scale = "difference") -> Average | Unavailable:
-    """The primary comparison: the average over visits, adjusted for the order where the design puts one arm later than the other.
+    """Average the primary comparison over visits, adjusted for the order where the design puts one arm later than the other.
 
     Returns:
-        The average with its `adjustment`. Where the order is unbalanced and cannot be told apart from the controller it is unadjusted, and
+        The average with its `adjustment`. Where the order is unbalanced and cannot be separated from the controller it is unadjusted, and
         `order_imbalance` says so.
     """
     imbalance = order_imbalance(data)
@@ -53,11 +54,11 @@ def adjusted_average(
 ) -> Average | Unavailable:
     """Average over visits of contrasts freed from covariates whose slopes are common to all visits and arms.
 
-    The slopes come from what varies within one arm of one visit. They tie the contrasts of the visits together, so that the variance is
-    that of leaving out one visit at a time, slopes included (the cluster jackknife, CV3 of MacKinnon, Nielsen and Webb 2023).
+    The slopes come from what varies within one arm of one visit. They tie the contrasts of the visits together. So the variance excludes
+    one visit at a time, slopes included (the cluster jackknife, CV3 of MacKinnon, Nielsen and Webb 2023).
 
     Args:
-        data: sessions of both arms. covariates: each [n], as `data`; sessions with an unknown one are left out.
+        data: sessions of both arms. covariates: each [n], as `data`; sessions with an unknown one are excluded.
         scale: as in `visit_contrasts`, of the values less what the covariates explain.
 
     Returns:
@@ -91,7 +92,8 @@ def adjusted_average(
 
 
 def _common_slopes(data: Measurements, table: Floats) -> Floats | None:
-    """Slopes on covariates [n, c] within arms of visits, of all visits and without each, [V + 1, c]; None where they are not identified."""
+    """Fit slopes on covariates [n, c] within arms of visits, of all visits and without each, [V + 1, c]; None where they are not
+    identified."""
     grams, moments = [], []
     for _, one, two in data.arms:
         centred = np.concatenate([table[arm] - table[arm].mean(0) for arm in (one, two)])
@@ -106,7 +108,7 @@ def _common_slopes(data: Measurements, table: Floats) -> Floats | None:
 
 
 def _smallest_share(grams: Floats, whole: Floats) -> float:
-    """Smallest eigenvalue of gram matrices [k, c, c] whose columns are scaled by those of another."""
+    """Compute the smallest eigenvalue of gram matrices [k, c, c] whose columns are scaled by those of another."""
     scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     if not np.diag(whole).all():
         return 0.0

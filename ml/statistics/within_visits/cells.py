@@ -26,16 +26,16 @@ class Cells:
     counts: Integers
 
     def sums(self, values: Floats) -> Floats:
-        """Sums of values [m] by visit and arm, [V, 2]."""
+        """Sum values [m] by visit and arm, [V, 2]."""
         return np.bincount(self.cell, weights=values, minlength=self.counts.size).astype(np.float64).reshape(-1, 2)
 
     def means(self, values: Floats) -> Floats:
-        """Means of values [m] by visit and arm, [V, 2]."""
+        """Average values [m] by visit and arm, [V, 2]."""
         return self.sums(values) / self.counts
 
 
 def cells_of(known: NDArray[np.bool_], visit: Integers, tested: NDArray[np.bool_]) -> Cells:
-    """The cells of n sessions.
+    """Sort n sessions into cells.
 
     Args:
         known: which were measured, [n]. visit: numbers, [n]. tested: True for the controller, False for cDBS, [n].

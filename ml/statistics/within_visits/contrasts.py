@@ -1,10 +1,9 @@
 """A controller against the cDBS sessions of the same visit, with the visit as the unit of evidence.
 
-Each visit that has both arms gives one contrast; the average of the contrasts is held against their spread by Student's t with one degree
-of freedom fewer than visits. Days that differ, days on which the controller does better or worse than on others, and visits of different
-size all end up in that spread, so that sessions of one visit never count as independent evidence. The test keeps its level for contrasts
-that are normal with unequal variances (Bakirov and Szekely 2005; Ibragimov and Mueller 2010): two-sided up to 8.3 %, one-sided up to 5 %
-for 2 to 14 visits.
+Each visit that has both arms gives one contrast. Student's t compares the average of the contrasts with their spread, with one degree of
+freedom fewer than visits. That spread includes three things: days that differ, effects that differ between days, and visits of different
+size. So sessions of one visit never count as independent evidence. The test keeps its level for normal contrasts with unequal variances
+(Bakirov and Szekely 2005; Ibragimov and Mueller 2010). That is proven two-sided up to 8.3 %, and one-sided up to 5 % for 2 to 14 visits.
 
 A metric with a floor or a ceiling has skewed contrasts where the effect differs between visits, and Student's ratio then errs. Of such a
 metric the larger p counts of Student's ratio and of the same freed from its skewness (Hall 1992), and the
@@ -29,7 +28,7 @@ Integers = NDArray[np.int64]
 Scale = Literal["difference", "win_probability", "ordinal"]
 
 LEAST_FOR_SKEWNESS = 3
-"""Visits below which contrasts tell no skewness: two are always symmetric."""
+"""Fewest visits whose contrasts can show skewness: two are always symmetric."""
 
 
 NEGLIGIBLE = 1e-12
@@ -37,7 +36,7 @@ NEGLIGIBLE = 1e-12
 
 
 class Reason(StrEnum):
-    """Why a number is not given.
+    """Reason why a number is not given.
 
     ALL_EQUAL: every session has the same value. NO_VARIANCE: sessions may differ, but what is averaged over visits is the same at each.
     TOO_FEW_SESSIONS: no arm of a visit has two sessions, and no visit another to differ from. ONE_VISIT: all that varies, varies in one.
@@ -70,7 +69,7 @@ class Unavailable:
 
 
 class Adjustment(StrEnum):
-    """What a contrast is freed from."""
+    """Adjustment of a contrast: what it is freed from."""
 
     NONE = "none"
     ORDER = "order"
@@ -82,7 +81,7 @@ class Adjustment(StrEnum):
 
 @dataclass(frozen=True)
 class Measurements:
-    """One metric of a controller's sessions and of the cDBS sessions they are held against; n sessions.
+    """One metric of a controller's sessions and of the cDBS sessions they are compared with; n sessions.
 
     Attributes:
         value: [n], NaN where it was not measured.
@@ -128,7 +127,7 @@ class Measurements:
         resolution: float = 0.0,
         bounded: bool = False,
     ) -> Measurements:
-        """From anything that numpy can read; errors as in the class."""
+        """Convert anything that numpy can read; errors as in the class."""
         return cls(
             np.asarray(value, dtype=np.float64).ravel(),
             np.asarray(visit, dtype=np.int64).ravel(),
@@ -140,7 +139,7 @@ class Measurements:
         )
 
     def take(self, rows: NDArray[np.bool_] | Integers) -> Measurements:
-        """Some of the sessions."""
+        """Select some of the sessions."""
         return Measurements(
             self.value[rows],
             self.visit[rows],
@@ -171,7 +170,7 @@ class Measurements:
 
     @cached_property
     def contrasts(self) -> dict[Scale, VisitContrasts | Unavailable]:
-        """What `visit_contrasts` has found, by scale."""
+        """Cached results of `visit_contrasts` by scale."""
         return {}
 
     @cached_property
@@ -191,7 +190,7 @@ class Measurements:
         return float(np.mean(np.divide(later, spread, out=np.zeros_like(later), where=spread > 0)))
 
     def no_evidence(self) -> Unavailable:
-        """Why no visit has both arms."""
+        """Explain why no visit has both arms."""
         tested = self.tested[np.isfinite(self.value)]
         one_arm = not tested.any() or tested.all()
         return Unavailable(Reason.NO_SESSION if one_arm else Reason.NO_VISIT_WITH_BOTH_ARMS, 0, 1)
@@ -256,28 +255,28 @@ class Average:
     skewness: float = 0.0
 
     def p_above(self, value: float) -> float:
-        """One-sided p of the hypothesis that the average is `value` or less."""
+        """Compute the one-sided p of the hypothesis that the average is `value` or less."""
         return float(stdtr(self.degrees, -min(self._ratios(value))))
 
     def p_below(self, value: float) -> float:
-        """One-sided p of the hypothesis that the average is `value` or more."""
+        """Compute the one-sided p of the hypothesis that the average is `value` or more."""
         return float(stdtr(self.degrees, max(self._ratios(value))))
 
     def _ratios(self, value: float) -> tuple[float, float]:
-        """Student's ratio against a value, and the same freed from skewness."""
+        """Compute Student's ratio against a value, and the same freed from skewness."""
         ratio = (self.estimate - value) / self.standard_error
         return ratio, float(unskewed(ratio, self.skewness, self.visits))
 
 
 def visit_contrasts(data: Measurements, scale: Scale = "difference") -> VisitContrasts | Unavailable:
-    """The contrast of every visit with both arms.
+    """Compute the contrast of every visit with both arms.
 
     Args:
-        data: sessions of both arms; those without a value are left out.
-        scale: `difference` of means, or `win_probability`: the share of pairs of one session of either arm of the visit in which the
-            controller's value is the higher one, ties counting one half (then the null is 0.5). `ordinal` is the same for steps of
-            `resolution`, to which a shift may have been added: pairs less than a step apart count in proportion, so that a shift between
-            two whole steps lies between what these give.
+        data: sessions of both arms; those without a value are excluded.
+        scale: `difference` of means, `win_probability` or `ordinal`. `win_probability` is the share of pairs in which the controller's
+            value is higher. A pair is one session of either arm; ties count one half, so the null is 0.5. `ordinal` is the same for steps
+            of `resolution`, to which a shift may have been added. Its pairs less than a step apart count in proportion. So a shift between
+            two whole steps gives a value between theirs.
 
     Returns:
         The contrasts, or why there is none: no session of an arm, or no visit with both. The same object whenever it is asked again.
@@ -308,18 +307,19 @@ def _contrasts(data: Measurements, scale: Scale) -> VisitContrasts | Unavailable
 
 
 def win_probability(x: Floats, y: Floats, step: float = 0.0) -> float:
-    """Share of pairs with x > y, ties counting one half; of a scale in steps, pairs less than a step apart count in proportion."""
+    """Compute the share of pairs with x > y, ties counting one half. On a scale in steps, pairs less than a step apart count in
+    proportion."""
     return float(pairs(x, y, step).mean())
 
 
 def pairs(x: Floats, y: Floats, step: float = 0.0) -> Floats:
-    """What each pair counts for `win_probability`, 0 to 1, [n_x, n_y]."""
+    """Compute what each pair counts for `win_probability`, 0 to 1, [n_x, n_y]."""
     difference = np.subtract.outer(x, y)
     return np.asarray(0.5 + 0.5 * (np.clip(difference / step, -1.0, 1.0) if step else np.sign(difference)))
 
 
 def step_of(data: Measurements, scale: Scale) -> float:
-    """Step of the comparison of pairs; 0 where any difference counts whole."""
+    """Give the step of the comparison of pairs; 0 where any difference counts whole."""
     return data.resolution if scale == "ordinal" else 0.0
 
 
@@ -340,7 +340,7 @@ def average(contrasts: VisitContrasts | Unavailable, level: float = 0.95) -> Ave
 
 
 def unskewed(ratio: Any, skewness: Any, visits: Any) -> Any:
-    """Student's ratio freed from the skewness of its contrasts by Hall's cubic transformation (Hall 1992), which is monotone.
+    """Free Student's ratio from the skewness of its contrasts by Hall's cubic transformation (Hall 1992), which is monotone.
 
     Numbers or arrays: the ratio, the third central moment in cubes of the standard deviation, and the number of visits.
     """
@@ -349,7 +349,7 @@ def unskewed(ratio: Any, skewness: Any, visits: Any) -> Any:
 
 
 def skewed(quantile: float, skewness: float, visits: int) -> float:
-    """The ratio that `unskewed` takes to a quantile."""
+    """Invert `unskewed`: find the ratio that it takes to a quantile."""
     if abs(skewness) < 1e-6:
         return quantile
     shifted = quantile / np.sqrt(visits) - skewness / (6 * visits)
@@ -357,7 +357,8 @@ def skewed(quantile: float, skewness: float, visits: int) -> float:
 
 
 def skewness_of(contrasts: Floats, variance: float) -> float:
-    """Third central moment of contrasts [V] in cubes of the standard deviation; 0 of fewer than three, which tell none."""
+    """Compute the third central moment of contrasts [V] in cubes of the standard deviation; 0 of fewer than three, whose skewness is
+    unknown."""
     if contrasts.size < LEAST_FOR_SKEWNESS or variance <= 0:
         return 0.0
     return float(np.mean((contrasts - contrasts.mean()) ** 3) / variance**1.5)
@@ -372,7 +373,7 @@ def student(
     at_most: float = np.inf,
     freed: Floats | None = None,
 ) -> Average | Unavailable:
-    """An average with its variance, on t with one degree of freedom fewer than visits, or `at_most` so many.
+    """Build an average with its variance, on t with one degree of freedom fewer than visits, or `at_most` so many.
 
     `freed`: the contrasts that it is the average of, [V], where they are not those of `of`.
     """

@@ -1,6 +1,6 @@
 """Generalised linear mixed models of few sessions by Laplace's approximation: ordered categories, and counts out of a number.
 
-theta maximises log likelihood - 1/2 sum_j theta_j^2 / variance_j; columns of one group share a variance that maximises the Laplace
+theta maximises log likelihood - 1/2 sum_j theta_j^2 / variance_j. Columns of one group share a variance. It maximises the Laplace
 approximation of the marginal likelihood times a half-Cauchy density of scale 1 of its root (Tierney and Kadane 1986; Gelman 2006). Both
 likelihoods are concave, so that Newton's method finds the one maximum.
 """
@@ -23,7 +23,7 @@ ROOTS: Floats = np.array([0.02, 0.05, 0.1, 0.2, 0.35, 0.6, 1.0, 1.6, 2.5, 4.0, 6
 """Standard deviations of a group, in logits, that are tried."""
 
 WEAK = 5.0
-"""Standard deviation of the prior of slopes, in logits: keeps a slope finite where an arm lies wholly above the other."""
+"""Standard deviation of the prior of slopes, in logits: keeps a slope finite where one arm is wholly above the other."""
 
 FLAT = 100.0
 """The same of thresholds and intercepts."""
@@ -39,7 +39,7 @@ class GeneralisedFit:
 
 
 def binomial(count: Floats, total: Floats, design: Floats) -> Likelihood:
-    """Logistic likelihood of `count` out of `total`, [n], for a design [n, q].
+    """Build the logistic likelihood of `count` out of `total`, [n], for a design [n, q].
 
     Raises:
         ValueError: a count below zero or above its total.
@@ -58,7 +58,8 @@ def binomial(count: Floats, total: Floats, design: Floats) -> Likelihood:
 
 
 def cumulative(category: Integers, design: Floats) -> Likelihood:
-    """Proportional-odds likelihood of categories 0 ... K - 1, [n], each of which occurs: logit P(y <= k) = threshold_k - design theta.
+    """Build the proportional-odds likelihood of categories 0 ... K - 1, [n], each of which occurs: logit P(y <= k) = threshold_k - design
+    theta.
 
     The parameters are the K - 1 rising thresholds, then those of the design [n, q] (McCullagh 1980).
     """
@@ -85,7 +86,7 @@ def cumulative(category: Integers, design: Floats) -> Likelihood:
 
 
 def fit(likelihood: Likelihood, start: Floats, fixed: Mapping[int, float], groups: Mapping[str, Sequence[int]]) -> GeneralisedFit:
-    """Mode and covariance at the likeliest standard deviations of the groups.
+    """Find mode and covariance at the likeliest standard deviations of the groups.
 
     Args:
         likelihood: of parameters [q]. start: parameters that are allowed, [q].

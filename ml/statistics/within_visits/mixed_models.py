@@ -1,5 +1,5 @@
-"""Mixed models of a controller against cDBS: a level of each visit, an effect of the controller that differs from visit to visit, policies
-within it.
+"""Mixed models of a controller against cDBS. They have a level of each visit, an effect of the controller that differs between visits, and
+policies within it.
 
 They use every session at once and say how far visits and policies differ. All are tested on t with one degree of freedom fewer than visits
 with both arms, never as a normal deviate: the spread between visits is what they know least. Where Satterthwaite's approximation has fewer
@@ -36,7 +36,7 @@ INTERCEPT, EFFECT = 0, 1
 
 @dataclass(frozen=True)
 class PolicyEffect:
-    """How one policy differs from the controller's average, shrunk: in the unit of the effect, with its standard error."""
+    """Difference of one policy from the controller's average, shrunk: in the unit of the effect, with its standard error."""
 
     policy: int
     estimate: float
@@ -64,10 +64,10 @@ class MixedComparison:
 
 
 def linear_comparison(data: Measurements, policy: Integers | None = None, level: float = 0.95) -> MixedComparison | Unavailable:
-    """Linear mixed model by restricted likelihood.
+    """Fit a linear mixed model by restricted likelihood.
 
     Args:
-        data: sessions of both arms; visits that lack one and sessions without a value are left out.
+        data: sessions of both arms; visits that lack one and sessions without a value are excluded.
         policy: number of the policy of every session, [n]; that of cDBS sessions is not looked at.
     """
     prepared = _prepare(data, policy)
@@ -158,7 +158,7 @@ class _Prepared:
         level: float,
         more: dict[str, range] | None = None,
     ) -> MixedComparison | Unavailable:
-        """Fit of a likelihood whose columns lie `shift` places after those of the design."""
+        """Fit a likelihood whose columns come `shift` places after those of the design."""
         groups = {g: range(c.start + shift, c.stop + shift) for g, c in self.groups.items()} | (more or {})
         found: GeneralisedFit = fit(likelihood, start, fixed, groups)
         place = EFFECT + shift
@@ -169,7 +169,7 @@ class _Prepared:
         return MixedComparison(effect, roots["visit"], roots["slope"], roots.get("policy"), roots.get("session"), policies)
 
     def policy_effects(self, parameters: Floats, covariance: Floats, shift: int) -> tuple[PolicyEffect, ...]:
-        """The policies' own columns."""
+        """Read the effects of the policies from their own columns."""
         columns = self.groups.get("policy", range(0))
         return tuple(
             PolicyEffect(int(p), float(parameters[c + shift]), float(np.sqrt(covariance[c + shift, c + shift])))

@@ -1,4 +1,4 @@
-"""Whether the comparison with the same visit's cDBS holds when what else went on in the visit is taken out."""
+"""Sensitivity of the comparison with the same visit's cDBS to other influences of the visit."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Sensitivity:
 
 
 def sensitivities(data: Measurements, level: float = 0.95) -> tuple[Sensitivity, ...]:
-    """All alternative analyses of one metric, in the order of `Adjustment`."""
+    """Run all alternative analyses of one metric, in the order of `Adjustment`."""
     return (
         Sensitivity(Adjustment.NONE, average(visit_contrasts(data), level)),
         Sensitivity(Adjustment.ORDER, order_adjusted(data, level)),
@@ -47,14 +47,14 @@ def sensitivities(data: Measurements, level: float = 0.95) -> tuple[Sensitivity,
 
 
 def order_adjusted(data: Measurements, level: float = 0.95) -> Average | Unavailable:
-    """Freed from a linear drift over the visit, the same at every visit."""
+    """Adjust for a linear drift over the visit, the same at every visit."""
     if data.order is None:
         return Unavailable(Reason.NOT_RECORDED)
     return adjusted_average(data, [data.order], Adjustment.ORDER, level)
 
 
 def medication_adjusted(data: Measurements, level: float = 0.95) -> Average | Unavailable:
-    """Freed from a quadratic in the time since the last dose: the effect rises, then wears off."""
+    """Adjust for a quadratic in the time since the last dose: the effect rises, then wears off."""
     if data.medication_h is None or not np.isfinite(data.medication_h).any():
         return Unavailable(Reason.NOT_RECORDED)
     hours = data.medication_h - np.nanmean(data.medication_h)
@@ -65,14 +65,14 @@ def medication_adjusted(data: Measurements, level: float = 0.95) -> Average | Un
 
 
 def carry_over_adjusted(data: Measurements, level: float = 0.95) -> Average | Unavailable:
-    """Freed from whether the session before it, among those of both arms, was the controller's; the first of a visit has none before it."""
+    """Adjust for whether the session before it, among those of both arms, was the controller's. The first of a visit has none before it."""
     if data.order is None:
         return Unavailable(Reason.NOT_RECORDED)
     return adjusted_average(data, [_after_tested(data)], Adjustment.CARRY_OVER, level)
 
 
 def bracketed(data: Measurements, level: float = 0.95) -> Average | Unavailable:
-    """Only sessions that stand between two measured cDBS sessions of the visit, each against those two, weighted by nearness in the order.
+    """Compare only sessions between two measured cDBS sessions of the visit, each with those two, weighted by nearness in the order.
 
     A drift that is linear over such a stretch cancels.
     """
@@ -98,7 +98,7 @@ def bracketed(data: Measurements, level: float = 0.95) -> Average | Unavailable:
 
 
 def skewness_corrected(data: Measurements, level: float = 0.95) -> Average | Unavailable:
-    """Student's ratio of the visits' contrasts freed from their skewness, whatever the metric (`contrasts.unskewed`)."""
+    """Adjust Student's ratio of the visits' contrasts for their skewness, whatever the metric (`contrasts.unskewed`)."""
     contrasts = visit_contrasts(data)
     if isinstance(contrasts, Unavailable):
         return contrasts
@@ -130,7 +130,7 @@ def _after_tested(data: Measurements) -> Floats:
 
 
 def _against_neighbours(value: Floats, order: Floats, one: Integers, two: Integers) -> tuple[list[float], set[int]]:
-    """Differences of the bracketed sessions of a visit from their neighbours, and which cDBS sessions were used."""
+    """Compute differences of the bracketed sessions of a visit from their neighbours, and which cDBS sessions were used."""
     cdbs = two[np.isfinite(order[two])]
     differences: list[float] = []
     used: set[int] = set()

@@ -1,12 +1,11 @@
 """Exact rank tests that shuffle sessions within visits alone: did the controller differ from cDBS on these visits at all?
 
-Under the hypothesis that no session of any visit would have come out otherwise under the other arm, every way to share a visit's values out
-between its arms is equally likely. The distribution of the statistic is found by convolution over visits, not by enumeration. Where effects
-differ in sign from visit to visit that hypothesis is false although the average may be zero: the average is judged by `visits.py`.
+The hypothesis: no session of any visit would have had another value under the other arm. Then every way to divide a visit's values between
+its arms is equally likely. The distribution of the statistic is computed by convolution over visits, not by enumeration. Where effects
+differ in sign between visits, that hypothesis is false although the average may be zero: `visits.py` tests the average.
 
-Sources: van Elteren 1960 (the weighted sum of Wilcoxon statistics of strata), Hodges and Lehmann 1962 (aligned ranks), Hodges and Lehmann
-1963
-(the interval by inversion), Besag and Clifford 1991 and Phipson and Smyth 2010 (the p-value of a random sample of shufflings).
+Sources: van Elteren 1960 (the weighted sum of Wilcoxon statistics of strata), Hodges and Lehmann 1962 (aligned ranks). Hodges and Lehmann
+1963 (the interval by inversion). Besag and Clifford 1991, Phipson and Smyth 2010 (the p-value of a random sample of shufflings).
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ ROUNDING = 1e-9
 
 
 class Method(StrEnum):
-    """How a p-value was found."""
+    """Method by which a p-value was computed."""
 
     EXACT = "exact"
     MONTE_CARLO = "monte_carlo"
@@ -89,10 +88,10 @@ class ShiftInterval:
 
 
 def van_elteren(data: Measurements, *, seed: int = 0) -> StratifiedTest | Unavailable:
-    """Van Elteren's test: Wilcoxon statistics of the visits, each weighted by 1 / (sessions + 1).
+    """Run van Elteren's test: Wilcoxon statistics of the visits, each weighted by 1 / (sessions + 1).
 
     Args:
-        data: sessions of both arms; those without a value are left out, and so is every visit that lacks an arm.
+        data: sessions of both arms; those without a value are excluded, and so is every visit that lacks an arm.
         seed: of the shufflings, where the exact distribution is too large.
     """
     strata = _strata(data)
@@ -100,7 +99,7 @@ def van_elteren(data: Measurements, *, seed: int = 0) -> StratifiedTest | Unavai
 
 
 def aligned_rank_test(data: Measurements, *, seed: int = 0) -> StratifiedTest | Unavailable:
-    """Aligned ranks: values less their visit's mean are ranked over all visits, then shuffled within visits.
+    """Run the aligned rank test: values less their visit's mean are ranked over all visits, then shuffled within visits.
 
     Has more power than van Elteren's test where visits are small, and needs one scale for all visits.
     """
@@ -116,7 +115,7 @@ def aligned_rank_test(data: Measurements, *, seed: int = 0) -> StratifiedTest | 
 
 
 def shift_interval(data: Measurements, level: float = 0.95, *, seed: int = 0) -> ShiftInterval | Unavailable:
-    """The shift that is common to all visits, by inversion of van Elteren's test.
+    """Estimate the shift that is common to all visits, by inversion of van Elteren's test.
 
     The p-value changes only where a shift makes two sessions of a visit equal, so it is asked at those shifts and between them.
 
@@ -152,7 +151,7 @@ class _Stratum:
 
     @property
     def lowest(self) -> int:
-        """What is taken off so that the smallest possible sum is near 0."""
+        """Offset that is subtracted so that the smallest possible sum is near 0."""
         if self.ties is not None:
             return self.n_tested * (self.n_tested + 1)
         return int(np.sort(self.scores)[: self.n_tested].sum())
@@ -163,7 +162,7 @@ class _Stratum:
         return float(self.scores.size * few * (self.scores.max() - self.scores.min() + 1) * few)
 
     def distribution(self) -> Floats:
-        """Probabilities of the sum less `lowest`."""
+        """Compute the probabilities of the sum less `lowest`."""
         if self.ties is None:
             return _subset_sums(tuple((self.scores - self.scores.min()).tolist()), self.n_tested)
         if max(self.ties) > 1:
@@ -191,7 +190,7 @@ def _wilcoxon(x: Floats, y: Floats) -> _Stratum:
 
 
 def _doubled_ranks(values: Floats) -> Integers:
-    """Twice the mid-ranks, whole numbers."""
+    """Compute twice the mid-ranks, which are whole numbers."""
     _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
     below = np.cumsum(counts) - counts
     return (2 * below + counts + 1)[place]
@@ -199,7 +198,7 @@ def _doubled_ranks(values: Floats) -> Integers:
 
 @lru_cache(maxsize=512)
 def _subset_sums(scores: tuple[int, ...], chosen: int) -> Floats:
-    """Probabilities of the sum of `chosen` of the scores less the smallest such sum, every choice equally likely."""
+    """Compute the probabilities of the sum of `chosen` of the scores less the smallest such sum, every choice equally likely."""
     few = min(chosen, len(scores) - chosen)
     ordered = sorted(scores)
     counts = np.zeros((few + 1, sum(ordered[len(ordered) - few :]) + 1))
@@ -233,7 +232,7 @@ def _test(parts: Sequence[_Stratum], weights: Sequence[int], strata: Sequence[tu
 
 
 def _span(part: _Stratum) -> int:
-    """Largest sum less the smallest."""
+    """Subtract the smallest sum from the largest."""
     if part.ties is not None:
         return 2 * part.n_tested * (part.scores.size - part.n_tested)
     ordered = np.sort(part.scores)
@@ -241,7 +240,7 @@ def _span(part: _Stratum) -> int:
 
 
 def _convolve(distributions: Sequence[Floats], weights: Sequence[int]) -> Floats:
-    """Distribution of the weighted sum of independent whole numbers."""
+    """Compute the distribution of the weighted sum of independent whole numbers."""
     length = 1 + sum(w * (d.size - 1) for d, w in zip(distributions, weights, strict=True))
     if len(distributions) == 1 and weights[0] == 1:
         return distributions[0]
@@ -256,7 +255,7 @@ def _convolve(distributions: Sequence[Floats], weights: Sequence[int]) -> Floats
 
 
 def _draws(parts: Sequence[_Stratum], weights: Sequence[int], seed: int) -> Integers:
-    """The statistic of random shufflings, [DRAWS]."""
+    """Draw the statistic of random shufflings, [DRAWS]."""
     rng = np.random.default_rng(seed)
     total = np.zeros(DRAWS, dtype=np.int64)
     for part, weight in zip(parts, weights, strict=True):
@@ -266,7 +265,7 @@ def _draws(parts: Sequence[_Stratum], weights: Sequence[int], seed: int) -> Inte
 
 
 def _distinct(values: Floats) -> Floats:
-    """Sorted values, those that differ by rounding alone taken for one."""
+    """Sort values; those that differ by rounding alone count as one."""
     ordered = np.sort(values)
     tolerance = 1e-12 * max(1.0, float(np.abs(ordered).max()))
     return ordered[np.concatenate([[True], np.diff(ordered) > tolerance])]
@@ -284,7 +283,8 @@ def _weighted_median(values: Floats, mass: Floats) -> float:
 def _untied_interval(
     strata: Sequence[tuple[Floats, Floats]], weights: Sequence[int], differences: Floats, mass: Floats, level: float, seed: int
 ) -> ShiftInterval:
-    """The interval where no arm of a visit holds a value twice: the distribution is the same at every shift between two differences.
+    """Compute the interval where no arm of a visit has a value twice: the distribution is then the same at every shift between two
+    differences.
 
     A shift that passes a difference of visit v takes 2 w_v off the statistic, so that the ends are differences counted off from outside.
     """
@@ -321,7 +321,7 @@ class _Inversion:
         return Method.MONTE_CARLO if any(t.method is Method.MONTE_CARLO for t in self.tested.values()) else Method.EXACT
 
     def end(self, *, upper: bool) -> float:
-        """The outermost shift on one side that is not rejected."""
+        """Find the outermost shift on one side that is not rejected."""
         last = 2 * self.knots.size
         outside, inside = (last, 0) if upper else (0, last)
         if self._accepted(outside, upper):
@@ -354,7 +354,7 @@ class _Inversion:
         return self.tested[place]
 
     def _snap(self, x: Floats, y: Floats) -> Floats:
-        """Moved values that meet one of the other arm but for rounding are made equal to it."""
+        """Make moved values equal to a value of the other arm where they differ by rounding alone."""
         nearest = y[np.abs(np.subtract.outer(x, y)).argmin(1)]
         return np.where(np.abs(x - nearest) <= 4 * self.tolerance, nearest, x)
 
