@@ -12,7 +12,7 @@ from ml.trajectories import ReplayBuffer
 
 
 def behaviour_mean(buffer: ReplayBuffer) -> ConstantPolicy:
-    """The mean amplitude fraction of the buffer's usable steps, held constant: what the logged sessions spent, without their variation."""
+    """Build the constant policy of the mean amplitude fraction over the buffer's usable steps: the logged energy without its variation."""
     return ConstantPolicy(float(buffer.transitions().actions.mean()))
 
 
@@ -34,10 +34,10 @@ class ConstantChoice:
 
 
 def best_constant(score: Score, amplitudes: Sequence[float] = CONSTANT_GRID) -> ConstantChoice:
-    """The best constant amplitude by an estimate from data.
+    """Choose the best constant amplitude by an estimate from data.
 
     Args:
-        score: estimate of a policy's worth from sessions left out of the estimator's fit (fitted Q evaluation, for example).
+        score: estimate of a policy's value from held-out sessions of the estimator's fit (fitted Q evaluation, for example).
         amplitudes: fractions to try. Outside the logged range an estimate is extrapolation.
 
     Raises:
@@ -55,7 +55,7 @@ def best_constant(score: Score, amplitudes: Sequence[float] = CONSTANT_GRID) -> 
 def proportional_from_buffer(
     buffer: ReplayBuffer, low_quantile: float = 0.25, high_quantile: float = 0.9, floor: float = 0.0, newest: int = 1
 ) -> ProportionalPolicy:
-    """Proportional control between two quantiles of the participant's own beta amplitudes.
+    """Build proportional control between two quantiles of the participant's own beta amplitudes.
 
     Args:
         buffer: sessions of the participant.

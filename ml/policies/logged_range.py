@@ -1,4 +1,4 @@
-"""Whether a policy stays where the random controller has been: a value below its lower bound B is extrapolation."""
+"""Range of the random controller, and policies that leave it: a value below its lower bound B is extrapolation."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer
 
 LARGEST_SHARE_BELOW = 0.05
-"""Above this share of the buffer's states answered with less than B, a policy is said to leave the logged range."""
+"""Largest share of the buffer's states that a policy in the logged range may answer with less than B."""
 
 
 def random_bound(buffer: ReplayBuffer) -> float | None:
-    """B of the buffer's random sessions, the lowest where they differ; None where there is no random session."""
+    """Find B of the buffer's random sessions, the lowest where they differ; None where there is no random session."""
     return min((s.random_lower_bound for s in buffer.sessions if s.random_lower_bound is not None), default=None)
 
 
 def share_below_bound(policy: Policy, buffer: ReplayBuffer) -> float | None:
-    """Share of the buffer's usable states that a policy answers with less than B; None where there is no random session."""
+    """Compute the share of the buffer's usable states that a policy answers with less than B; None where there is no random session."""
     bound = random_bound(buffer)
     if bound is None:
         return None
@@ -26,6 +26,6 @@ def share_below_bound(policy: Policy, buffer: ReplayBuffer) -> float | None:
 
 
 def stays_in_range(policy: Policy, buffer: ReplayBuffer) -> bool:
-    """Whether at most `LARGEST_SHARE_BELOW` of the buffer's states are answered with less than B; True where no B is known."""
+    """Decide whether at most `LARGEST_SHARE_BELOW` of the buffer's states are answered with less than B; True where no B is known."""
     share = share_below_bound(policy, buffer)
     return share is None or share <= LARGEST_SHARE_BELOW

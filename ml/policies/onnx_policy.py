@@ -1,7 +1,8 @@
 """Policies as ONNX files, made here or elsewhere.
 
-The contract of such a file: one input [N, W] of beta windows, oldest first, in the participant's unit; one output [N, 1] of amplitude
-fractions in [0, 1]; float32 or float64; everything inside the file; the same answer each time. Names are free, N is dynamic or fixed.
+The contract of such a file: one input [N, W] of beta windows, oldest first, in the participant's unit. One output [N, 1] of amplitude
+fractions in [0, 1]. Values are float32 or float64, everything is inside the file, and its answer is deterministic. Names are free, N is
+dynamic or fixed.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class OnnxPolicy:
     Args:
         content: the ONNX file.
         window: W that the participant uses; None takes the file's own.
-        probe: further beta windows to try on load, shape [M, W], beside the built-in ones (a snapshot's states, for example).
+        probe: further beta windows to try on load, shape [M, W], in addition to the built-in ones (a snapshot's states, for example).
 
     Attributes:
         content: the bytes given.
@@ -57,12 +58,12 @@ class OnnxPolicy:
         return OnnxPolicy, (self.content, self.window)
 
     def act(self, states: NDArray[Any]) -> NDArray[np.float64]:
-        """Amplitude fractions, shape [N], for beta windows [N, W].
+        """Compute amplitude fractions, shape [N], for beta windows [N, W].
 
         Raises:
             ValueError: states of another shape.
-            PolicyOutputError: an output that is not finite or lies outside [0, 1] by more than `RANGE_TOLERANCE`; less is rounding and
-                is clipped.
+            PolicyOutputError: an output that is not finite or outside [0, 1] by more than `RANGE_TOLERANCE`; less is rounding and is
+                clipped.
         """
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != self.window:
@@ -75,7 +76,8 @@ class OnnxPolicy:
         return np.clip(fractions, 0.0, 1.0)
 
     def _run(self, states: NDArray[Any]) -> NDArray[np.float64]:
-        """Raw outputs, shape [N]; a file with a fixed N is fed in blocks, the last one filled up with copies of its last row."""
+        """Run the file for raw outputs, shape [N]. A file with a fixed N gets blocks, the last one filled up with copies of its last
+        row."""
         count = len(states)
         if count == 0:
             return np.empty(0)
@@ -223,7 +225,7 @@ def _open(content: bytes) -> Any:
 
 
 def _built_in_probe(window: int) -> NDArray[np.float64]:
-    """Flat and noisy windows over eight decades, because a file does not say in which unit its beta is."""
+    """Make flat and noisy windows over eight decades, because a file does not state the unit of its beta."""
     scales = np.concatenate([[0.0], 10.0 ** np.arange(-3, 5)])
     noise = np.abs(np.random.default_rng(0).normal(1.0, 0.5, size=(4, scales.size, window)))
     shapes = np.concatenate([np.ones((1, scales.size, window)), noise])

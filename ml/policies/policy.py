@@ -1,4 +1,4 @@
-"""What a policy is to the rest of betaloop: beta windows in, amplitude fractions out."""
+"""Interface of a policy to the rest of betaloop: beta windows in, amplitude fractions out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ class Policy(Protocol):
     """A deterministic controller pi(s)."""
 
     def act(self, states: NDArray[Any]) -> NDArray[np.float64]:
-        """Amplitude fractions in [0, 1], shape [N], for beta windows in the beta unit of the participant, shape [N, W], oldest first."""
+        """Compute amplitude fractions in [0, 1], shape [N], for beta windows in the beta unit of the participant, shape [N, W], oldest
+        first."""
 
 
 Score = Callable[[Policy], float]

@@ -24,7 +24,7 @@ MIN_CYCLES = 3.0
 """A run with fewer samples than this many cycles of the lower band edge says nothing about the band and is not counted."""
 
 BRIDGE_S = 1.0
-"""The filter runs on over a gap up to this long; at the edges of a longer one it begins anew."""
+"""Longest gap over which the filter continues; at the edges of a longer one it starts again."""
 
 RESPONSE_CYCLES = 8.0
 """Half length of the filter's impulse response that counts, in cycles of the band's width."""
@@ -72,9 +72,9 @@ class BandRows:
 
     @property
     def reached(self) -> NDArray[np.float64]:
-        """What a limit of coverage is held against: `covered`, and one sample more.
+        """Share that is compared with a limit of coverage: `covered`, and one sample more.
 
-        Rows begin and end between samples, so that a row of packets that fill a share of it exactly holds one sample more or one less.
+        Rows begin and end between samples. So a row that packets fill to an exact share has one sample more or one less.
         """
         return np.minimum(self.covered + self.sample, 1.0)
 
@@ -85,7 +85,7 @@ class BandRows:
 
 
 def band_pass(samples: NDArray[np.float64], rate_hz: float, low_hz: float, high_hz: float) -> NDArray[np.float64]:
-    """Zero-phase Butterworth band-pass of one gap-free stretch, -3 dB at the edges after both passes.
+    """Apply a zero-phase Butterworth band-pass to one gap-free stretch, -3 dB at the edges after both passes.
 
     Args:
         samples: shape [n].
@@ -107,13 +107,14 @@ def band_pass(samples: NDArray[np.float64], rate_hz: float, low_hz: float, high_
 
 @lru_cache(maxsize=64)
 def _sections(rate_hz: float, low_hz: float, high_hz: float) -> NDArray[np.float64]:
-    """Second-order sections of one pass; kept, because a lossy recording has hundreds of stretches and one filter."""
+    """Design the second-order sections of one pass. They are cached: a lossy recording has hundreds of stretches and one filter."""
     edges = _edges_of_one_pass(rate_hz, low_hz, high_hz)
     return np.asarray(scipy.signal.butter(FILTER_ORDER, edges, btype="bandpass", fs=rate_hz, output="sos"))
 
 
 def _edges_of_one_pass(rate_hz: float, low_hz: float, high_hz: float) -> tuple[float, float]:
-    """Edges of a filter that is -1.5 dB at the wanted ones, so that two passes are -3 dB there and the noise bandwidth is the band's.
+    """Compute the edges of a filter that is -1.5 dB at the wanted ones. Two passes are then -3 dB there, and the noise bandwidth is the
+    band's.
 
     The band is widened about its geometric centre in the analogue prototype, by (sqrt(2) - 1)^(-1 / 2N) for order N.
     """
@@ -133,16 +134,16 @@ def band_rows(
     t0_s: float = 0.0,
     models: Mapping[float, Model | None] | None = None,
 ) -> BandRows:
-    """Band amplitude of a lossy signal per row.
+    """Compute the band amplitude of a lossy signal per row.
 
-    Stretches of one rate with at most `BRIDGE_S` between them are filtered as one, the gaps filled with what an autoregressive model of the
-    measured samples predicts from both sides (`ml.signals.prediction`; straight lines where there is none). Only measured samples count.
-    Near a gap the filter lacks what the prediction does not know, so the sum of squares is divided by the share of the band's power that
-    reaches each sample, by the model (of a flat band, where there is none): without gaps that is the number of samples.
+    Stretches of one rate with at most `BRIDGE_S` between them are filtered as one. An autoregressive model of the measured samples fills
+    the gaps, predicting from both sides (`ml.signals.prediction`). Where there is no model, straight lines do. Only measured samples count.
+    Near a gap the filter lacks what the prediction does not know. So the sum of squares is divided by the share of the band's power that
+    reaches each sample, by the model. Without a model the band counts as flat; without gaps the divisor is the number of samples.
 
-    The standard error of a row is that of its power against the mean over the whole row, of a Gaussian signal whose band-passed
-    autocorrelation rho is that of the measured samples. A sample of which the share g is passed is sqrt(g) of the signal and lacks an
-    independent sqrt(1 - g), so that by the covariance of squares (Isserlis 1918, Biometrika 12, 134-139)
+    The standard error of a row is that of its power against the mean over the whole row. The signal counts as Gaussian, with a band-passed
+    autocorrelation rho, that of the measured samples. A sample of which the share g is passed is sqrt(g) of the signal and lacks an
+    independent sqrt(1 - g). By the covariance of squares (Isserlis 1918, Biometrika 12, 134-139),
     var / power^2 = sum_ij (d_i d_j + 2 c_i c_j) 2 rho_ij^2, with d = g / sum(g) - 1 / n and c = sqrt(g (1 - g)) / n.
 
     Args:
@@ -187,7 +188,7 @@ def band_rows(
 
 
 def one_sample(rates_hz: Iterable[float], period_s: float) -> float:
-    """Share of a row that one sample of the slowest of these rates covers; 0 without a rate."""
+    """Compute the share of a row that one sample of the slowest of these rates covers; 0 without a rate."""
     return 1.0 / (min(rates_hz, default=math.inf) * period_s)
 
 
@@ -211,7 +212,7 @@ class _Run:
 
 
 def gap_models(stretches: Iterable[Stretch]) -> dict[float, Model | None]:
-    """The model of a signal that fills its gaps, by the rate of its stretches; None: straight lines do."""
+    """Fit the models that fill a signal's gaps, by the rate of its stretches; None where straight lines fill them."""
     return _models(_by_rate(stretches))
 
 
@@ -224,7 +225,7 @@ def _models(by_rate: Mapping[float, list[Stretch]]) -> dict[float, Model | None]
 
 
 def _by_rate(stretches: Iterable[Stretch]) -> dict[float, list[Stretch]]:
-    """Stretches with samples, by their rate and in order of time."""
+    """Sort stretches with samples by their rate and by time."""
     by_rate: dict[float, list[Stretch]] = defaultdict(list)
     for stretch in stretches:
         if stretch[2].size:
@@ -233,7 +234,7 @@ def _by_rate(stretches: Iterable[Stretch]) -> dict[float, list[Stretch]]:
 
 
 def _places(stretches: Sequence[Stretch], rate_hz: float) -> list[int]:
-    """The nearest place of each stretch's first sample on the grid of its rate, after the samples before it."""
+    """Find the nearest place of each stretch's first sample on the grid of its rate, after the samples before it."""
     places: list[int] = []
     end = -np.inf
     for start_s, _, samples in stretches:
@@ -243,7 +244,7 @@ def _places(stretches: Sequence[Stretch], rate_hz: float) -> list[int]:
 
 
 def _runs(by_rate: Mapping[float, list[Stretch]], models: Mapping[float, Model | None], low_hz: float) -> Iterator[_Run]:
-    """Runs of stretches of one rate, each stretch at its nearest place on the grid of that rate."""
+    """Yield runs of stretches of one rate, each stretch at its nearest place on the grid of that rate."""
     for rate_hz, own in by_rate.items():
         together: list[Stretch] = []
         end_s = -np.inf
@@ -273,9 +274,10 @@ def _run(rate_hz: float, stretches: list[Stretch], model: Model | None, low_hz: 
 
 
 def _bridge(x: NDArray[np.float64], measured: NDArray[np.bool_], cycle: int) -> None:
-    """Straight lines over the gaps of x, [m], between the means of up to `cycle` samples on either side.
+    """Fill the gaps of x, [m], with straight lines between the means of up to `cycle` samples on either side.
 
-    A mean over a cycle follows the slow background but not the band itself, nor noise, which a line from sample to sample would bring in.
+    A mean over a cycle follows the slow background. It follows neither the band nor the noise, which a line from sample to sample would
+    add.
     """
     edges = np.flatnonzero(np.diff(np.concatenate(([0], measured.astype(np.int8), [0]))))
     begin, end = edges[::2], edges[1::2]
@@ -289,7 +291,8 @@ def _bridge(x: NDArray[np.float64], measured: NDArray[np.bool_], cycle: int) -> 
 
 
 def _passed(run: _Run, low_hz: float, high_hz: float) -> NDArray[np.float64]:
-    """Share of the band's power that reaches each measured sample, 0..1; 1 far from gaps. Beyond the run's ends nothing is missing."""
+    """Compute the share of the band's power that reaches each measured sample, 0..1; 1 far from gaps. Beyond the run's ends nothing is
+    missing."""
     if run.measured.all():
         return np.ones(run.t_s.size)
     impulse = _impulse_response(run.rate_hz, low_hz, high_hz)
@@ -302,7 +305,7 @@ def _passed(run: _Run, low_hz: float, high_hz: float) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=64)
 def _impulse_response(rate_hz: float, low_hz: float, high_hz: float) -> NDArray[np.float64]:
-    """The zero-phase filter's impulse response, as far as it counts, about its middle."""
+    """Compute the zero-phase filter's impulse response about its middle, as far as it counts."""
     half = int(np.ceil(RESPONSE_CYCLES * rate_hz / (high_hz - low_hz)))
     impulse = np.zeros(2 * half + 1)
     impulse[half] = 1.0
@@ -310,7 +313,7 @@ def _impulse_response(rate_hz: float, low_hz: float, high_hz: float) -> NDArray[
 
 
 def _squared_correlation(run: _Run, filtered: NDArray[np.float64], lags_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Square of the measured samples' autocorrelation, averaged over the lags around each of `lags_s`; shape as that."""
+    """Square the measured samples' autocorrelation, averaged over the lags around each of `lags_s`; same shape."""
     most = min(int(MAX_LAG_S * run.rate_hz), run.measured.size - 1)
     length = scipy.fft.next_fast_len(run.measured.size + most + 1, real=True)
     signal, mask = np.zeros(run.measured.size), run.measured.astype(np.float64)
@@ -325,7 +328,7 @@ def _squared_correlation(run: _Run, filtered: NDArray[np.float64], lags_s: NDArr
     integral = np.concatenate(([0.0], np.cumsum(np.clip(rho, -1.0, 1.0) ** 2))) / run.rate_hz
     edges = np.append(lag - 0.5 / run.rate_hz, lag[-1] + 0.5 / run.rate_hz)
     between = lags_s[:, None] + width * np.array([-0.5, 0.5])
-    # lags are symmetric: what lies left of 0 is the mirror image of what lies right of it
+    # lags are symmetric: the left of 0 is the mirror image of the right
     value = np.sign(between) * np.interp(np.abs(between), edges, integral - 0.5 / run.rate_hz)
     return np.asarray(np.maximum(np.diff(value, axis=1)[:, 0] / width, 0.0))
 
@@ -333,7 +336,7 @@ def _squared_correlation(run: _Run, filtered: NDArray[np.float64], lags_s: NDArr
 def _relative_error(
     passed: NDArray[np.float64], mixed: NDArray[np.float64], squared: NDArray[np.float64], period_s: float
 ) -> NDArray[np.float64]:
-    """Standard error of each row's mean power over that power, [rows].
+    """Compute the standard error of each row's mean power over that power, [rows].
 
     Args:
         passed, mixed: sums of g and of sqrt(g (1 - g)) over the samples of each piece of a row, s, [rows, bins].
@@ -356,10 +359,10 @@ def _relative_error(
 def spectrum(
     stretches: Iterable[tuple[float, float, NDArray[np.float64]]], max_hz: float = 100.0, segment_s: float = 1.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Power spectral density of a lossy signal: Welch's method within each gap-free stretch, averaged over all segments.
+    """Estimate the power spectral density of a lossy signal: Welch's method within each gap-free stretch, averaged over all segments.
 
-    Hann windows of `segment_s` that overlap by half, each freed of its mean, one-sided; the integral over frequency is the variance.
-    Source: Welch 1967, IEEE Trans. Audio Electroacoust. 15, 70-73. Stretches shorter than a segment are left out.
+    Hann windows of `segment_s` overlap by half; each is freed of its mean. The density is one-sided, so its integral over frequency is the
+    variance. Source: Welch 1967, IEEE Trans. Audio Electroacoust. 15, 70-73. Stretches shorter than a segment are excluded.
 
     Args:
         stretches: gap-free pieces (time of the first sample in s, rate in Hz, samples [n]), as in `band_rows`; rates may differ.
@@ -386,7 +389,7 @@ def spectrum(
             block = samples[first * hop : (first + here - 1) * hop + width]
             hz, density = scipy.signal.welch(block, rate_hz, nperseg=width, noverlap=width - hop)
             reached = grid <= hz[-1] + 1e-9
-            # a rate that gives no whole number of samples per segment has its frequencies a little beside the grid
+            # a rate that gives no whole number of samples per segment has its frequencies a little off the grid
             total[reached] += here * np.interp(grid[reached], hz, density)
             segments[reached] += here
     known = segments > 0

@@ -1,8 +1,8 @@
-"""What an autoregressive model of a signal says of the samples that are missing in it, and how much of a band it leaves unsaid.
+"""Prediction of a signal's missing samples by an autoregressive model, and the share of a band that it leaves unknown.
 
-The missing samples that make the squared residual of the model least are their best linear prediction from both sides (Janssen, Veldhuis
-and Vries 1986, IEEE Trans. ASSP 34, 317-330): with b the autocorrelation of the model's coefficients, they solve B x = -B' m, where B and
-B' hold b at the distances of missing samples to each other and to measured ones. Their covariance is the residual's variance times the
+The best linear prediction from both sides minimises the model's squared residual over the missing samples (Janssen, Veldhuis and Vries
+1986, IEEE Trans. ASSP 34, 317-330). With b the autocorrelation of the model's coefficients, the samples solve B x = -B' m. Here B and B'
+contain b at the distances of missing samples to each other and to measured ones. Their covariance is the residual's variance times the
 inverse of B.
 """
 
@@ -53,12 +53,12 @@ class Model:
     coefficients: Floats
 
     def scaled(self, factor: float) -> Model:
-        """The model of the same signal in another unit, of which one old unit is `factor`."""
+        """Convert the model to another unit, in which one old unit is `factor`."""
         return replace(self, mean=factor * self.mean, residual=factor**2 * self.residual)
 
 
 def fit(pieces: Sequence[tuple[int, Floats]], rate_hz: float) -> Model | None:
-    """The model of the measured samples of a signal, by Yule and Walker; None where they are too few, or say nothing.
+    """Fit the model of a signal's measured samples by Yule and Walker; None where they are too few or constant.
 
     Args:
         pieces: place of the first sample on the grid of the rate and samples [n] of each gap-free piece, in order, not overlapping.
@@ -87,7 +87,7 @@ def fit(pieces: Sequence[tuple[int, Floats]], rate_hz: float) -> Model | None:
 
 
 def _lagged(pieces: Sequence[tuple[int, Floats]], mean: float, order: int) -> tuple[Floats, Floats]:
-    """Sums of the products of samples about the mean at lags 0 to `order`, and of how many pairs each is; both [order + 1].
+    """Sum the products of samples about the mean at lags 0 to `order`, and count the pairs of each lag; both [order + 1].
 
     A block of samples at a time, with those that the longest lag reaches back to, so that memory follows no length of a recording.
     """
@@ -107,7 +107,7 @@ def _lagged(pieces: Sequence[tuple[int, Floats]], mean: float, order: int) -> tu
 
 
 def predict(model: Model, x: Floats, measured: NDArray[np.bool_]) -> Floats:
-    """A signal with its missing samples predicted from both sides, [m].
+    """Predict the missing samples of a signal from both sides, [m].
 
     Args:
         model: of the signal.
@@ -115,7 +115,7 @@ def predict(model: Model, x: Floats, measured: NDArray[np.bool_]) -> Floats:
         measured: which were, [m].
     """
     order = model.b.size - 1
-    # what lies beyond the ends is missing too, and would draw gaps near an end to the mean if it were taken as measured
+    # samples beyond the ends are missing too: taken as measured, they would draw gaps near an end to the mean
     beyond = BEYOND * order
     there = np.pad(measured, beyond)
     known = np.where(there, np.pad(x, beyond) - model.mean, 0.0)
@@ -136,7 +136,7 @@ def predict(model: Model, x: Floats, measured: NDArray[np.bool_]) -> Floats:
 
 
 def _solve(b: Floats, missing: NDArray[np.int64], right: Floats) -> Floats:
-    """Missing samples, which lie at these places, from the right-hand side of their equations."""
+    """Solve for the missing samples at these places, given the right-hand side of their equations."""
     order = min(b.size - 1, missing.size - 1)
     banded = np.zeros((order + 1, missing.size))
     for d in range(order + 1):
@@ -146,10 +146,11 @@ def _solve(b: Floats, missing: NDArray[np.int64], right: Floats) -> Floats:
 
 
 def unsaid(model: Model, measured: NDArray[np.bool_], impulse: Floats) -> Floats:
-    """Share of a filter's output power that the prediction of missing samples lacks at each sample, [m], 0 far from gaps.
+    """Compute the share of a filter's output power that the prediction of missing samples lacks at each sample, [m]; 0 far from gaps.
 
-    What two gaps lack is added up, each as if the samples of the other were known. That is a little too little where less than half of the
-    model's memory lies between them: by 0.05 of the band's power for 6 samples between gaps of 30 at 250 Hz, by up to 0.25 for fewer.
+    The shares that two gaps lack are added, each as if the samples of the other were known. That is slightly too little where the gaps are
+    less than half of the model's memory apart. At 250 Hz, it lacks 0.05 of the band's power for 6 samples between gaps of 30, up to 0.25
+    for fewer.
 
     Args:
         model: of the signal.
@@ -172,14 +173,15 @@ def unsaid(model: Model, measured: NDArray[np.bool_], impulse: Floats) -> Floats
 
 
 def _profile(model: Model, size: int, impulse: Floats) -> tuple[Floats, Floats]:
-    """Variance that a gap of so many samples leaves in the filter's output before and behind it, each [half].
+    """Compute the variance that a gap of so many samples leaves in the filter's output before and behind it, each [half].
 
     A gap longer than the filter is wide acts on either side as one of that length.
     """
     half = impulse.size // 2
     b = np.zeros(size)
     b[: min(size, model.b.size)] = model.b[:size]
-    # y = h * e with e of covariance residual * inv(B) and B = L L': its variance is residual times the squares of the columns of inv(L) h
+    # y = h * e, where e has the covariance residual * inv(B) and B = L L'. Its variance is the residual times the squares of the columns of
+    # inv(L) h.
     lower = scipy.linalg.cholesky(scipy.linalg.toeplitz(b), lower=True)
     places = np.concatenate((np.arange(-half, 0), np.arange(size, size + half)))
     distance = np.abs(places[:, None] - np.arange(size))
@@ -189,7 +191,7 @@ def _profile(model: Model, size: int, impulse: Floats) -> tuple[Floats, Floats]:
 
 
 def _power(model: Model, impulse: Floats) -> float:
-    """Power of the filter's output, of a signal of this model."""
+    """Compute the power of the filter's output for a signal of this model."""
     length = scipy.fft.next_fast_len(4 * max(impulse.size, model.coefficients.size), real=True)
     density = model.residual / np.abs(scipy.fft.rfft(model.coefficients, length)) ** 2
     weight = np.abs(scipy.fft.rfft(impulse, length)) ** 2 * density

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 
 def row_of(t_s: NDArray[np.float64], period_s: float) -> NDArray[np.int64]:
-    """Row that holds each time; rows are open on the left and closed on the right, except that 0 belongs to row 0. Shape as t_s."""
+    """Find the row of each time; rows are open on the left and closed on the right, except that 0 belongs to row 0. Shape as t_s."""
     row = np.ceil(t_s / period_s - 1e-9).astype(np.int64) - 1
     return np.where((row == -1) & (t_s > -1e-9), 0, row)
 
@@ -15,12 +15,12 @@ def row_of(t_s: NDArray[np.float64], period_s: float) -> NDArray[np.int64]:
 def row_means(
     t_s: NDArray[np.float64], values: NDArray[np.float64], interval_s: NDArray[np.float64], rows: int, period_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean per row of values that come at intervals, such as the device's own band power.
+    """Average per row values that come at intervals, such as the device's own band power.
 
     Args:
         t_s: time of each value, [n]; values with NaN are gaps.
         values: [n].
-        interval_s: time each value stands for, [n].
+        interval_s: time that each value covers, [n].
         rows: number of rows, the first beginning at 0.
         period_s: length of a row, s.
 
@@ -38,7 +38,7 @@ def row_means(
 def step_means(
     t_s: NDArray[np.float64], values: NDArray[np.float64], end_s: float, rows: int, period_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Time-weighted mean per row of a value that holds from its time until the next, such as the stimulation amplitude.
+    """Average per row, weighted by time, a value that applies until the next one, such as the stimulation amplitude.
 
     Args:
         t_s: when each value begins to hold, [n], not decreasing; may begin before 0.
