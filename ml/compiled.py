@@ -16,9 +16,9 @@ from numba.core.caching import FunctionCache
 class SharedCache(FunctionCache):
     """Numba's cache of one function, written by one process at a time.
 
-    Numba numbers the machine code of a function's signatures after reading an index, and writes index and code one after the other without
-    a lock. Two processes that compile different signatures at the same moment choose the same number, and the index then names the code
-    of the other signature: later processes would run it on arguments of the wrong type.
+    Numba reads an index, numbers the machine code of a function's signatures, then writes index and code one after the other without a
+    lock. Two processes that compile different signatures at the same moment choose the same number. The index then names the code of the
+    other signature, and later processes would run it on arguments of the wrong type.
     """
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -35,9 +35,9 @@ class SharedCache(FunctionCache):
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """A decorator: `njit` with these options, kept on disk where the package's folder or the user's cache can be written.
+    """Make a decorator: `njit` with these options, cached on disk where the package's folder or the user's cache can be written.
 
-    Where neither can be, every process compiles anew.
+    Where neither can be written, every process compiles again.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:

@@ -3,13 +3,13 @@
 Designs, by their names:
 
 * `paper`: a new uniform draw on [B, 1] every step (Gao et al. 2023, section 6.1). The mean over a minute hardly ever leaves the middle.
-* `stratified`: each random session has a level of its own, stratified over [B, 1] across sessions and visits, and draws around it that are
-  held 10 to 60 s (log-uniform). A titration ladder (1, 0.8, 0.6, ..., two minutes each) may stand once in each visit.
-* `near`: a session that is held near one stated amplitude, as a verdict asks for: draws within `NEAR_SPREAD` of it.
+* `stratified`: each random session has a level of its own, stratified over [B, 1] across sessions and visits. Draws around it stay constant
+  for 10 to 60 s (log-uniform). A titration ladder (1, 0.8, 0.6, ..., two minutes each) may come once in each visit.
+* `near`: a session near one stated amplitude, as a verdict asks for: draws within `NEAR_SPREAD` of it.
 
-Safety comes before information: nothing is below B, and anything below `LOW_AMPLITUDE` lies in the last `LOW_SECONDS` of a session, so it
-lasts no longer than that and ends with the session. One hold is one decision: its density is conditional on the level and on which bound is
-in force, and is the density that `Decision.log_density` gives.
+Safety comes before information. Nothing is below B. Anything below `LOW_AMPLITUDE` comes in the last `LOW_SECONDS` of a session, so it
+lasts no longer and ends with the session. One hold is one decision. Its density is conditional on the level and on which bound is in force;
+`Decision.log_density` gives it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ LADDER_SECONDS: Final = 120.0
 
 @dataclass(frozen=True, kw_only=True)
 class DesignSettings:
-    """What a design needs to know.
+    """Settings of a design.
 
     Attributes:
         name: `stratified` (the default) or `paper`. visits, sessions: early visits, and random sessions in each.
@@ -84,7 +84,7 @@ class DesignSettings:
 
 @dataclass(frozen=True)
 class Decision:
-    """One amplitude that is held.
+    """One amplitude that stays constant.
 
     Attributes:
         start, steps: first step and length. amplitude: fraction of cDBS.
@@ -98,7 +98,7 @@ class Decision:
 
 
 def amplitudes(decisions: Sequence[Decision], steps: int) -> Floats:
-    """Amplitude fraction of the first steps of decisions in order, [steps]: cDBS after the last one."""
+    """List the amplitude fraction of the first steps of decisions in order, [steps]: cDBS after the last one."""
     held = np.repeat([d.amplitude for d in decisions], [d.steps for d in decisions])
     return np.concatenate([held, np.ones(max(0, steps - held.size))])[:steps]
 
@@ -125,7 +125,7 @@ class DesignedSession:
         return np.repeat([d.amplitude for d in self.decisions], [d.steps for d in self.decisions])
 
     def first_steps(self, steps: int) -> Floats:
-        """Amplitude fraction of so many steps, [steps]: cDBS after the last decision."""
+        """List the amplitude fraction of so many steps, [steps]: cDBS after the last decision."""
         return amplitudes(self.decisions, steps)
 
     @property
@@ -135,7 +135,7 @@ class DesignedSession:
 
 
 def lay_out(settings: DesignSettings) -> tuple[DesignedSession, ...]:
-    """Every random session of the early visits, by visit and number."""
+    """Design every random session of the early visits, by visit and number."""
     levels = stratified_levels(settings) if settings.name == "stratified" else None
     result = []
     for visit in range(1, settings.visits + 1):
@@ -151,10 +151,11 @@ def lay_out(settings: DesignSettings) -> tuple[DesignedSession, ...]:
 
 
 def stratified_levels(settings: DesignSettings) -> Floats:
-    """Levels of the sessions, [visits, sessions without the ladder]: one in each of as many equal strata of [B, 1] as there are sessions.
+    """Draw the levels of the sessions, [visits, sessions without the ladder], one in each of as many equal strata of [B, 1] as there are
+    sessions.
 
-    Each visit has one level in each coarse stratum (as many as it has sessions), in random order; over the visits each fine stratum is
-    used once. Within its stratum a level is uniform, so that every level is uniform on [B, 1] by itself.
+    Each visit has one level in each coarse stratum (as many as it has sessions), in random order. Over the visits each fine stratum is used
+    once. Within its stratum a level is uniform, so that every level alone is uniform on [B, 1].
     """
     visits, sessions = settings.visits, settings.sessions - settings.ladder
     if sessions == 0:
@@ -169,7 +170,7 @@ def stratified_levels(settings: DesignSettings) -> Floats:
 
 @dataclass(frozen=True)
 class DrawDensity:
-    """Density of held amplitudes around a level: uniform within a distance of it, mixed with a share of uniform on all of [low, 1].
+    """Density of sustained amplitudes around a level: uniform within a distance of it, mixed with a share of uniform on all of [low, 1].
 
     Attributes:
         level: of the session. low: the bound in force: B, or at least `LOW_AMPLITUDE` outside the last minutes of a session.
@@ -195,12 +196,12 @@ class DrawDensity:
         return max(self.low, level - self.spread), min(1.0, level + self.spread)
 
     def draw(self, rng: np.random.Generator) -> float:
-        """An amplitude."""
+        """Draw an amplitude."""
         low, high = (self.low, 1.0) if rng.random() < self.everywhere else self.near
         return float(rng.uniform(low, high))
 
     def density(self, amplitude: NDArray[np.float64] | float) -> Floats:
-        """Density at amplitudes, any shape; integrates to 1 over [low, 1]."""
+        """Compute the density at amplitudes, any shape; integrates to 1 over [low, 1]."""
         a = np.asarray(amplitude, dtype=np.float64)
         low, high = self.near
         everywhere = self.everywhere * ((a >= self.low) & (a <= 1)) / (1 - self.low)
@@ -208,12 +209,12 @@ class DrawDensity:
 
 
 def near_density(level: float, low: float) -> DrawDensity:
-    """Density of held amplitudes near one: uniform within `NEAR_SPREAD` of it, above the bound in force."""
+    """Build the density of sustained amplitudes near one: uniform within `NEAR_SPREAD` of it, above the bound in force."""
     return DrawDensity(level, low, NEAR_SPREAD, everywhere=0.0)
 
 
 def near_session(level: float, steps: int, period_s: float, lower_bound: float, seed: int, number: int) -> DesignedSession:
-    """A session held near an amplitude; below `LOW_AMPLITUDE` in its last `LOW_SECONDS` alone, and as low as that allows before.
+    """Design a session near an amplitude; below `LOW_AMPLITUDE` in its last `LOW_SECONDS` alone, and as low as that allows before.
 
     Args:
         level: fraction of cDBS. steps: T. period_s: of a step. lower_bound: B. seed, number: the same ones give the same draws.
@@ -229,23 +230,23 @@ def near_session(level: float, steps: int, period_s: float, lower_bound: float, 
 
 
 def near_doses(level: float, steps: int, period_s: float, lower_bound: float) -> tuple[float, float]:
-    """Expected mean amplitude of a session held near a level, over the session and over its last `LOW_SECONDS`."""
+    """Compute the expected mean amplitude of a session near a level, over the session and over its last `LOW_SECONDS`."""
     late = min(steps, int(LOW_SECONDS / period_s))
     before, after = (float(np.mean(near_density(level, low).near)) for low in (max(lower_bound, LOW_AMPLITUDE), lower_bound))
     return (before * (steps - late) + after * late) / steps, after
 
 
 def hold_steps(rng: np.random.Generator, period_s: float) -> int:
-    """Length of one hold in steps, log-uniform between `HOLD_SECONDS`, at least one step."""
+    """Draw the length of one hold in steps, log-uniform between `HOLD_SECONDS`, at least one step."""
     low, high = HOLD_SECONDS
     seconds = low * (high / low) ** rng.random()
     return max(1, round(seconds / period_s))
 
 
 def ladder_session(settings: DesignSettings, visit: int, number: int) -> DesignedSession:
-    """The titration ladder: 1, 0.8, 0.6, ... for two minutes each, down to B at the lowest and within the safety limit.
+    """Design the titration ladder: 1, 0.8, 0.6, ... for two minutes each, down to B at the lowest and within the safety limit.
 
-    It ends with the session, so that outcomes meet the lowest rung and anything low lies in the last minutes; before it stands cDBS. A
+    It ends with the session: outcomes are measured at the lowest rung, and low amplitudes come in the last minutes. Before it is cDBS. A
     session too short for all rungs has the first ones.
     """
     length = max(1, int(LADDER_SECONDS / settings.period_s))
@@ -278,8 +279,8 @@ def _held_session(settings: DesignSettings, visit: int, number: int, level: floa
 def _held(
     steps: int, period_s: float, lower_bound: float, rng: np.random.Generator, law: Callable[[float], DrawDensity]
 ) -> tuple[Decision, ...]:
-    """Held draws by a density that depends on the bound in force."""
-    # Low amplitudes stand at the end: outcomes are taken there, and a session that is broken off has not been low for nothing.
+    """Draw sustained amplitudes by a density that depends on the bound in force."""
+    # Low amplitudes come last: outcomes are measured there, and a session that is broken off has not been low without need.
     low_begins = max(0, steps - int(LOW_SECONDS / period_s))
     decisions: list[Decision] = []
     k = 0
@@ -295,7 +296,7 @@ def _held(
 
 @dataclass(frozen=True)
 class Recognised:
-    """What logged amplitudes say about how they were drawn.
+    """Way in which logged amplitudes were drawn, as far as they show it.
 
     Attributes:
         kind: `every_step` (a new draw every step, as in the paper's design), `held` (draws that last), `constant`, or `unknown` with too
@@ -310,9 +311,10 @@ class Recognised:
 
 
 def unstated_holds(recognised: Recognised, steps: int) -> tuple[Hold, ...]:
-    """The stretches of held draws as decisions of unknown density that leave out none of `steps`: unknown steps go on with the hold before.
+    """Convert stretches of sustained draws to decisions of unknown density that cover all `steps`; unknown steps extend the hold before
+    them.
 
-    One amplitude all along is one hold. Empty where the draws are not held.
+    A single amplitude throughout is one hold. Empty where the draws change every step.
     """
     if recognised.kind not in ("held", "constant"):
         return ()
@@ -321,12 +323,12 @@ def unstated_holds(recognised: Recognised, steps: int) -> tuple[Hold, ...]:
 
 
 HELD_SHARE: Final = 0.5
-"""From this share of repeated amplitudes on, draws count as held: rounding a new draw to a device's 0.1 mA repeats far fewer."""
+"""Share of repeated amplitudes from which draws count as sustained: rounding a new draw to a device's 0.1 mA repeats far fewer."""
 FEWEST_STEPS: Final = 10
 
 
 def recognise(amplitude: Sequence[float] | Floats, tolerance: float = 1e-6) -> Recognised:
-    """Whether the random amplitudes of a session without a stated design were drawn every step or held.
+    """Recognise whether the random amplitudes of a session without a stated design were drawn every step or sustained.
 
     Args:
         amplitude: fraction of cDBS per step, [T]; NaN where unknown.

@@ -1,12 +1,12 @@
 """Stimulation energy: relative to cDBS, in microwatts where the pulses are known, and what it may mean for a battery.
 
 Source: Gao et al. 2023, section 6.1 (metric). The paper names the metric without a formula. Energy per pulse grows with the square of the
-current, so that at a fixed rate and pulse width the energy of a session relative to cDBS is the mean of the squared amplitude fraction.
+current. So at a fixed rate and pulse width, the energy of a session relative to cDBS is the mean squared amplitude fraction.
 
-That is the energy which reaches the tissue. What the battery gives for it lies between that (an output stage without loss) and current
-times a fixed supply voltage, which grows with the current alone: of the battery's charge a smaller share is saved than of the tissue's
-energy. Battery life is therefore a range, and depends on numbers about the implant that no recording holds; they must be given and are
-handed back with it.
+That is the energy which reaches the tissue. The battery gives at least that (an output stage without loss). At most it gives current times
+a fixed supply voltage, which grows with the current alone. So the share saved of the battery's charge is smaller than that of the tissue's
+energy. Battery life is therefore a range. It depends on numbers about the implant that no recording contains; they must be given and are
+returned with it.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike
 
 
 def relative_energy(fraction: ArrayLike) -> float:
-    """Mean squared amplitude fraction of one session: 1 is cDBS, 0 is no stimulation; above 1 where amplitudes exceeded cDBS.
+    """Compute the mean squared amplitude fraction of one session: 1 is cDBS, 0 is no stimulation; above 1 where amplitudes exceeded cDBS.
 
     Args:
-        fraction: amplitude fraction of the cDBS amplitude per step, shape [T]; NaN where unknown, which is left out.
+        fraction: amplitude fraction of the cDBS amplitude per step, shape [T]; NaN where unknown, which is ignored.
 
     Returns:
         Energy relative to cDBS; NaN when no step is known.
@@ -34,15 +34,16 @@ def relative_energy(fraction: ArrayLike) -> float:
 
 
 def mean_square_ma(amplitude_ma: ArrayLike) -> float:
-    """Mean squared amplitude of one session, mA^2; arguments and errors as in `relative_energy`, in milliamperes."""
+    """Compute the mean squared amplitude of one session, mA^2; arguments and errors as in `relative_energy`, in milliamperes."""
     return _mean_square(amplitude_ma, "amplitude in mA")
 
 
 def mean_power_uw(amplitude_ma: ArrayLike, pulse_width_us: ArrayLike, rate_hz: ArrayLike, impedance_ohm: float) -> float:
-    """Mean electrical power into the tissue: I^2 R times the share of the time that a pulse is on (Koss et al. 2005, for currents).
+    """Compute the mean electrical power into the tissue: I^2 R times the share of the time that a pulse is on (Koss et al. 2005, for
+    currents).
 
     Args:
-        amplitude_ma: pulse amplitude per step, mA, shape [T]; steps that are NaN in any of the three are left out.
+        amplitude_ma: pulse amplitude per step, mA, shape [T]; steps that are NaN in any of the three are ignored.
         pulse_width_us: width of the active phase, microseconds, shape [T] or a number.
         rate_hz: pulses per second, shape [T] or a number.
         impedance_ohm: of the therapy contacts, ohm, above zero.
@@ -87,7 +88,7 @@ def pulse(amplitude_ma: float, pulse_width_us: float, impedance_ohm: float | Non
 
 
 def supply_power_uw(amplitude_ma: ArrayLike, pulse_width_us: ArrayLike, rate_hz: ArrayLike, supply_v: float) -> float:
-    """Mean power that a current source draws from a fixed supply voltage: I V times the share of the time that a pulse is on.
+    """Compute the mean power that a current source draws from a fixed supply voltage: I V times the share of time with a pulse.
 
     Args:
         amplitude_ma, pulse_width_us, rate_hz: as in `mean_power_uw`.
@@ -111,7 +112,7 @@ def supply_power_uw(amplitude_ma: ArrayLike, pulse_width_us: ArrayLike, rate_hz:
 
 @dataclass(frozen=True)
 class Range:
-    """What a number is assumed to lie between.
+    """Lower and upper limit that a number is assumed to have.
 
     Raises:
         ValueError: limits that are not finite, or fall.
@@ -127,7 +128,7 @@ class Range:
 
 @dataclass(frozen=True, kw_only=True)
 class BatteryAssumptions:
-    """What is assumed of an implant; none of it has a default, since no recording holds it.
+    """Assumptions about an implant; none has a default, since no recording contains it.
 
     Attributes:
         capacity_mah: usable charge of the battery, mAh.
@@ -155,7 +156,7 @@ class BatteryAssumptions:
 
 @dataclass(frozen=True)
 class BatteryLife:
-    """How long one charge (or a primary cell) may last, days, under assumptions that belong to it. There is no single number."""
+    """Time that one charge (or a primary cell) may last, days, under assumptions that belong to it. There is no single number."""
 
     days: Range
     assumptions: BatteryAssumptions
@@ -168,7 +169,7 @@ class BatteryLife:
 
 
 def battery_life(stimulation_uw: Range, assumptions: BatteryAssumptions) -> BatteryLife:
-    """Time from full to empty.
+    """Compute the time from full to empty.
 
     Args:
         stimulation_uw: what stimulation draws from the battery, from `mean_power_uw` (no loss) to `supply_power_uw` (fixed supply).
@@ -205,7 +206,8 @@ class Implant:
     source: str
 
     def life(self, amplitude_ma: ArrayLike) -> BatteryLife:
-        """From full to empty at these amplitudes, mA [T]: between an output stage without loss (I^2 R) and a fixed supply (I V).
+        """Compute the time from full to empty at these amplitudes, mA [T]: between an output stage without loss (I^2 R) and a fixed supply
+        (I V).
 
         Raises:
             ValueError: numbers from which no life follows.
@@ -222,7 +224,7 @@ class Implant:
 
 
 def saving_percent(energy: float, reference: float) -> float:
-    """What a controller saves against a reference (cDBS), per cent; negative when it uses more.
+    """Compute what a controller saves against a reference (cDBS), per cent; negative when it uses more.
 
     Raises:
         ValueError: a reference that is not above zero, against which nothing can be saved.

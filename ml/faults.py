@@ -1,4 +1,4 @@
-"""Tells what our own code says of data from what a library says of its arrays."""
+"""Separation of errors that our own code raises about data from those that a library raises about its arrays."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ BROKE = "its computation broke down on these data; the log tells engineers where
 
 
 def own_words(error: Exception) -> str | None:
-    """What an error says where our own code raised it, as a sentence for who reads results; None where a library did.
+    """Return the message of an error that our own code raised, as a sentence for people who read results; None where a library raised it.
 
     What is raised by a function written in C counts as the code that called it.
     """
@@ -23,7 +23,7 @@ def own_words(error: Exception) -> str | None:
 
 
 def said_of(error: Exception, log: Callable[[str], None]) -> str:
-    """Why a method gave nothing, for who reads results; what a library said of it goes to `log`."""
+    """Say why a method gave nothing, for people who read results; a library's message goes to `log`."""
     if (said := own_words(error)) is not None:
         return said
     log("".join(traceback.format_exception(error)).rstrip())

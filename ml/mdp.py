@@ -69,12 +69,12 @@ class MdpSettings:
             raise ValueError(f"r_a ({self.r_a}) must not be below r_b ({self.r_b}): beta under the threshold is the better state")
 
     def to_json(self) -> dict[str, Any]:
-        """All constants, by name."""
+        """Return all constants, by name."""
         return asdict(self)
 
 
 def step_reward(settings: MdpSettings, beta: NDArray[Any], amplitude: NDArray[Any]) -> NDArray[np.float64]:
-    """Reward of steps (eq:per_step_reward): r_a or r_b by the threshold, less C1 times the amplitude.
+    """Compute the reward of steps (eq:per_step_reward): r_a or r_b by the threshold, less C1 times the amplitude.
 
     Args:
         settings: the participant's MDP constants.

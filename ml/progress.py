@@ -1,4 +1,4 @@
-"""How long computations say where they are; every fit, training and roll-out takes a `Report`."""
+"""Reports of progress; every fit, training and roll-out takes a `Report`."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ class Report(Protocol):
     """Called now and then with the finished share and a few named numbers (losses, estimates)."""
 
     def __call__(self, fraction: float, message: str = "", **numbers: float) -> None:
-        """`fraction` in [0, 1]; `message` a short phrase for a person; `numbers` become points of learning curves."""
+        """Report a `fraction` in [0, 1]; `message` is a short phrase for a person; `numbers` become points of learning curves."""
 
 
 def silent(fraction: float, message: str = "", **numbers: float) -> None:
-    """A report that goes nowhere."""
+    """Ignore a report."""
 
 
 def part_of(report: Report, k: int, of: int) -> Report:
-    """A report for the k-th of several equal parts of a computation."""
+    """Report the k-th of several equal parts of a computation."""
 
     def inner(fraction: float, message: str = "", **numbers: float) -> None:
         report((k + fraction) / of, message, **numbers)

@@ -1,10 +1,10 @@
-"""What a session returned, and by how much one policy returns more than another. One definition of each, for all of betaloop.
+"""Return of a session, and gain of one policy over another. One definition of each, for all of betaloop.
 
-Actual return: sum over t < H of gamma^t r_t + r_end. Gaps have one rule. A step without a known reward (beta or amplitude not valid, or H
-beyond the session's end) counts as the discount-weighted mean of the known ones, and a session whose known steps hold less than
-`KNOWN_SHARE` of the discount weight has no step return. Other rules are worse. Where r_a = 0, as in the paper, counting a missing step as 0
-gives it the best reward there is, so that gaps look good; leaving out every session with a gap loses nearly all recordings; and without a
-least share a few steps would speak for a whole session.
+Actual return: sum over t < H of gamma^t r_t + r_end. Gaps have one rule. A step without a known reward counts as the discount-weighted mean
+of the known ones (beta or amplitude not valid, or H beyond the session's end). A session whose known steps have less than `KNOWN_SHARE` of
+the discount weight has no step return. Other rules are worse. Where r_a = 0, as in the paper, a missing step that counts as 0 gets the best
+reward there is, so that gaps look good. Excluding every session with a gap loses nearly all recordings. Without a least share a few steps
+would represent a whole session.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ class ActualReturn:
 
 
 def actual_return(session: SessionTrajectory, settings: MdpSettings, horizon_steps: int) -> ActualReturn:
-    """A session's actual return over H steps, under the rule for gaps of this module; steps beyond H are left out."""
+    """Compute a session's actual return over H steps, under the rule for gaps of this module; steps beyond H are ignored."""
     return ActualReturn(step_return(session.rewards(settings), settings.gamma, horizon_steps), session.end_reward(settings))
 
 
 def step_return(rewards: Floats, gamma: float, horizon_steps: int) -> float | None:
-    """Discounted sum of the step rewards [T] over H steps, NaN where unknown; None where too little of it is known."""
+    """Sum the step rewards [T] over H steps, discounted, NaN where unknown; None where too little of it is known."""
     own = np.full((1, horizon_steps), np.nan)
     own[0, : min(rewards.size, horizon_steps)] = rewards[:horizon_steps]
     found, shares = step_returns(np.nan_to_num(own), ~np.isnan(own), gamma)
@@ -61,10 +61,10 @@ def step_return(rewards: Floats, gamma: float, horizon_steps: int) -> float | No
 
 
 def step_returns(rewards: Floats, known: NDArray[np.bool_], gamma: float) -> tuple[Floats, Floats]:
-    """Discounted sums of several sessions, unknown steps counted as the mean of the known ones.
+    """Sum the discounted rewards of several sessions; unknown steps count as the mean of the known ones.
 
     Args:
-        rewards: r_t, [N, H]; what stands where a step is not known does not matter. known: steps that count, [N, H]. gamma: per step.
+        rewards: r_t, [N, H]; values at unknown steps do not matter. known: steps that count, [N, H]. gamma: per step.
 
     Returns:
         The sums, 0 for a session without a known step, and the share of the discount weight that is known, [N] each.
@@ -93,7 +93,7 @@ class Gain:
 
 
 def gain(draws: Floats, reference: Floats, level: float = BOUND) -> Gain:
-    """Gain of one policy over another from draws that share their resampled sessions, so that what both share cancels.
+    """Compute the gain of one policy over another. Both have draws of the same resampled sessions, so that what both share cancels.
 
     Args:
         draws, reference: bootstrap draws of both returns by one method, [D]; draw d of both rests on the same resampled sessions.

@@ -1,7 +1,7 @@
 """Samples at the resolution of a screen: extremes per bin of time in several widths, and power over time and frequency.
 
-A recording of a million samples cannot be sent to a page. A bin's lowest and highest sample together show what a line through every sample
-would show at that width, so that no spike is lost; bins without a sample stay empty, so that gaps stay gaps.
+A recording of a million samples cannot be sent to a page. A bin's lowest and highest sample show what a line through every sample would
+show at that width, so that no spike is lost. Bins without a sample stay empty, so that gaps stay gaps.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Spectrogram:
 
 
 def pyramid(t_s: NDArray[np.float64], values: NDArray[np.float32], rate_hz: float) -> list[Level]:
-    """Levels of extremes, each `FACTOR` times as wide as the one before, down to a single bin.
+    """Compute levels of extremes, each `FACTOR` times as wide as the one before, down to a single bin.
 
     Args:
         t_s: times of the samples, s, [n], in any order. values: samples, [n]. rate_hz: the highest rate of the samples.
@@ -90,7 +90,7 @@ def _wider(level: Level) -> Level:
 
 
 def level_for(levels: Sequence[Level], begin_s: float, end_s: float, bins: int) -> int | None:
-    """Which level draws a window in at least `bins` bins, the coarsest that does; None where only the samples themselves do."""
+    """Find the coarsest level that draws a window in at least `bins` bins; None where only the samples themselves do."""
     for number in range(len(levels) - 1, -1, -1):
         if levels[number].width_s * bins <= end_s - begin_s:
             return number
@@ -100,10 +100,10 @@ def level_for(levels: Sequence[Level], begin_s: float, end_s: float, bins: int) 
 def spectrogram(
     stretches: Iterable[Stretch], begin_s: float, end_s: float, width_s: float = 1.0, max_hz: float = 100.0, segment_s: float = 1.0
 ) -> Spectrogram:
-    """Power spectral density per column of time: Hann windows that overlap by half, each freed of its mean, one-sided.
+    """Estimate the power spectral density per column of time: Hann windows that overlap by half, each freed of its mean, one-sided.
 
-    A segment counts in the column that holds its middle; the density of a column is the mean of its segments, as in Welch 1967, IEEE Trans.
-    Audio Electroacoust. 15, 70-73. No segment reaches over a gap.
+    A segment counts in the column of its middle. The density of a column is the mean of its segments, as in Welch 1967, IEEE Trans. Audio
+    Electroacoust. 15, 70-73. No segment reaches over a gap.
 
     Args:
         stretches: gap-free pieces; rates may differ.
@@ -111,7 +111,7 @@ def spectrogram(
         max_hz: highest frequency wanted. segment_s: length of a segment; frequencies are 1 / segment_s apart.
 
     Returns:
-        Frequencies that no stretch reaches are left out.
+        Frequencies that no stretch reaches are omitted.
     """
     columns = max(1, int(np.ceil((end_s - begin_s) / width_s - 1e-9)))
     grid = np.arange(int(np.floor(max_hz * segment_s + 1e-9)) + 1) / segment_s
@@ -136,7 +136,7 @@ def spectrogram(
             if width % 2 == 0:
                 power[:, -1] /= 2
             if not np.array_equal(hz[: grid.size], grid[: hz.size]):
-                # a rate that gives no whole number of samples per segment has its frequencies a little beside the grid
+                # a rate that gives no whole number of samples per segment has its frequencies a little off the grid
                 power = np.stack([np.interp(grid[reached], hz, row) for row in power])
             at = column[first : first + block.shape[0]]
             inside = (at >= 0) & (at < columns)
@@ -149,7 +149,7 @@ def spectrogram(
 
 
 def fewer_columns(found: Spectrogram, begin_s: float, end_s: float, most: int) -> Spectrogram:
-    """The columns of a window, averaged so that there are at most `most`; a column without any power stays empty."""
+    """Average the columns of a window so that there are at most `most`; a column without any power stays empty."""
     first = max(0, int(np.floor((begin_s - found.first_s) / found.width_s + 1e-9)))
     last = min(found.density.shape[0], int(np.ceil((end_s - found.first_s) / found.width_s - 1e-9)))
     rows = found.density[first : max(last, first)]

@@ -4,9 +4,9 @@ Alignment, everywhere in betaloop: step k = 0, 1, ... is the row t_s = period (k
 (period k, period (k + 1)], and the beta amplitude of that same window. The state s_k is the W beta amplitudes *before* that row,
 oldest first; r_k uses the row itself. Source: Gao et al. 2023, section 4.1.
 
-A window may hold a stated number of imputed beta amplitudes: between the session's mean and the line from the measured value before to the
-one after, as far as the session's beta carries over from row to row. They are marked, never a window's newest value, and never judged by a
-reward.
+A window may contain a stated number of imputed beta amplitudes. An imputed value is between the session's mean and the line from the
+measured value before to the one after. Its place depends on how far the session's beta carries over from row to row. They are marked, never
+a window's newest value, and never used for a reward.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ Mask = NDArray[np.bool_]
 
 
 PRIOR_PAIRS = 10
-"""Pairs of unrelated rows that count beside the measured ones where autocorrelations are estimated: short sessions say little of them."""
+"""Pairs of unrelated rows that are added to the measured ones where autocorrelations are estimated: short sessions inform little about
+them."""
 
 
 def _carried_over(deviations: Floats) -> float:
-    """Weight of the mean of both neighbours in the best linear prediction of a value between them, 0 to 1.
+    """Estimate the weight of the mean of both neighbours in the best linear prediction of a value between them, 0 to 1.
 
     2 r_1 / (1 + r_2) with the autocorrelations at one and two rows: cov(d_t, m) / var(m) for m = (d_{t-1} + d_{t+1}) / 2. For longer gaps
     it is an approximation.
@@ -56,11 +57,11 @@ def _carried_over(deviations: Floats) -> float:
 
 @dataclass(frozen=True)
 class Hold:
-    """One decision of an exploration design: an amplitude that is drawn once and then held.
+    """One decision of an exploration design: an amplitude that is drawn once and then stays constant.
 
     Attributes:
-        start, steps: first step and length. log_density: of the amplitude given the session's level and the bound in force; None where it
-            is not known (held draws of no stated design) or where nothing was drawn (a titration ladder).
+        start, steps: first step and length. log_density: of the amplitude given the session's level and the bound in force. None where it
+            is unknown (sustained draws of no stated design) or where nothing was drawn (a titration ladder).
     """
 
     start: int
@@ -82,7 +83,7 @@ class SessionTrajectory:
         amplitude: amplitude fraction a_k, shape [T]; NaN where unknown. May exceed 1: such a step is not usable.
         qoc: end-of-session QoCs.
         random_lower_bound: B in force for a random session; else None.
-        holds: decisions of a random session whose draws are held, in order and without gaps up to where it ended. Empty where every step is
+        holds: decisions of a random session with sustained draws, in order and without gaps up to where it ended. Empty where every step is
             a decision of its own: a random session's density is then 1 / (1 - B) on [B, 1] at every step.
         lead_amplitude: amplitude fraction in force just before step 0, where it is known; else None.
         stopped_as: the QoCs that a session counts as which ended for the participant's sake (they asked for it, an adverse event): it is a
@@ -91,7 +92,7 @@ class SessionTrajectory:
         medication_h: hours from the last dose to the session's start, where they are known; else None.
 
     Raises:
-        ValueError: arrays of unequal length, a session without a step, as many imputed values as the window has, or holds that leave out
+        ValueError: arrays of unequal length, a session without a step, or as many imputed values as the window has. Also holds that omit
             steps or go beyond the session.
     """
 
@@ -128,7 +129,7 @@ class SessionTrajectory:
 
     @property
     def uniform_bound(self) -> float | None:
-        """B where every step's amplitude was drawn anew, uniform on [B, 1]; None for any other session."""
+        """B where every step's amplitude was a new draw, uniform on [B, 1]; None for any other session."""
         return None if self.holds else self.random_lower_bound
 
     @property
@@ -143,7 +144,7 @@ class SessionTrajectory:
 
     @property
     def imputed(self) -> Mask:
-        """Which of `padded_beta` are imputed, shape [W + T]."""
+        """Mark which of `padded_beta` are imputed, shape [W + T]."""
         return self._filled()[1]
 
     def _filled(self) -> tuple[Floats, Mask]:
@@ -163,7 +164,7 @@ class SessionTrajectory:
         return beta, imputed
 
     def states(self) -> Floats:
-        """s_0 ... s_T, shape [T + 1, W], oldest beta first; NaN where a window holds an invalid beta that may not be imputed in it."""
+        """Return s_0 ... s_T, shape [T + 1, W], oldest beta first; NaN where a window has an invalid beta that may not be imputed in it."""
         filled, imputed = self._filled()
         window = self.lead_beta.size
         states = sliding_window_view(filled, window)
@@ -174,13 +175,13 @@ class SessionTrajectory:
         return np.where(refused[:, None], sliding_window_view(self.measured_beta, window), states)
 
     def usable(self) -> Mask:
-        """Steps that may enter a buffer, shape [T]: state, next state and amplitude are known, beta is measured and 0 <= a <= 1."""
+        """Mark steps that may enter a buffer, shape [T]: state, next state and amplitude are known, beta is measured and 0 <= a <= 1."""
         whole = np.asarray(np.isfinite(self.states()).all(axis=1))
         amplitude_ok = (self.amplitude >= -AMPLITUDE_TOLERANCE) & (self.amplitude <= 1 + AMPLITUDE_TOLERANCE)
         return whole[:-1] & whole[1:] & amplitude_ok
 
     def rewards(self, settings: MdpSettings) -> Floats:
-        """r_k, shape [T]; NaN where beta or amplitude is unknown."""
+        """Compute r_k, shape [T]; NaN where beta or amplitude is unknown."""
         return step_reward(settings, self.beta, self.amplitude)
 
     @property
@@ -245,7 +246,7 @@ class ReplayBuffer:
                 )
 
     def transitions(self) -> Transitions:
-        """All usable steps. Raises ValueError when there is none."""
+        """Collect all usable steps. Raises ValueError when there is none."""
         states, actions, rewards, next_states, index, step = [], [], [], [], [], []
         for i, session in enumerate(self.sessions):
             k = np.flatnonzero(session.usable())
@@ -268,14 +269,14 @@ class ReplayBuffer:
         )
 
     def beta_scale(self) -> tuple[float, float]:
-        """Mean and standard deviation of all valid beta amplitudes, for normalising network inputs."""
+        """Compute mean and standard deviation of all valid beta amplitudes, for normalising network inputs."""
         values = np.concatenate([s.measured_beta for s in self.sessions])
         values = values[~np.isnan(values)]
         std = float(values.std())
         return float(values.mean()), std if std > 0 else 1.0
 
     def median_steps(self) -> int:
-        """Median session length in steps: the default horizon H of returns."""
+        """Compute the median session length in steps: the default horizon H of returns."""
         return int(np.median([s.steps for s in self.sessions]))
 
 
@@ -289,7 +290,7 @@ _STOPPED_SCHEMA_VERSION = 5
 
 
 def _schema_version(buffer: ReplayBuffer) -> int:
-    """The lowest version that tells all of a buffer, so that buffers of before keep their bytes and their names."""
+    """Choose the lowest version that can express all of a buffer, so that older buffers keep their bytes and their names."""
     if any(s.stopped for s in buffer.sessions):
         return _STOPPED_SCHEMA_VERSION
     if any(s.holds for s in buffer.sessions):
@@ -298,7 +299,7 @@ def _schema_version(buffer: ReplayBuffer) -> int:
 
 
 def to_parquet(buffer: ReplayBuffer) -> bytes:
-    """The buffer as Parquet bytes: one row per beta amplitude (step < 0: the window before the session), constants in the metadata.
+    """Write the buffer as Parquet bytes: one row per beta amplitude (step < 0: the window before the session), constants in the metadata.
 
     The bytes depend on the buffer alone (and the pyarrow version), so that their SHA-256 names it.
     """
@@ -368,12 +369,12 @@ def from_parquet(content: bytes) -> ReplayBuffer:
 
 
 def content_hash(content: bytes) -> str:
-    """SHA-256 of stored bytes, in hex."""
+    """Compute the SHA-256 of stored bytes, in hex."""
     return hashlib.sha256(content).hexdigest()
 
 
 def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
-    # members that are left out where they say nothing, so that the bytes of older buffers stay what they were
+    # members that are omitted at their default, so that the bytes of older buffers stay what they were
     later: dict[str, Any] = {"most_imputed": s.most_imputed} if s.most_imputed else {}
     later |= {"lead_amplitude": s.lead_amplitude} if s.lead_amplitude is not None else {}
     later |= {"holds": [[h.start, h.steps, h.log_density] for h in s.holds]} if s.holds else {}

@@ -1,7 +1,8 @@
-"""Visit days of a synthetic participant: which sessions are held, by the rules of the paper's trials, and the replay buffers they leave.
+"""Visit days of a synthetic participant: the sessions that take place, by the rules of the paper's trials, and the replay buffers they
+leave.
 
-Rules (Gao et al. 2023, section 6.1): sessions last 5-20 minutes; 2-4 policies are tested on a day; a cDBS session stands between any two
-sessions of learned policies; no-DBS sessions are few and last 5 minutes; a uniformly random controller on [B, 1] is used early on.
+Rules (Gao et al. 2023, section 6.1). Sessions last 5-20 minutes; 2-4 policies are tested on a day. A cDBS session comes between any two
+sessions of learned policies. No-DBS sessions are few and last 5 minutes. A uniformly random controller on [B, 1] is used early on.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def run_day(
     keep_lfp: bool = False,
     report: Report = silent,
 ) -> list[SimulatedSession]:
-    """Hold the sessions of a visit day; `policies` by the names in the plan, `seed` is the study's."""
+    """Run the sessions of a visit day; `policies` by the names in the plan, `seed` is the study's."""
     sessions = []
     for number, planned in enumerate(day):
         controller: Controller = policies[planned.policy] if planned.policy is not None else planned.controller  # type: ignore[assignment]
@@ -120,7 +121,8 @@ def random_controller_buffer(
     settings: MdpSettings | None = None,
     threads: int = 1,
 ) -> ReplayBuffer:
-    """A replay buffer of early visits: mostly random sessions, each third cDBS, one short no-DBS session per visit from the third on.
+    """Simulate a replay buffer of early visits: mostly random sessions, each third cDBS, one short no-DBS session per visit from the third
+    on.
 
     Args:
         participant: who. visits: number of visit days. sessions_per_visit: random and cDBS sessions of each. steps: T of these sessions.

@@ -1,4 +1,4 @@
-"""What runs a session: a policy or one of the fixed controllers, and what the device delivers of what it asks for."""
+"""Controllers of a session, a policy or a fixed one, and the amplitudes that the device delivers for them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _FIXED: Final[dict[str, float]] = {"cdbs": 1.0, "no_dbs": 0.0}
 
 
 def is_random(controller: Controller) -> bool:
-    """Whether it explores: by draws of its own, or as a design laid out."""
+    """Decide whether a controller explores: by draws of its own, or as a design planned."""
     return isinstance(controller, np.ndarray) or (isinstance(controller, str) and controller == "random")
 
 
 def chooser(controller: Controller, counters: NDArray[np.uint64], lower_bound: float) -> Callable[[Floats], Floats]:
-    """What to ask for at each step, from the beta windows [N, W]."""
+    """Make the function that chooses an amplitude at each step, from the beta windows [N, W]."""
     if isinstance(controller, str) and controller == "random":
         if not 0 <= lower_bound < 1:
             raise ValueError(f"the random controller needs a lower bound in [0, 1), not {lower_bound}")
@@ -53,7 +53,7 @@ def chooser(controller: Controller, counters: NDArray[np.uint64], lower_bound: f
 
 
 def delivery(participant: ParticipantModel, resolution_ma: float | None, lower_bound: float) -> Callable[[Floats], Floats]:
-    """What the device delivers of what is asked, as fractions; rounding never goes below a random controller's bound."""
+    """Make the function from requested to delivered fractions; rounding never goes below a random controller's bound."""
     if resolution_ma is None:
         return lambda asked: asked
     unit = resolution_ma / participant.cdbs_amplitude_ma

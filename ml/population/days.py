@@ -1,4 +1,4 @@
-"""How a visit day differs from another: progression from month to month, the day's form, today's levodopa exposure."""
+"""Differences between visit days: progression from month to month, the day's form, today's levodopa exposure."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class DayEffect:
 
 
 def day_effect(salt: int, visit: int, study_seed: int = 0) -> DayEffect:
-    """The day of `visit` (1, 2, ...) of the participant with this salt; another `study_seed` is another run of the same study."""
+    """Draw the day of `visit` (1, 2, ...) of the participant with this salt; another `study_seed` is another run of the same study."""
     form, dose, delay = np.random.default_rng([salt, visit, study_seed]).standard_normal(3)
     return DayEffect(
         log_gain=DAY_LOG_GAIN * form + PROGRESSION_PER_VISIT * (visit - 1),

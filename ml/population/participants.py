@@ -81,7 +81,7 @@ class Regimen:
 
 @dataclass(frozen=True, kw_only=True)
 class Programme:
-    """How the implanted stimulator is programmed.
+    """Programme of the implanted stimulator.
 
     Attributes:
         rate_hz, pulse_width_us: pulse train.
@@ -138,7 +138,7 @@ class ParticipantModel:
     reference: ReferenceBeta
 
     def mdp_settings(self, **changes: Any) -> MdpSettings:
-        """Suggested MDP constants, `changes` applied on top. Beta is in uV."""
+        """Suggest MDP constants, with `changes` applied on top. Beta is in uV."""
         suggested: dict[str, Any] = {"xi_beta": self.reference.xi_beta, "c2": self.c2, "c3": self.c3, "c4": self.c4}
         return MdpSettings(**(suggested | changes))
 

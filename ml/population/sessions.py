@@ -1,6 +1,6 @@
 """Sessions of a synthetic participant: one controller, a window of beta before it, steps of 2 s, and what is measured at the end.
 
-All sessions of a call advance together, and each keeps its own random streams: a session is the same, bit for bit, alone or among others.
+All sessions of a call advance together, each with its own random streams. So a session is the same, bit for bit, alone or among others.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class SimulatedSession:
         return self.outcomes.tremor_minutes
 
     def trajectory(self, session_id: int, policy_id: int | None = None) -> SessionTrajectory:
-        """The session as a trajectory of the MDP; the lead is the window before it."""
+        """Convert the session to a trajectory of the MDP; the lead is the window before it."""
         return SessionTrajectory(
             session_id=session_id,
             visit=self.visit,
@@ -122,7 +122,7 @@ class SessionBatch:
         return int(self.seeds.size)
 
     def session(self, i: int) -> SimulatedSession:
-        """Session i of the batch."""
+        """Extract session i of the batch."""
         return SimulatedSession(
             participant=self.participant.code,
             controller=self.controller,
@@ -242,7 +242,8 @@ def run_sessions(
 
     Args:
         participant: a model or its code.
-        controller: a policy, `random` (uniform on [lower_bound, 1] anew at each step), `cdbs`, `no_dbs`, or a design's amplitudes, [T].
+        controller: a policy, `random` (a new uniform draw on [lower_bound, 1] at each step), `cdbs`, `no_dbs`, or a design's amplitudes,
+            [T].
         visits, hours, seeds, study_seed: of each session, [N] or one for all; `hours` since the first session of the day (0-6).
         steps: T. lead_steps: L, beta amplitudes before step 0, which is also the window W that a policy sees.
         lead_amplitude: amplitude fraction before the session; 1 because cDBS runs between sessions.
@@ -251,8 +252,8 @@ def run_sessions(
         keep_lfp: keep the LFP (2 kB per step and session).
 
     Raises:
-        ValueError: an unknown participant or controller, no step, a policy that leaves [0, 1] or answers in another shape, or a design of
-            another length or below `lower_bound`.
+        ValueError: an unknown participant or controller, no step, or a policy that leaves [0, 1] or answers in another shape. Also a design
+            of another length or below `lower_bound`.
     """
     model = _model(participant)
     if isinstance(controller, np.ndarray) and (
@@ -333,7 +334,7 @@ def run_session(
     study_seed: int = 0,
     name: str = "rl",
 ) -> SimulatedSession:
-    """One session with its LFP; arguments and errors as in `run_sessions`."""
+    """Run one session with its LFP; arguments and errors as in `run_sessions`."""
     return run_sessions(
         participant,
         controller,

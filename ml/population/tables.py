@@ -13,7 +13,7 @@ TREMOR_COLUMNS: Final = ("mild", "moderate", "none", "slight", "strong", "unknow
 
 
 def session_table_csv(session: SimulatedSession) -> bytes:
-    """Columns `t_s,beta,amplitude_fraction`, one row per 2 s; beta in uV.
+    """Write columns `t_s,beta,amplitude_fraction`, one row per 2 s; beta in uV.
 
     Row t_s = 2(k + 1) holds step k; rows with t_s <= 0 are the window before the session, the newest at 0.
     """

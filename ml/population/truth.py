@@ -30,7 +30,7 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class TrueReturn:
-    """What a controller is worth on a participant.
+    """True return of a controller on a participant.
 
     Attributes:
         total: E[r_end + sum over t < steps of gamma^t r_t]. step_return, end_reward: its two parts.
@@ -74,7 +74,7 @@ def true_return(
     threads: int = 1,
     report: Report = silent,
 ) -> TrueReturn:
-    """Expected return of a controller over days, hours and noise (eq:ope_total_return).
+    """Estimate the expected return of a controller over days, hours and noise (eq:ope_total_return).
 
     Args:
         policy: a policy, `random` (on [settings.lower_bound, 1]), `cdbs` or `no_dbs`.
@@ -130,7 +130,7 @@ def sample_sessions(
     threads: int = 1,
     report: Report = silent,
 ) -> SessionBatch:
-    """Independent sessions: days, hours (stratified over the day), visits and noise drawn from `seed` alone, whatever the controller."""
+    """Simulate independent sessions: days, hours (stratified over the day), visits and noise from `seed` alone, whatever the controller."""
     if sessions < 2:
         raise ValueError(f"a standard error needs at least two sessions, not {sessions}")
     rng = np.random.default_rng([seed, 0x7275])
@@ -151,7 +151,7 @@ def sample_sessions(
 
 
 def measure_reference(participant: ParticipantModel | str, *, sessions: int = 200, seed: int = 0, threads: int = 1) -> ReferenceBeta:
-    """Mean beta amplitudes of 10 min sessions under cDBS, amplitude fraction 0.3 and no stimulation."""
+    """Measure mean beta amplitudes of 10 min sessions under cDBS, amplitude fraction 0.3 and no stimulation."""
     levels: dict[str, Controller] = {"cdbs": "cdbs", "at_03": ConstantPolicy(0.3), "off": "no_dbs"}
     common: dict[str, Any] = {"sessions": sessions, "seed": seed, "steps": 300, "threads": threads}
     means = {name: float(sample_sessions(level, participant, **common).beta.mean()) for name, level in levels.items()}

@@ -60,7 +60,8 @@ def rcs_session_zip(
     ins_clock_offset_s: float = 0.0,
     bad_gen_times: int = 3,
 ) -> bytes:
-    """A recording as the bytes of a ZIP with `Session<unix ms>/Device<serial>/` and its eleven files; equal arguments give equal bytes.
+    """Write a recording as the bytes of a ZIP with `Session<unix ms>/Device<serial>/` and its eleven files; equal arguments give equal
+    bytes.
 
     Args:
         sessions: of one participant, in the order they took place, each with its LFP. Their amplitudes are logged in steps of 0.1 mA, the
@@ -97,7 +98,7 @@ def rcs_session_zip(
 
 
 def stim_records(participant: ParticipantModel, blocks: Sequence[_Block], started_ms: int) -> list[tuple[int, Json]]:
-    """Delta records of StimLog with their PC times: all groups first, then each change of amplitude or therapy status."""
+    """Make the delta records of StimLog with their PC times: all groups first, then each change of amplitude or therapy status."""
     amplitude = participant.cdbs_amplitude_ma
     first: Json = {"therapyStatusData": {"activeGroup": 0, "therapyStatus": 1}}
     first |= {f"TherapyConfigGroup{n}": ds.stim_group(participant, n, amplitude) for n in range(4)}
@@ -214,7 +215,8 @@ def _power(counts: NDArray[np.float64], stream_ms: int) -> Iterator[tuple[int, s
 
 
 def band_power(counts: NDArray[np.float64]) -> list[int]:
-    """On-device power of the two bands from one FFT window of device units, [250]: 64 |FFT|^2 / N^2 per bin, shifted, summed."""
+    """Compute the on-device power of the two bands from one FFT window of device units, [250]: 64 |FFT|^2 / N^2 per bin, shifted,
+    summed."""
     spectrum = np.fft.rfft(counts * np.hanning(counts.size), n=ds.FFT_SIZE)
     power = 64.0 * np.abs(spectrum) ** 2 / ds.FFT_SIZE**2
     shifted = np.floor(power / 2 ** (8 - (15 - ds.BAND_FORMATION)))
@@ -254,7 +256,7 @@ def _settings_records(
 
 
 def _event_records(blocks: Sequence[_Block]) -> list[tuple[int, Json]]:
-    """Notes at the start, the grasp test and the end of each session; they do not tell the controller."""
+    """Make notes at the start, the grasp test and the end of each session; they do not reveal the controller."""
     records = []
     for number, block in enumerate(blocks, start=1):
         grasp_ms = max(block.start_ms, block.end_ms - 10_000)

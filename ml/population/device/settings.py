@@ -1,6 +1,6 @@
-"""What a Summit RC+S settings file says before any change: record 0 of DeviceSettings and StimLog for a synthetic participant.
+"""First record of a Summit RC+S settings file: record 0 of DeviceSettings and StimLog for a synthetic participant.
 
-Field names, codes and units as in recordings of the device. Identity fields say that nobody is behind them.
+Field names, codes and units as in recordings of the device. Identity fields state that there is no person behind them.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def device_settings(participant: ParticipantModel, serial: str, ins_seconds: int
 
 
 def general_data(serial: str, ins_seconds: int, *, therapy_on: bool) -> Json:
-    """Section GeneralData, which later records repeat."""
+    """Make section GeneralData, which later records repeat."""
     return {
         "batteryStatus": 80,
         "daysUntilEos": 3254,
@@ -106,7 +106,7 @@ def general_data(serial: str, ins_seconds: int, *, therapy_on: bool) -> Json:
 
 
 def stream_state(*, on: bool) -> Json:
-    """Section StreamState: time domain, power and time sync together."""
+    """Make section StreamState: time domain, power and time sync together."""
     return {
         "AccelStreamEnabled": False,
         "AdaptiveStreamEnabled": False,
@@ -121,7 +121,7 @@ def stream_state(*, on: bool) -> Json:
 
 
 def therapy_group(participant: ParticipantModel, group: int, amplitude_ma: float) -> Json:
-    """Section TherapyConfigGroup of DeviceSettings: group A (0) holds the programme, the others are unused."""
+    """Make section TherapyConfigGroup of DeviceSettings: group A (0) has the programme, the others are unused."""
     p = participant.programme
     used = group == 0
     period = round(1e5 / p.rate_hz) if used else 21845
@@ -155,7 +155,7 @@ def therapy_group(participant: ParticipantModel, group: int, amplitude_ma: float
 
 
 def stim_group(participant: ParticipantModel, group: int, amplitude_ma: float) -> Json:
-    """Section TherapyConfigGroup of StimLog, which spells its fields in another way."""
+    """Make section TherapyConfigGroup of StimLog, which spells its fields in another way."""
     p = participant.programme
     out: Json = {"ratePeriod": round(1e5 / p.rate_hz) if group == 0 else 21845, "RateInHz": p.rate_hz if group == 0 else 4.6}
     for n in range(4):
@@ -169,7 +169,7 @@ def stim_group(participant: ParticipantModel, group: int, amplitude_ma: float) -
 
 
 def stim_amplitude(amplitude_ma: float) -> Json:
-    """Amplitude of one program in StimLog: tenths of mA and mA."""
+    """Make the amplitude of one program in StimLog: tenths of mA and mA."""
     tenths = round(10 * amplitude_ma)
     return {"amplitude": tenths, "AmplitudeInMilliamps": tenths / 10}
 
@@ -203,7 +203,7 @@ def _program(programme: Programme, index: int, amplitude_ma: float | None) -> Js
 
 
 def _limits(upper_ma: float | None) -> Json:
-    """Clinician's limits of a group: program 0 up to the cDBS amplitude; placeholders where the group is unused."""
+    """Make the clinician's limits of a group: program 0 up to the cDBS amplitude; placeholders where the group is unused."""
     out: Json = {}
     for n in range(4):
         tenths = _PLACEHOLDER_TENTHS if upper_ma is None else round(10 * upper_ma) if n == 0 else 0

@@ -5,14 +5,15 @@ Two populations, subthalamic nucleus (S) and external globus pallidus (G), in sp
     tau_S dS/dt = F_S(w_CS (Ctx + (1 - kappa E) sigma_c xi) - w_GS G(t - 6 ms)) - S
     tau_G dG/dt = F_G((1 - eta E) w_SG S(t - 6 ms) - w_GG G(t - 4 ms) - w_XG Str) - G
 
-with the sigmoid F(x) = M / (1 + exp(-4 x / M) (M - B) / B) and weights on the line from the healthy (K = 0) to the parkinsonian
-(K = 1) set of Nevado-Holgado, Terry and Bogacz 2010 (J Neurosci 30:12340). DBS acts in two places: it removes a share eta E of the STN-GPe
-loop gain, and a share kappa E of the cortical fluctuations xi that reach the nucleus through the hyperdirect pathway. Its effect E has two
-parts: one follows the amplitude within half a second, the other builds up over seconds and outlasts stimulation. Every population input is
-delayed, so over one step of 1 ms the drive is known and the leak is integrated exactly (exponential integrator, trapezoid in the drive).
+with the sigmoid F(x) = M / (1 + exp(-4 x / M) (M - B) / B). Weights are on the line from the healthy (K = 0) to the parkinsonian (K = 1)
+set of Nevado-Holgado, Terry and Bogacz 2010 (J Neurosci 30:12340). DBS acts in two places. It removes a share eta E of the STN-GPe loop
+gain. It also removes a share kappa E of the cortical fluctuations xi that reach the nucleus through the hyperdirect pathway. Its effect E
+has two parts: one follows the amplitude within half a second, the other builds up over seconds and outlasts stimulation. Every population
+input is delayed. So over one step of 1 ms the drive is known, and the leak is integrated exactly (exponential integrator, trapezoid in the
+drive).
 
-Each session owns its random streams: splitmix64, a counter hashed per draw, keyed by the session's seed. A session's numbers therefore
-depend neither on the batch it runs in, nor on threads, nor on what the controller does (two policies with one seed see the same noise).
+Each session owns its random streams: splitmix64, a counter hashed per draw, with the session's seed as key. A session's numbers therefore
+depend neither on its batch, nor on threads, nor on the controller. Two policies with one seed get the same noise.
 """
 
 from __future__ import annotations
@@ -82,7 +83,8 @@ def _mix(z: Any) -> Any:
 
 @compiled()
 def seed_streams(seeds: Any, salt: Any) -> Any:
-    """Counters of all random streams, shape [N, STREAMS], from session seeds and the participant's salt, both uint64 of shape [N]."""
+    """Make the counters of all random streams, shape [N, STREAMS], from session seeds and the participant's salt, both uint64 of shape
+    [N]."""
     counters = np.empty((seeds.shape[0], STREAMS), dtype=np.uint64)
     for i in range(seeds.shape[0]):
         for j in range(STREAMS):
@@ -92,14 +94,14 @@ def seed_streams(seeds: Any, salt: Any) -> Any:
 
 @compiled()
 def uniform(counters: Any, stream: int) -> float:
-    """Next draw from (0, 1) of a stream; `counters` is the row of one session and is advanced in place."""
+    """Draw the next number from (0, 1) of a stream; `counters` is the row of one session and is advanced in place."""
     counters[stream] += _GOLDEN
     return (float(_mix(counters[stream]) >> _SHIFT_11) + 0.5) * 1.1102230246251565e-16
 
 
 @compiled()
 def gauss_pair(counters: Any, stream: int) -> Any:
-    """Next two independent standard normal draws of a stream (Box and Muller)."""
+    """Draw the next two independent standard normals of a stream (Box and Muller)."""
     radius = math.sqrt(-2.0 * math.log(uniform(counters, stream)))
     angle = 2.0 * math.pi * uniform(counters, stream)
     return radius * math.cos(angle), radius * math.sin(angle)
@@ -112,7 +114,7 @@ def _rate(x: float, maximum: float, base: float) -> float:
 
 @compiled()
 def saturation(a: float, a50: float, hill: float) -> float:
-    """Share of the full DBS effect at amplitude fraction a: a Hill curve scaled to 1 at a = 1."""
+    """Compute the share of the full DBS effect at amplitude fraction a: a Hill curve scaled to 1 at a = 1."""
     if a <= 0.0:
         return 0.0
     return (1.0 + a50**hill) * a**hill / (a**hill + a50**hill)
@@ -130,7 +132,7 @@ def _filtered(sample: float, state: Any, sos: Any) -> float:
 
 @compiled()
 def _one_period(state: Any, counters: Any, c: Any, amplitude: float, k_period: float, sos: Any, lfp: Any) -> float:
-    """500 LFP samples of one session in place; returns their beta RMS in uV. `lfp` (mV) is filled where it is not empty."""
+    """Advance one session by 500 LFP samples in place; returns their beta RMS in uV. `lfp` (mV) is filled where it is not empty."""
     e_inf = saturation(amplitude, c[_A50], c[_HILL])
     noise_xi = _SIGMA_CORTEX * math.sqrt(1.0 - _DECAY_XI**2)
     noise_x, noise_bg = math.sqrt(1.0 - _DECAY_X**2), math.sqrt(1.0 - _DECAY_BG**2)
@@ -198,7 +200,8 @@ def advance(state: Any, counters: Any, constants: Any, amplitude: Any, medicatio
 
 @compiled()
 def initial_state(counters: Any, constants: Any, amplitude: float) -> Any:
-    """State of N sessions long under one constant amplitude, shape [N, STATE_SIZE]; the fast part still has to settle."""
+    """Compute the state of N sessions after a long time at one constant amplitude, shape [N, STATE_SIZE]; the fast part still has to
+    settle."""
     state = np.zeros((counters.shape[0], STATE_SIZE))
     for i in range(counters.shape[0]):
         state[i, _S : _S + 8] = 15.0
@@ -209,7 +212,7 @@ def initial_state(counters: Any, constants: Any, amplitude: float) -> Any:
 
 
 def constants_of(participant: ParticipantModel, log_gain: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Constants of N sessions, shape [N, 7]; `log_gain` [N] is the day's and the visit's shift of log K."""
+    """Compute constants of N sessions, shape [N, 7]; `log_gain` [N] is the day's and the visit's shift of log K."""
     p = participant.brain
     one = np.array([p.k0, p.eta, p.a50, p.hill, p.s_act, p.c_med, p.s_k])
     rows = np.repeat(one[None, :], log_gain.size, axis=0)
@@ -219,5 +222,5 @@ def constants_of(participant: ParticipantModel, log_gain: NDArray[np.float64]) -
 
 @cache
 def beta_filter() -> NDArray[np.float64]:
-    """Second-order sections of the causal Butterworth band-pass 13-35 Hz at 250 Hz (order 4 per edge), shape [4, 6]."""
+    """Design the causal Butterworth band-pass 13-35 Hz at 250 Hz (order 4 per edge) as second-order sections, shape [4, 6]."""
     return np.ascontiguousarray(scipy.signal.butter(4, BETA_BAND_HZ, btype="bandpass", fs=LFP_RATE_HZ, output="sos"))

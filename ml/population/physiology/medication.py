@@ -26,7 +26,7 @@ GRID_HOURS: Final = 24
 
 @cache
 def effect_site_curve() -> NDArray[np.float64]:
-    """Effect-site concentration (mg/L) after one tablet, every 30 s for 24 h, by the exact propagator of the linear system."""
+    """Compute the effect-site concentration (mg/L) after one tablet, every 30 s for 24 h, by the exact propagator of the linear system."""
     k_e0 = math.log(2) / EFFECT_HALF_LIFE_H
     rates = np.array(
         [  # amounts in gut, central and peripheral compartment (mg), concentration at the effect site (mg/L)
@@ -46,7 +46,7 @@ def effect_site_curve() -> NDArray[np.float64]:
 
 
 def effect(regimen: Regimen, hours: NDArray[np.float64], dose_factor: float = 1.0, delay_h: float = 0.0) -> NDArray[np.float64]:
-    """Medication effect 0-1 at `hours` of the visit day, any shape.
+    """Compute the medication effect 0-1 at `hours` of the visit day, any shape.
 
     Args:
         regimen: doses of the day.
@@ -66,6 +66,6 @@ def effect(regimen: Regimen, hours: NDArray[np.float64], dose_factor: float = 1.
 
 
 def since_dose(regimen: Regimen, hour: float) -> float | None:
-    """Hours from the last dose of the day to an hour of it; None where there was none."""
+    """Compute the hours from the last dose of the day to an hour of it; None where there was none."""
     before = [hour - dose for dose in regimen.levodopa_h if dose <= hour]
     return min(before) if before else None

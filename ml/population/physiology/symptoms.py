@@ -1,8 +1,8 @@
 """Symptoms of a synthetic participant in steps of 2 s: tremor, bradykinesia and over-stimulation.
 
-The forms are assumed unless a source is named. Tremor returns within seconds of low stimulation in participants 2-4 and comes in
-episodes in participant 1 (Gao et al. 2023, appendix); bradykinesia has a fast part (15-30 s, Keresztenyi 2007) and a slow part that
-washes out over ten minutes (Cooper 2011, 2013), and follows beta.
+The forms are assumed unless a source is named. Tremor returns within seconds of low stimulation in participants 2-4 and comes in episodes
+in participant 1 (Gao et al. 2023, appendix). Bradykinesia follows beta. It has a fast part (15-30 s, Keresztenyi 2007) and a slow part that
+washes out over ten minutes (Cooper 2011, 2013).
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def advance(state: Any, counters: Any, constants: Any, amplitude: Any, medicatio
 
 
 def constants_of(participant: ParticipantModel, sessions: int) -> NDArray[np.float64]:
-    """Constants of N sessions, shape [N, 10]."""
+    """Compute constants of N sessions, shape [N, 10]."""
     p, reference = participant.symptoms, participant.reference
     row = [p.tremor_max, p.tremor_theta, p.tremor_up_s, p.tremor_down_s, float(p.tremor_episodic)]
     row += [p.brady_beta_share, p.brady_a50, p.brady_hill, reference.cdbs, reference.off]
@@ -75,7 +75,7 @@ def constants_of(participant: ParticipantModel, sessions: int) -> NDArray[np.flo
 
 
 def initial_state(participant: ParticipantModel, sessions: int, amplitude: float) -> NDArray[np.float64]:
-    """State of N participants who have been under one constant amplitude for long, shape [N, STATE_SIZE]."""
+    """Compute the state of N participants after a long time at one constant amplitude, shape [N, STATE_SIZE]."""
     p, reference = participant.symptoms, participant.reference
     state = np.zeros((sessions, STATE_SIZE))
     state[:, FAST] = state[:, SLOW] = saturation(amplitude, p.brady_a50, p.brady_hill)

@@ -95,7 +95,7 @@ def advance(
     out_tremor: Floats,
     out_overload: Floats,
 ) -> None:
-    """`equations.step`, with its four outputs named."""
+    """Run `equations.step`, with its four outputs named."""
     drift_size, act_size = p.drift_sd * math.sqrt(2 * p.drift_rate), math.sqrt(2 * p.act_rate)
     ring_1, ring_2 = 2 * p.ring_decay * math.cos(p.ring_turn), p.ring_decay**2
     for i in range(len(state)):

@@ -64,7 +64,7 @@ class SmoothPolicy:
     def draw(
         cls, rng: np.random.Generator, centre: float, spread: float, *, bias: float, gain: float, follows: bool, window: int = 10
     ) -> SmoothPolicy:
-        """A policy around sigmoid(bias); with `follows` it rises with beta on the whole, else its answer has any sign."""
+        """Draw a policy around sigmoid(bias); with `follows` it rises with beta on the whole, else its answer has any sign."""
         rows = rng.normal(size=(window, HIDDEN))
         for _ in range(2):  # neighbouring betas have similar weights
             rows = (np.roll(rows, 1, axis=0) + rows + np.roll(rows, -1, axis=0)) / 3
@@ -80,7 +80,7 @@ class SmoothPolicy:
 
 
 def draw_candidates(rng: np.random.Generator, xi: float, spread: float, window: int = 10) -> dict[str, Policy]:
-    """Eight to twelve candidates, by name: some far apart, several close to cDBS and to each other, as a training sweep leaves them.
+    """Draw eight to twelve candidates, by name: some far apart, several close to cDBS and to each other, as a training sweep leaves them.
 
     Args:
         rng: what they are drawn with. xi: beta threshold. spread: standard deviation of beta, both in the unit of beta.

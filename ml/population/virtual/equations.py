@@ -69,7 +69,8 @@ MEDICATION_WIDTH_H = 0.25
 
 
 def dose(shape: int, a: Floats, half: Floats, steep: float) -> Floats:
-    """Static dose response, 0 without stimulation; 1 at full amplitude, or for the U at the amplitude `half`. Any shape of arrays."""
+    """Compute the static dose response, 0 without stimulation; 1 at full amplitude, or for the U at the amplitude `half`. Any shape of
+    arrays."""
     if shape == LINE:
         return a
     if shape == HILL:
@@ -81,13 +82,13 @@ def dose(shape: int, a: Floats, half: Floats, steep: float) -> Floats:
 
 
 def medication(p: Patient, constants: Floats, step: int) -> Floats:
-    """Effect of medication, 0 to 1, wearing off around `med_off_h`."""
+    """Compute the effect of medication, 0 to 1, wearing off around `med_off_h`."""
     hour = constants[:, HOUR] + step * PERIOD_S / 3600
     return np.asarray(1 / (1 + np.exp((hour - p.med_off_h) / MEDICATION_WIDTH_H)))
 
 
 def moved_half(p: Patient, constants: Floats, state: Floats) -> Floats:
-    """Factor on the half-effect amplitudes of the day and the moment's activity, [n]."""
+    """Compute the factor on the half-effect amplitudes of the day and the moment's activity, [n]."""
     return np.asarray(constants[:, HALF] * np.exp(p.act_half * state[:, ACT]))
 
 
@@ -133,7 +134,7 @@ def _delayed(p: Patient, amplitude: Floats, k: int) -> Floats:
 
 
 def _reaching_dose(p: Patient, state: Floats, amplitude: Floats, k: int) -> Floats:
-    """The amplitude that acts now: behind a play operator, a dead time, or at once."""
+    """Compute the amplitude that acts now: behind a play operator, a dead time, or at once."""
     if p.kind == HYSTERESIS:
         a = amplitude[:, k]
         state[:, MECHANISM] = np.minimum(np.maximum(state[:, MECHANISM], a - p.play), a + p.play)
@@ -144,7 +145,7 @@ def _reaching_dose(p: Patient, state: Floats, amplitude: Floats, k: int) -> Floa
 def _beta(
     p: Patient, state: Floats, x: Floats, effect: Floats, depth: Floats, d: Floats, z: Floats, *, before_delay: Floats, reached: Floats
 ) -> Floats:
-    """Beta of the step by the patient's mechanism, [n]."""
+    """Compute beta of the step by the patient's mechanism, [n]."""
     bounded = np.clip(effect, 0.0, 1.0)
     if p.kind == BURSTS:
         high = state[:, MODE] > 0.5

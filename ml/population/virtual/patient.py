@@ -1,6 +1,6 @@
 """A virtual patient: the constants of one world at beta level (steps of 2 s), and the distribution that they are drawn from.
 
-All sizes are assumed; nothing here is fitted to a person. What the constants do stands in `equations`, which is written to be read.
+All sizes are assumed; nothing here is fitted to a person. `equations`, which is written to be read, shows what the constants do.
 """
 
 from __future__ import annotations
@@ -140,22 +140,22 @@ class Patient(NamedTuple):
 
     @property
     def beta_answers(self) -> bool:
-        """Whether beta answers to stimulation at all; where it does not, symptoms may."""
+        """True where beta answers to stimulation at all; where it does not, symptoms may."""
         return self.depth >= 0.1
 
 
 def rate(tau_s: float) -> float:
-    """Share of the way to its target that a first-order lag goes in one step."""
+    """Compute the share of the way to its target that a first-order lag goes in one step."""
     return 1.0 - math.exp(-PERIOD_S / tau_s)
 
 
 def drawn_rate(rng: np.random.Generator, low_s: float, high_s: float) -> float:
-    """Rate of a lag whose time constant is log-uniform between two numbers of seconds."""
+    """Draw the rate of a lag whose time constant is log-uniform between two numbers of seconds."""
     return rate(math.exp(float(rng.uniform(math.log(low_s), math.log(high_s)))))
 
 
 def draw_patient(kind: int, rng: np.random.Generator) -> Patient:
-    """An ordinary patient of one mechanism; `traits.with_trait` makes it a difficult one.
+    """Draw an ordinary patient of one mechanism; `traits.with_trait` makes it a difficult one.
 
     Args:
         kind: index into `MECHANISMS`. rng: what the constants are drawn with.

@@ -1,7 +1,7 @@
 """Sessions of a virtual patient: their days, their noise, and the loop with a controller. All sessions of a call advance together.
 
-A session depends on its own seeds alone, so it is the same alone and among thousands, and two controllers with one seed meet the same day
-and the same noise: differences of true returns have small errors.
+A session depends on its own seeds alone, so it is the same alone and among thousands. Two controllers with one seed get the same day and
+the same noise: differences of true returns have small errors.
 """
 
 from __future__ import annotations
@@ -53,20 +53,20 @@ class Days:
 
 
 def new_days(key: int, first: int, n: int) -> Days:
-    """A day of its own for each of the sessions first ... first + n - 1, at a uniform hour of a visit."""
+    """Draw a day of its own for each of the sessions first ... first + n - 1, at a uniform hour of a visit."""
     drawn = [_stream(key, _DAY_STREAM, i) for i in range(first, first + n)]
     return Days(np.stack([g.standard_normal(4) for g in drawn]), np.array([g.uniform(0, HOURS_OF_A_VISIT) for g in drawn]))
 
 
 def visit_days(key: int, visits: NDArray[np.int64], hours: Floats) -> Days:
-    """The days of numbered visits, [n]; sessions of one visit share its day."""
+    """Draw the days of numbered visits, [n]; sessions of one visit share its day."""
     effects = {int(v): _stream(key, _DAY_STREAM, -int(v)).standard_normal(4) for v in np.unique(visits)}
     return Days(np.stack([effects[int(v)] for v in visits]), np.asarray(hours, dtype=np.float64))
 
 
 @dataclass(frozen=True)
 class Sessions:
-    """What n sessions did.
+    """Courses and results of n sessions.
 
     Attributes:
         lead: beta before step 0 under cDBS, [n, W]. beta, amplitude: [n, T]. brady, tremor, overload: symptoms, [n, T].
@@ -132,7 +132,7 @@ def simulate(
 
 
 def session_constants(patient: Patient, days: Days, own: Floats) -> Floats:
-    """What differs from session to session, [n, CONSTANTS], out of the day's normals and the session's own, [n, >= 1]."""
+    """Compute the constants of each session, [n, CONSTANTS], from the day's normals and the session's own, [n, >= 1]."""
     result = np.empty((len(own), CONSTANTS))
     result[:, LEVEL] = patient.day_level * days.effects[:, 0] + patient.session_level * own[:, 0]
     result[:, GAIN] = np.exp(patient.day_gain * days.effects[:, 1])
@@ -157,7 +157,8 @@ def quality(patient: Patient, noise: Floats, amplitude: Floats, brady: Floats, t
 
 
 def _remembered(form: int, complaint: Floats, minutes: Floats) -> Floats:
-    """The complaint that a rating goes by, [n], out of that of every step, [n, T], and of every minute, [n, M]; see `patient.RATINGS`."""
+    """Summarise the complaint that a rating follows, [n], from that of every step, [n, T], and of every minute, [n, M]; see
+    `patient.RATINGS`."""
     if form == LATE_RATING:
         return np.asarray(complaint[:, -LATE_STEPS:].mean(axis=1))
     if form == PEAK_END_RATING:
@@ -170,7 +171,7 @@ def _stream(key: int, stream: int, number: int) -> np.random.Generator:
 
 
 def _noise(key: int, first: int, n: int, length: int) -> tuple[Floats, Floats]:
-    """Noise of every step, [n, K, NOISES], and each session's own normals, [n, OWN_NORMALS]."""
+    """Draw the noise of every step, [n, K, NOISES], and each session's own normals, [n, OWN_NORMALS]."""
     # A stream for each kind: a longer session's noise then only goes on where a shorter one's ends, so length does not change beginnings.
     noise, own = np.empty((n, length, NOISES)), np.empty((n, OWN_NORMALS))
     for i in range(n):

@@ -1,4 +1,4 @@
-"""What makes a virtual patient difficult: eight traits, each after a way in which evaluation has failed on patients it had not seen.
+"""Eight traits that make a virtual patient difficult. Each follows a way in which evaluation has failed on patients it had not seen.
 
 A trait changes constants of a patient whatever its mechanism. Sizes are assumed; docs/population.md argues for each why it is plausible.
 """
@@ -32,7 +32,7 @@ class _Draws:
 
 
 def _saturating(_: Patient, u: _Draws) -> Changes:
-    """A middle dose does all that a high one does, and a little less does nothing."""
+    """Make a middle dose do all that a high one does, and a slightly lower one do nothing."""
     shape = u.one_of(HILL, THRESHOLD)
     half = u(0.25, 0.55)
     return {
@@ -47,7 +47,7 @@ def _saturating(_: Patient, u: _Draws) -> Changes:
 
 
 def _drifting(_: Patient, u: _Draws) -> Changes:
-    """Beta answers at once and wanders by itself over minutes, further than stimulation moves it."""
+    """Make beta answer at once, and wander without cause over minutes, further than stimulation moves it."""
     immediate = u(0.8, 1.0)
     return {
         "immediate": immediate,
@@ -60,7 +60,7 @@ def _drifting(_: Patient, u: _Draws) -> Changes:
 
 
 def _overstimulated(_: Patient, u: _Draws) -> Changes:
-    """Full amplitude is more than is good: the answer of beta turns round, and side effects are felt."""
+    """Make full amplitude more than is good: the answer of beta turns round, and side effects are felt."""
     best = u(0.5, 0.75)
     return {
         "shape": U_SHAPE,
@@ -73,7 +73,7 @@ def _overstimulated(_: Patient, u: _Draws) -> Changes:
 
 
 def _unsteady(_: Patient, u: _Draws) -> Changes:
-    """Days and sessions move the level of beta, the dose response and the symptoms."""
+    """Make days and sessions move the level of beta, the dose response and the symptoms."""
     return {
         "day_level": u(0.08, 0.2),
         "day_gain": u(0.2, 0.4),
@@ -84,12 +84,12 @@ def _unsteady(_: Patient, u: _Draws) -> Changes:
 
 
 def _silent(_: Patient, u: _Draws) -> Changes:
-    """Beta hardly answers to stimulation while symptoms do: beta cannot steer."""
+    """Make beta hardly answer to stimulation while symptoms do: beta cannot steer."""
     return {"depth": u(0.01, 0.04), "burden_share": 0.0}
 
 
 def _faint(p: Patient, u: _Draws) -> Changes:
-    """Effects are small against noise, of beta and of what is asked and measured at the end."""
+    """Make effects small against noise, of beta and of what is asked and measured at the end."""
     return {
         "depth": u(0.1, 0.25),
         "noise": u(0.15, 0.3),
@@ -103,7 +103,8 @@ def _faint(p: Patient, u: _Draws) -> Changes:
 
 
 def _asymmetric(_: Patient, u: _Draws) -> Changes:
-    """Effects come much faster than they go, or the reverse: changing doses leave another effect than lasting ones of the same mean."""
+    """Make effects come much faster than they go, or the reverse. Changing doses then leave another effect than lasting ones of the same
+    mean."""
     slow = u(0.6, 0.95)
     immediate = (1 - slow) * u(0.0, 1.0)
     quick, late = (u.rate(8.0, 30.0), u.rate(10.0, 40.0)), (u.rate(200.0, 900.0), u.rate(300.0, 1200.0))
@@ -121,7 +122,7 @@ def _asymmetric(_: Patient, u: _Draws) -> Changes:
 
 
 def _artefact(p: Patient, u: _Draws) -> Changes:
-    """Stimulation leaks into the sensed beta at once, while it lowers beta itself over seconds and, for the larger part, minutes."""
+    """Make stimulation leak into the sensed beta at once, while it lowers beta itself over seconds and, for the larger part, minutes."""
     return {"leak": u(0.25, 0.5), "depth": max(p.depth, u(0.5, 0.8)), "immediate": 0.0, "fast": u(0.05, 0.4)}
 
 
@@ -143,7 +144,7 @@ SECOND: Final = 0.4
 
 
 def with_trait(patient: Patient, trait: str | None, rng: np.random.Generator) -> Patient:
-    """The patient with a trait, and with a share of `SECOND` a further one, which the first prevails over; None leaves it ordinary.
+    """Give a patient a trait, and with a share of `SECOND` a further one, which the first overrides; None leaves it ordinary.
 
     Unsteady days are no difficulty by themselves while all doses keep their order, so they always come with another trait.
 

@@ -60,13 +60,13 @@ class Mean(NamedTuple):
 
     @classmethod
     def of(cls, values: Floats) -> Mean:
-        """Of values [n], n >= 2."""
+        """Average values [n], n >= 2."""
         return cls(float(values.mean()), float(values.std(ddof=1) / math.sqrt(values.size)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """What a policy is worth, by Monte Carlo.
+    """True value of a policy, by Monte Carlo.
 
     Attributes:
         total: E[r_end + sum over t < H of gamma^t r_t]. step_return, end_reward: its parts. energy: mean squared amplitude fraction.
@@ -86,7 +86,7 @@ class Truth:
     returns: Floats
 
     def to_json(self) -> dict[str, Any]:
-        """Means and standard errors by name, and the standard deviation of returns between sessions."""
+        """Return means and standard errors by name, and the standard deviation of returns between sessions."""
         named = {k: list(v) for k, v in vars(self).items() if isinstance(v, Mean)}
         return named | {"returns_sd": float(self.returns.std(ddof=1))}
 
@@ -96,8 +96,8 @@ class World:
     """One virtual patient with MDP settings.
 
     Attributes:
-        part, index: which one. patient: its constants. trait: what makes it difficult, `traits.TRAITS`; None for an ordinary
-            one. settings: of its MDP; xi_beta is midway between beta under cDBS and under 0.3.
+        part, index: number of the world. patient: its constants. trait: what makes it difficult, `traits.TRAITS`; None for an ordinary one.
+            settings: of its MDP, with xi_beta midway between beta under cDBS and under 0.3.
         spread: standard deviation of beta, its unit. key: of its random streams.
     """
 
@@ -116,16 +116,16 @@ class World:
 
     @property
     def modelled(self) -> bool:
-        """Whether the mechanism of beta is of the kind that the estimators assume."""
+        """True where the mechanism of beta is of the kind that the estimators assume."""
         return self.patient.kind == 0
 
     def run(self, controller: Policy | Floats, days: Days, first: int, steps: int = STEPS) -> Sessions:
-        """Sessions with the numbers from `first` on."""
+        """Run sessions with the numbers from `first` on."""
         s = self.settings
         return simulate(self.patient, s.xi_beta, controller, days=days, key=self.key, first=first, steps=steps, window=s.window)
 
     def data(self, design: DataDesign, seed: int = 0, visits: int = VISITS) -> ReplayBuffer:
-        """Early visits, each of two cDBS sessions, four random ones by the design, and five minutes without stimulation.
+        """Simulate early visits, each of two cDBS sessions, four random ones by the design, and five minutes without stimulation.
 
         Whatever the design, the visits have the same days and take the same minutes: the ladder, where there is one, is one of the four.
         """
@@ -154,36 +154,38 @@ class World:
         return ReplayBuffer(self.settings, tuple(sessions), "uV", "table")
 
     def medication_h(self, hour: float) -> float | None:
-        """Hours since the last dose at an hour of a visit; None of a patient who takes none. A dose works for two to four hours."""
+        """Compute the hours since the last dose at an hour of a visit; None of a patient who takes none. A dose works for two to four
+        hours."""
         if self.patient.med_need == 0:
             return None
         works = float(np.random.default_rng([self.key, 0x3ED1]).uniform(2.0, 4.0))
         return hour - self.patient.med_off_h + works
 
     def data_days(self, rows: list[DataSession], seed: int) -> Days:
-        """Days of planned sessions."""
+        """Draw the days of planned sessions."""
         visits = np.array([row.visit for row in rows]) + 64 * seed
         return visit_days(self.key, visits, np.array([row.hour for row in rows]))
 
     def truth(self, policy: Policy, sessions: int = 300) -> Truth:
-        """True return on new days, each session on a day of its own."""
+        """Estimate the true return on new days, each session on a day of its own."""
         return _truth(self.settings, self.run(policy, new_days(self.key, 0, sessions), 0))
 
     def truth_on_data_days(self, policy: Policy, sessions: int = 300, seed: int = 0, visits: int = VISITS) -> Truth:
-        """What the policy would have returned on the very days of `data(.., seed, visits)`, with other noise."""
+        """Estimate what the policy would have returned on the very days of `data(.., seed, visits)`, with other noise."""
         days = self.data_days(visit_plan(self.settings, "paper", seed, visits), seed)
         of = np.arange(sessions) % len(days.hours)
         return _truth(self.settings, self.run(policy, Days(days.effects[of], days.hours[of]), _DATA_DAYS))
 
     def candidates(self) -> dict[str, Policy]:
-        """The policies to be evaluated, the same ones whatever the data are."""
+        """Draw the policies to be evaluated, the same ones whatever the data are."""
         rng = np.random.default_rng([self.key, 0xCA4D])
         return draw_candidates(rng, self.settings.xi_beta, self.spread, self.settings.window)
 
 
 @dataclass(frozen=True)
 class DataSession:
-    """One session of the data: visit, controller (`cdbs`, `random`, `no_dbs`), hour of the visit, amplitude of every step, held draws."""
+    """One session of the data: visit, controller (`cdbs`, `random`, `no_dbs`), hour of the visit, amplitude of every step, sustained
+    draws."""
 
     visit: int
     controller: str
@@ -193,7 +195,7 @@ class DataSession:
 
 
 def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int) -> list[DataSession]:
-    """Sessions of early visits in their order."""
+    """List the sessions of early visits in their order."""
     designed = lay_out(
         DesignSettings(
             name="paper" if design == "paper" else "stratified",
@@ -218,7 +220,7 @@ def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int
 
 @lru_cache(maxsize=256)
 def world(part: Part, index: int) -> World:
-    """World `index` of a part.
+    """Build world `index` of a part.
 
     Raises:
         ValueError: no such part, or an index outside it.
@@ -238,7 +240,7 @@ def world(part: Part, index: int) -> World:
 
 
 def make_up(part: str) -> list[tuple[int, str | None]]:
-    """Mechanism and trait of every world of a part: the same numbers of each in every part, in an order of its own."""
+    """List mechanism and trait of every world of a part: the same numbers of each in every part, in an order of its own."""
     traits = [t for t in TRAITS if t != SILENT]
     rotation = cycle(traits)
     others: list[tuple[int, str | None]] = []
@@ -270,7 +272,7 @@ def _truth(settings: MdpSettings, run: Sessions) -> Truth:
 
 
 def end_rewards(settings: MdpSettings, grasp_hz: Floats, rating: Floats, tremor_percent: Floats) -> Floats:
-    """`ml.mdp.end_reward` of many sessions, [n]."""
+    """Compute `ml.mdp.end_reward` of many sessions, [n]."""
     tremor = tremor_percent / 100 if settings.tremor_as_fraction else tremor_percent
     return np.asarray(settings.c2 * grasp_hz + settings.c3 * rating - settings.c4 * tremor)
 
@@ -285,7 +287,7 @@ def within_margins(policy: Truth, cdbs: Truth) -> bool:
 
 
 def simple_policies(settings: MdpSettings, spread: float) -> dict[str, Policy]:
-    """Constants and proportional controllers that decide who is a responder."""
+    """Build constants and proportional controllers that decide who is a responder."""
     constants: dict[str, Policy] = {f"constant {a:.2f}": ConstantPolicy(a) for a in (0.4, 0.5, 0.6, 0.7, 0.8, 0.89)}
     xi = settings.xi_beta
     return constants | {
@@ -295,5 +297,5 @@ def simple_policies(settings: MdpSettings, spread: float) -> dict[str, Policy]:
 
 
 def is_responder(truths: Mapping[str, Truth], cdbs: Truth) -> bool:
-    """Whether one of these policies is truly within the margins and saves `ENERGY_SAVED` of the energy of cDBS."""
+    """Decide whether one of these policies is truly within the margins and saves `ENERGY_SAVED` of the energy of cDBS."""
     return any(t.energy.value <= (1 - ENERGY_SAVED) * cdbs.energy.value and within_margins(t, cdbs) for t in truths.values())
