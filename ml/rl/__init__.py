@@ -1,7 +1,7 @@
 """Offline reinforcement learning of stimulation policies. Source: Gao et al. 2023, section 4.
 
-What other packages may use is named here; everything else is internal (contracts in `pyproject.toml`). A name is imported when it is first
-asked for, so that whoever needs the table of algorithms alone does not load torch.
+This module names what other packages may use; everything else is internal (contracts in `pyproject.toml`). A name is imported at its first
+use, so that the table of algorithms can be read without loading torch.
 """
 
 from __future__ import annotations

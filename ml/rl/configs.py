@@ -15,7 +15,7 @@ AIMS = ("steps", "return")
 
 
 def setting(default: Any, doc: str, *, low: float | None = None, above: float | None = None, high: float = math.inf) -> Any:
-    """A hyper-parameter: its default, what it means, and its range (`low` belongs to it, `above` does not, `high` does)."""
+    """Declare a hyper-parameter: its default, its meaning, and its range (`low` is part of it, `above` is not, `high` is)."""
     return field(default=default, metadata={"doc": doc, "low": low, "above": above, "high": high})
 
 
@@ -65,16 +65,16 @@ class TrainConfig:
 
     @classmethod
     def field_docs(cls) -> dict[str, str]:
-        """What each hyper-parameter means, by name."""
+        """Return the meaning of each hyper-parameter, by name."""
         return {described.name: described.metadata["doc"] for described in fields(cls)}
 
     def to_json(self) -> dict[str, Any]:
-        """All hyper-parameters, by name."""
+        """Return all hyper-parameters, by name."""
         return asdict(self) | {"hidden": list(self.hidden)}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Self:
-        """The inverse of `to_json`; missing names take their default. Raises ValueError for a name that is none."""
+        """Read what `to_json` wrote; missing names take their default. Raises ValueError for an unknown name."""
         known = cls.__dataclass_fields__
         unknown = sorted(set(values) - {described.name for described in fields(cls)})
         if unknown:
@@ -82,7 +82,7 @@ class TrainConfig:
         return cls(**(values | ({"hidden": tuple(values["hidden"])} if "hidden" in values else {})))
 
     def resolved_device(self) -> str:
-        """`cpu` or `cuda`. Raises ValueError when CUDA is asked for and there is none."""
+        """Choose `cpu` or `cuda`. Raises ValueError when CUDA is requested and there is none."""
         if self.device == "auto":
             return "cuda" if torch.cuda.is_available() else "cpu"
         if self.device == "cuda" and not torch.cuda.is_available():

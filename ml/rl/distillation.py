@@ -1,7 +1,7 @@
 """Policy distillation: a student small enough for the tablet, and later the implant. Source: Gao et al. 2023, section 4.2, eq:distillation.
 
-The student minimises the mean squared error to the teacher's amplitude fractions over the states of the replay buffer and over synthetic
-states: buffer states with Gaussian noise on every element.
+The student minimises the mean squared error to the teacher's amplitude fractions. The states are those of the replay buffer, and synthetic
+ones: buffer states with Gaussian noise on every element.
 """
 
 from __future__ import annotations
@@ -65,12 +65,12 @@ class DistilConfig:
             raise ValueError("batch must be 2 or more, updates and record_every 1 or more, seed 0 or more")
 
     def to_json(self) -> dict[str, Any]:
-        """All hyper-parameters, by name."""
+        """Return all hyper-parameters, by name."""
         return asdict(self) | {"hidden": list(self.hidden)}
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> DistilConfig:
-        """The inverse of `to_json`; missing names take their default. Raises ValueError for a name that is none."""
+        """Read what `to_json` wrote; missing names take their default. Raises ValueError for an unknown name."""
         unknown = sorted(set(values) - set(DistilConfig.__dataclass_fields__))
         if unknown:
             known = ", ".join(DistilConfig.__dataclass_fields__)
@@ -81,7 +81,7 @@ class DistilConfig:
 
 @dataclass(frozen=True)
 class ActionError:
-    """How far the student's amplitude fraction is from the teacher's over a set of states: mean, 99th percentile and worst."""
+    """Distance of the student's amplitude fraction from the teacher's over a set of states: mean, 99th percentile and worst."""
 
     mean: float
     p99: float
@@ -89,7 +89,7 @@ class ActionError:
 
     @staticmethod
     def between(student: NDArray[np.float64], teacher: NDArray[np.float64]) -> ActionError:
-        """Errors of actions, both [N]."""
+        """Compute the errors of actions, both [N]."""
         error = np.abs(student - teacher)
         return ActionError(float(error.mean()), float(np.quantile(error, 0.99)), float(error.max()))
 
@@ -124,7 +124,7 @@ class DistilledPolicy:
         return 4 * self.parameters
 
     def report(self) -> dict[str, Any]:
-        """Errors and size, for storing beside the policy."""
+        """Return errors and size, to be stored with the policy."""
         return {
             "on_buffer": asdict(self.on_buffer),
             "on_noise": asdict(self.on_noise) if self.on_noise else None,
@@ -204,7 +204,7 @@ def _fit(
 def _labelled_block(
     student: MlpPolicy, teacher: Policy, states: NDArray[np.float64], noise_sd: float, config: DistilConfig, block: int
 ) -> tuple[Any, Any]:
-    """Z-scored windows [64, B, W] and the teacher's fractions [64, B, 1]; the second half of each batch carries fresh noise."""
+    """Make z-scored windows [64, B, W] and the teacher's fractions [64, B, 1]; the second half of each batch has fresh noise."""
     rng = np.random.default_rng([config.seed, _TRAIN_STREAM, block])
     windows = states[rng.integers(0, len(states), (_BLOCK, config.batch))]
     if noise_sd > 0:

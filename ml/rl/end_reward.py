@@ -1,13 +1,13 @@
 """Each step's share of the end-of-session reward, so that a critic may sum what the study values and not beta and energy alone.
 
-The paper leaves QoCs out of training, because one number per session is sparse (Gao et al. 2023, remark 1). Reconstructing step rewards
-from an end-of-session one is known from evaluation (off-policy evaluation for human feedback, Gao et al., NeurIPS 2023). Here the model of
-outcomes that evaluation uses (`ml.ope.outcomes`) is taken apart into steps: one dose is worth more where symptoms are near, saturates,
-and over-stimulates, and visits have levels of their own, so that contrasts within a day count for more than a good day that chanced upon
-a low amplitude.
+The paper leaves QoCs out of training, because one number per session is sparse (Gao et al. 2023, remark 1). Evaluation reconstructs step
+rewards from an end-of-session one (off-policy evaluation for human feedback, Gao et al., NeurIPS 2023). Here the model of outcomes that
+evaluation uses (`ml.ope.outcomes`) is divided into steps. One dose is worth more where symptoms are near; it saturates, and it
+over-stimulates. Visits have levels of their own, so that contrasts within a day count for more than a good day with a low amplitude by
+chance.
 
-A critic sums without end and discounts, so a share enters as (1 - gamma) / (1 - gamma^H) of it, H the median session: steps and r_end
-then stand in the same proportion as in the return of eq:ope_total_return.
+A critic sums without end and discounts. So a share enters as (1 - gamma) / (1 - gamma^H) of it, H the median session. Steps and r_end then
+have the same proportion as in the return of eq:ope_total_return.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class EndReward:
     """A fitted share.
 
     Attributes:
-        model: of the outcomes, with constants of 0 where a QoC is left out. level: what those left out add to r_end on average.
+        model: of the outcomes, with constants of 0 where a QoC is excluded. level: the average share of the excluded ones in r_end.
         settings: of the MDP. factor: (1 - gamma) / (1 - gamma^H).
-        skill: 1 - squared error of r_end of left-out sessions / that of saying the mean. visit_skill: the same of left-out visits, held
-            against the mean of the other visits; None where there is one visit.
+        skill: 1 - squared error of r_end of held-out sessions / that of predicting the mean. visit_skill: the same of held-out visits. Its
+            mean is that of the other visits; None with one visit.
         sessions: with an r_end.
     """
 
@@ -50,16 +50,16 @@ class EndReward:
     sessions: int
 
     def per_step(self, session: SessionTrajectory) -> Floats:
-        """What every step adds to its reward, [T]; NaN where amplitude or beta is unknown."""
+        """Compute what every step adds to its reward, [T]; NaN where amplitude or beta is unknown."""
         return self.factor * (self.level + end_reward_by_step(self.model, session, self.settings))
 
 
 def fit_end_reward(buffer: ReplayBuffer) -> EndReward | None:
     """Learn the share from the QoCs that are predicted better than by their mean; None without one, or with too few sessions.
 
-    Too few are fewer than `FEWEST_SESSIONS` with an r_end. A QoC that nothing predicts, such as a noisy rating, is left out, so that it
-    does not drown what another tells; None too where what is left predicts r_end no better than its mean. To see that, sessions are left
-    out, and visits: the first would miss what a noisy session hides, the second what days hide that differ by more than doses do.
+    Too few are fewer than `FEWEST_SESSIONS` with an r_end. A QoC that nothing predicts, such as a noisy rating, is excluded, so that it
+    does not hide the others. None too where the remaining ones predict r_end no better than its mean. Skill on held-out sessions or on
+    held-out visits is enough: noise of sessions may hide it in one, differences between days in the other.
     """
     settings = buffer.settings
     rated = sum(s.end_reward(settings) is not None and bool(s.usable().any()) for s in buffer.sessions)
@@ -81,7 +81,7 @@ def fit_end_reward(buffer: ReplayBuffer) -> EndReward | None:
 
 
 def _skill(model: EndModel, left: LeftOut, constants: Floats, table: Floats) -> float:
-    """`EndReward.skill` or `visit_skill`, where only QoCs with a constant that is not 0 are predicted; table [n, 3]."""
+    """Compute `EndReward.skill` or `visit_skill`, where only QoCs with a constant that is not 0 are predicted; table [n, 3]."""
     counted, by_model = model.constants != 0, constants != 0
     said = np.where(by_model, left.predicted[:, 1:], left.mean[:, 1:])[:, counted]
     known = np.isfinite(table[:, counted]).all(1) & np.isfinite(said).all(1) & np.isfinite(left.mean[:, 1:][:, counted]).all(1)

@@ -1,8 +1,8 @@
 """Sessions that a training does not see: what they say of the policy on its way, and which of its states is chosen.
 
-Nothing here knows a true return. A score is an estimate from held-out sessions that the caller brings (fitted Q evaluation, for
-example: `ml.ope` uses this package, so this package cannot use it). Choosing by a score uses the sessions up: an estimate from the same
-sessions flatters the chosen state and is no evidence for deployment.
+Nothing here knows a true return. A score is an estimate from held-out sessions that the caller supplies, such as fitted Q evaluation.
+(`ml.ope` uses this package, so this package cannot use it.) Choosing by a score uses the sessions up. An estimate from the same sessions
+flatters the chosen state and is no evidence for deployment.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _SPLIT_STREAM = 5
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutSessions:
-    """What watches a training from outside its data.
+    """Held-out sessions that monitor a training from outside its data.
 
     Attributes:
-        sessions: the sessions left out.
+        sessions: the held-out sessions.
         score: estimate by which the best state is chosen; None takes the last.
         score_name: names the estimate; part of what a checkpoint belongs to.
-        eligible: whether a state may be chosen for its score, such as `ml.policies.logged_range.stays_in_range`: beyond the data an
+        eligible: decides whether a state may be chosen for its score, such as `ml.policies.logged_range.stays_in_range`. Beyond the data an
             estimate is free to be large, and the best score would find that state. None allows every state; where none is eligible, the
             last stays.
         is_step_return: whether `score` estimates the discounted sum of step rewards without end, from the sessions' first states; only
@@ -58,10 +58,10 @@ class HeldOutSessions:
             raise ValueError(f"every must be 1 or more and patience 0 or more, not {self.every} and {self.patience}")
 
     def starts(self) -> tuple[NDArray[np.float64], float]:
-        """First usable states of the sessions, shape [n, W], and the mean discounted return logged from them.
+        """Return the first usable states of the sessions, shape [n, W], and the mean discounted return logged from them.
 
-        The return is that of the remaining usable steps, followed by the session's mean reward for ever: a critic that bootstraps
-        through the end of a session estimates a sum without end. Raises ValueError when no session has a usable step.
+        The return is that of the remaining usable steps, followed by the session's mean reward for ever. A critic that bootstraps through
+        the end of a session estimates such an endless sum. Raises ValueError when no session has a usable step.
         """
         gamma = self.sessions.settings.gamma
         states, returns = [], []
@@ -83,22 +83,23 @@ class HeldOutSessions:
         return np.stack(states), float(np.mean(returns))
 
     def start_memory(self) -> NDArray[np.float64]:
-        """What critics that remember past amplitudes see at the states of `starts`, [n, M]."""
+        """Return past amplitudes at the states of `starts`, [n, M], for critics that remember them."""
         used = [(s, np.flatnonzero(s.usable())) for s in self.sessions.sessions]
         return np.stack([remembered(s, self.sessions.settings.period_s)[k[0]] for s, k in used if k.size])
 
     def name(self) -> str:
-        """Names the sessions and the rule, for checkpoints."""
+        """Name the sessions and the rule, for checkpoints."""
         digest = hashlib.sha256(to_parquet(self.sessions)).hexdigest()
         return f"{digest} {self.score_name} {self.score is not None} {self.eligible is not None} {self.every} {self.patience}"
 
 
 def split_sessions(buffer: ReplayBuffer, share: float = 0.2, seed: int = 0) -> tuple[ReplayBuffer, ReplayBuffer]:
-    """Sessions to train on and sessions held out, drawn within each controller, so that both sides see every kind where it has two.
+    """Split sessions into those for training and held-out ones. They are drawn within each controller, so that both sides have every kind
+    with two sessions.
 
     Args:
         buffer: the sessions; a session is never divided.
-        share: of the sessions of each controller that are held out, rounded; at least one session in all.
+        share: of the held-out sessions of each controller, rounded; at least one session in all.
         seed: of the draw.
 
     Raises:

@@ -1,9 +1,8 @@
 """The training loop that every offline learner shares: reproducible batches, learning curves, checkpoints.
 
 A learner knows one gradient step of K policies side by side; the loop knows when to measure, report and save. Batches are drawn from a
-counter, not from a running generator: block b of a run with seed s always holds the same rows. The state of the random numbers is
-therefore the update number alone, and a run resumed from a checkpoint goes on bit for bit as if it had not been interrupted (same
-machine, one thread).
+counter, not from a running generator: block b of a run with seed s always has the same rows. So the state of the random numbers is the
+update number alone. A run resumed from a checkpoint continues bit for bit as if it had not been interrupted (same machine, one thread).
 """
 
 from __future__ import annotations
@@ -48,22 +47,22 @@ class Learner(Protocol):
     uses_noise: bool
 
     def update(self, batch: TransitionBatch) -> None:
-        """One update of the networks; leaves the batch as it is."""
+        """Run one update of the networks; the batch stays unchanged."""
 
     def measure(self, probe: TransitionBatch) -> list[dict[str, float]]:
-        """Points of the learning curves of each policy: means since the last call, and values on the probe."""
+        """Compute points of the learning curves of each policy: means since the last call, and values on the probe."""
 
     def policy(self, member: int) -> MlpPolicy:
-        """A copy of one policy as it is now."""
+        """Copy the current state of one policy."""
 
     def start_values(self, states: NDArray[np.float64], memory: NDArray[np.float64]) -> list[float] | None:
-        """Mean Q(s, pi(s)) over beta windows [n, W] for each policy, in reward units; None for an algorithm without a critic."""
+        """Average Q(s, pi(s)) over beta windows [n, W] for each policy, in reward units; None for an algorithm without a critic."""
 
     def rows(self, member: int) -> dict[str, Any]:
-        """One member's weights by network, copies."""
+        """Copy one member's weights, by network."""
 
     def state(self) -> dict[str, Any]:
-        """Everything that the next update depends on (weights, targets, optimisers): tensors, numbers, lists, dictionaries."""
+        """Return everything that the next update depends on (weights, targets, optimisers): tensors, numbers, lists, dictionaries."""
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Put `state` back."""
@@ -71,7 +70,7 @@ class Learner(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """How long to train, on which random numbers, and when to look.
+    """Length of a training, its random numbers, and the times of measurements.
 
     Attributes:
         updates, batch, record_every, checkpoint_every: as in `TrainConfig`. seeds: one per policy. device: of the tensors.
@@ -87,7 +86,7 @@ class Schedule:
 
 @dataclass
 class MemberRecord:
-    """What the loop leaves of one policy.
+    """Results of the loop for one policy.
 
     Attributes:
         points: of the learning curves. held_out: points on held-out sessions.
@@ -101,7 +100,7 @@ class MemberRecord:
     best_rows: dict[str, Any] | None = None
 
     def scorings_since_best(self) -> int:
-        """Scorings after the best one."""
+        """Count the scorings after the best one."""
         return sum(point["update"] > (self.best_update or 0) for point in self.held_out)
 
 
@@ -115,7 +114,7 @@ class _Draws:
         self._noise: Any = None
 
     def batch(self, update: int) -> TransitionBatch:
-        """The batch of update 0, 1, ..."""
+        """Draw the batch of update 0, 1, ..."""
         block, row = divmod(update, BLOCK)
         if block != self._block:
             p = self._schedule
@@ -168,7 +167,7 @@ def run(
 
 
 def as_curve(points: Sequence[dict[str, float]]) -> Curve:
-    """Points as arrays by name, all of one length; `update` holds the update numbers."""
+    """Convert points to arrays by name, all of one length; `update` has the update numbers."""
     return {name: np.array([point[name] for point in points]) for name in points[0]} if points else {}
 
 
@@ -185,7 +184,7 @@ def _record(numbers: list[dict[str, float]], records: list[MemberRecord], done: 
 def _score(
     learner: Learner, held_out: HeldOutSessions, starts: tuple[NDArray[np.float64], float], records: list[MemberRecord], done: int
 ) -> None:
-    """A point on the held-out sessions for each policy; keeps the eligible state of the best score, the earlier one of equals."""
+    """Add a point on the held-out sessions for each policy; keeps the eligible state of the best score, the earlier one of equals."""
     states, logged = starts
     values = learner.start_values(states, held_out.start_memory())
     for k, record in enumerate(records):
@@ -206,7 +205,7 @@ def _score(
 
 
 def fingerprint_of(data: PackedTransitions, config: Any, start: dict[str, Any]) -> str:
-    """A name for a run: data, configuration (anything JSON holds) and the weights it starts from."""
+    """Name a run by its data, its configuration (anything that JSON can express) and its initial weights."""
     digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
     digest.update(data.digest().encode())
     for tensor in _tensors(start):
@@ -216,7 +215,7 @@ def fingerprint_of(data: PackedTransitions, config: Any, start: dict[str, Any]) 
 
 @contextlib.contextmanager
 def single_thread() -> Iterator[None]:
-    """One torch thread inside the block: sums then have one order, and two trainings on two cores do not fight."""
+    """Limit torch to one thread inside the block: sums then have one order, and two trainings on two cores do not compete."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -226,14 +225,14 @@ def single_thread() -> Iterator[None]:
 
 
 def tensors_to_bytes(state: dict[str, Any]) -> bytes:
-    """A nest of dictionaries, lists, numbers and tensors as bytes."""
+    """Write a nest of dictionaries, lists, numbers and tensors as bytes."""
     sink = io.BytesIO()
     torch.save(state, sink)
     return sink.getvalue()
 
 
 def tensors_from_bytes(content: bytes) -> dict[str, Any]:
-    """The inverse of `tensors_to_bytes`; runs no code from the bytes. Raises ValueError when they are something else."""
+    """Read what `tensors_to_bytes` wrote; runs no code from the bytes. Raises ValueError when they are something else."""
     try:
         state = torch.load(io.BytesIO(content), weights_only=True)
     except Exception as error:  # torch raises pickle, zip, runtime and EOF errors for damaged files

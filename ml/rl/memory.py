@@ -1,8 +1,8 @@
-"""What a critic remembers of past amplitudes: the dose lately, as far as beta has not yet answered it.
+"""Memory of a critic for past amplitudes: the recent dose, as far as beta has not yet answered it.
 
-A beta window of W steps does not say which doses led to it, while the answer to a dose comes within seconds, minutes and tens of minutes.
-A critic that sees the window alone takes a slow answer for chance, or credits it to the amplitude of the moment. So it may see the mean
-of past amplitudes over three spans beside the window. The actor never does: a controller on the tablet is the paper's, a function of beta.
+A beta window of W steps does not show which doses led to it. The answer to a dose comes within seconds to tens of minutes. A critic that
+sees the window alone takes a slow answer for chance, or credits it to the amplitude of the moment. So it may also see the mean of past
+amplitudes over three spans. The actor never does: a controller on the tablet is the paper's, a function of beta.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CLINICAL = 1.0
 
 
 def remembered(session: SessionTrajectory, period_s: float) -> Floats:
-    """Past amplitudes before every step and after the last, [T + 1, 3], as 2a - 1 in [-1, 1], the critics' range of actions.
+    """Compute past amplitudes before every step and after the last, [T + 1, 3], as 2a - 1 in [-1, 1], the critics' range of actions.
 
     m_{k+1} = m_k + (1 - exp(-period / span)) (a_k - m_k), from the amplitude in force before the session; an unknown amplitude leaves it.
     """
@@ -34,7 +34,7 @@ def remembered(session: SessionTrajectory, period_s: float) -> Floats:
 
 
 def memory_of(buffer: ReplayBuffer, transitions: Transitions) -> tuple[Floats, Floats]:
-    """What is remembered at the states of a buffer's transitions and at their next states, each [N, 3]."""
+    """Collect past amplitudes at the states of a buffer's transitions and at their next states, each [N, 3]."""
     each = [remembered(session, buffer.settings.period_s) for session in buffer.sessions]
     now, after = (np.stack([each[i][k + ahead] for i, k in zip(transitions.session, transitions.step, strict=True)]) for ahead in (0, 1))
     return now, after

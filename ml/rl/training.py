@@ -33,26 +33,26 @@ from ml.rl.memory import memory_of
 from ml.trajectories import ReplayBuffer, Transitions
 
 _UNSHARED = {"checkpoint_every"}
-"""Hyper-parameters that change no result and are left out of a checkpoint's name."""
+"""Hyper-parameters that change no result and are omitted from a checkpoint's name."""
 
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """What a training leaves behind; with its critics, so that fine-tuning can go on from it.
+    """Result of a training, with its critics, so that fine-tuning can continue from it.
 
     Attributes:
         policy: the actor.
-        networks: what its algorithm learnt beside it, by name (`critic`, `critic_2`, `value`); on z-scored windows and scaled rewards.
+        networks: the algorithm's other networks by name (`critic`, `critic_2`, `value`); on z-scored windows and scaled rewards.
         reward_scale: how the critics' rewards were scaled.
-        curve: learning curves by name, arrays of one length: `update`; `critic_loss` (mean squared temporal-difference error since the last
-            point, in squared reward units); `mean_q` (mean Q(s, pi(s)) over a probe of the buffer, in reward units: an unbounded climb is
-            over-estimation); `action_distance` (mean |pi(s) - a| to the logged actions of the probe); `saturated` (share of the probe's
-            states answered within 0.01 of 0 or 1: at 1 the tanh has no slope left, and the policy is cDBS or no-DBS by another name);
-            and the algorithm's own losses.
+        curve: learning curves by name, arrays of one length, with `update`. `critic_loss`: mean squared temporal-difference error since the
+            last point, in squared reward units. `mean_q`: mean Q(s, pi(s)) over a probe of the buffer, in reward units; an unbounded climb
+            is over-estimation. `action_distance`: mean |pi(s) - a| to the logged actions of the probe. `saturated`: share of the probe's
+            states answered within 0.01 of 0 or 1. At 1 the tanh has no slope left, and the policy is cDBS or no-DBS by another name. The
+            algorithm's own losses follow.
         config: the hyper-parameters, with the seed.
-        held_out: curves on the held-out sessions, empty without them: `update`; `score`, the caller's estimate; `start_q`, mean
-            Q(s_0, pi(s_0)); `over_logged`, that less the return logged from s_0 under whatever controller was in force; `over_estimate`,
-            that less `score`, where the score is a step return.
+        held_out: curves on the held-out sessions, empty without them. `update`; `score`, the caller's estimate; `start_q`, mean Q(s_0,
+            pi(s_0)). `over_logged`: `start_q` less the return logged from s_0 under whatever controller was in force. `over_estimate`:
+            `start_q` less `score`, where the score is a step return.
         best_update: the update whose state this is, chosen by `score`; None means the last.
     """
 
@@ -80,7 +80,7 @@ class TrainedPolicy:
         return self.networks["critic"]
 
     def to_bytes(self) -> bytes:
-        """Everything as bytes, for the file store."""
+        """Write everything as bytes, for the file store."""
         return tensors_to_bytes(
             {
                 "algorithm": self.algorithm,
@@ -97,7 +97,7 @@ class TrainedPolicy:
 
     @staticmethod
     def from_bytes(content: bytes) -> TrainedPolicy:
-        """The inverse of `to_bytes`. Raises ValueError when the bytes are no such training."""
+        """Read what `to_bytes` wrote. Raises ValueError when the bytes are no such training."""
         saved = tensors_from_bytes(content)
         try:
             learner = algorithm(saved["algorithm"]).learner
@@ -144,20 +144,20 @@ def train_many(
     """Train K policies side by side on a participant's replay buffer, whatever controllers its sessions had; gamma comes from its settings.
 
     Args:
-        buffer: the sessions; where some are held out, the others.
+        buffer: the sessions, without the held-out ones.
         configs: hyper-parameters of each policy, all of one algorithm, which they name; only those in `TrainConfig.per_member` may differ.
         report: called with the progress and the learning curves' points (with `_1`, `_2`, ... behind the names where K is above 1).
         checkpoint: file that holds the state of the training; where it exists, the training goes on from it. Not removed at the end.
-        initial: start of a fine-tuning, left as it is: a training (all its networks and scales) or a policy alone, whose critics then
-            start afresh (set `critic_warmup`). The beta scale stays the initial policy's, or it would be another function.
+        initial: start of a fine-tuning, which stays unchanged: a training (all its networks and scales) or a policy alone. The critics of a
+            policy alone start afresh (set `critic_warmup`). The beta scale stays the initial policy's, or it would be another function.
         held_out: sessions that watch the training, and the score by which its best state is chosen.
 
     Returns:
         The trained policies in the order of `configs`; the same bit for bit on one machine for the same arguments.
 
     Raises:
-        ValueError: no usable step; configurations that cannot be trained together; an initial policy of another window, other hidden
-            layers or another algorithm; CUDA asked for where there is none.
+        ValueError: no usable step; configurations that cannot be trained together. An initial policy of another window, other hidden layers
+            or another algorithm; CUDA requested where there is none.
         TrainingDiverged: a loss or value is not finite.
         CheckpointError: the checkpoint belongs to another run, or is damaged.
     """
@@ -183,7 +183,7 @@ def train_on(
     held_out: HeldOutSessions | None = None,
     memory: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> list[TrainedPolicy]:
-    """`train_many` on transitions of any source, with gamma, the mean and standard deviation of beta, and what critics remember."""
+    """Run `train_many` on transitions of any source, with gamma, the mean and standard deviation of beta, and what critics remember."""
     _require_together(configs)
     if remembers(configs[0]) and memory is None:
         raise ValueError("critics with a memory of past amplitudes need it beside the transitions")
@@ -237,7 +237,7 @@ def _require_together(configs: Sequence[TrainConfig]) -> None:
 def _start(
     learner_type: type[StackedLearner[Any]], window: int, beta_scale: tuple[float, float], config: TrainConfig, initial: Start
 ) -> dict[str, Any]:
-    """The networks of one member."""
+    """Make the networks of one member."""
     actor_seed, *seeds = (int(s.generate_state(1)[0]) for s in np.random.SeedSequence(config.seed).spawn(4))
     policy = initial.policy if isinstance(initial, TrainedPolicy) else initial
     if policy is None:

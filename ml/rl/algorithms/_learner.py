@@ -1,4 +1,4 @@
-"""What the algorithms share: K policies with their critics and targets side by side, fresh or from an earlier training."""
+"""Common part of the algorithms: K policies with their critics and targets side by side, fresh or from an earlier training."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SATURATION_MARGIN = 0.01
 """An amplitude fraction this near to 0 or 1 counts as saturated."""
 
 Networks = Mapping[str, Any]
-"""The networks of one policy by name: `policy`, and what its algorithm learns beside it."""
+"""The networks of one policy by name: `policy`, and the other networks of its algorithm."""
 C = TypeVar("C", bound=TrainConfig)
 
 
@@ -65,14 +65,14 @@ class StackedLearner(abc.ABC, Generic[C]):
     @classmethod
     @abc.abstractmethod
     def networks(cls, config: C, policy: MlpPolicy, seeds: Sequence[int]) -> dict[str, nn.Module]:
-        """A policy and fresh other networks; `seeds` has enough for them."""
+        """Make a policy and fresh other networks; `seeds` has enough for them."""
 
     @abc.abstractmethod
     def update(self, batch: TransitionBatch) -> None:
-        """One update, in the order of the module's text."""
+        """Run one update, in the order of the module's text."""
 
     def measure(self, probe: TransitionBatch) -> list[dict[str, float]]:
-        """Points of the learning curves of each member, as `TrainedPolicy.curve` describes them."""
+        """Compute points of the learning curves of each member, as `TrainedPolicy.curve` describes them."""
         actions = self.policy_stack.act(probe.states)
         values = self._probe_values(probe.critic_states, actions)
         distance = (actions - probe.actions).abs().mean(dim=(1, 2)).tolist()
@@ -88,13 +88,13 @@ class StackedLearner(abc.ABC, Generic[C]):
         return points
 
     def policy(self, member: int) -> MlpPolicy:
-        """A copy of one policy as it is now."""
+        """Copy the current state of one policy."""
         return self.modules(self.rows(member))["policy"]
 
     def start_values(self, states: NDArray[np.float64], memory: NDArray[np.float64]) -> list[float] | None:
-        """Mean Q(s, pi(s)) over beta windows [n, W] for each member, in reward units; None for an algorithm without a critic.
+        """Average Q(s, pi(s)) over beta windows [n, W] for each member, in reward units; None for an algorithm without a critic.
 
-        `memory`, [n, M], is what critics that remember past amplitudes see beside the windows.
+        `memory`, [n, M], is a further input of critics that remember past amplitudes.
         """
         windows = torch.tensor(states, dtype=torch.float32)
         scores = self._starts[0]["policy"].normalise(windows).to(self.device).expand(self.members, -1, -1)
@@ -105,11 +105,11 @@ class StackedLearner(abc.ABC, Generic[C]):
         return None if values is None else [self.scale.value(value) for value in values]
 
     def rows(self, member: int) -> dict[str, Any]:
-        """One member's weights by network, copies."""
+        """Copy one member's weights, by network."""
         return {name: stack.weights[member].cpu().clone() for name, stack in self.stacks.items()}
 
     def modules(self, rows: Mapping[str, Any]) -> dict[str, Any]:
-        """Weights as modules."""
+        """Convert weights to modules."""
         policy = self._starts[0]["policy"]
         fresh = MlpPolicy(policy.window, policy.hidden, mean=float(policy.mean), std=float(policy.std))
         modules = self.networks(self.config, fresh, [0] * len(self.stacks))
@@ -118,7 +118,7 @@ class StackedLearner(abc.ABC, Generic[C]):
         return modules
 
     def state(self) -> dict[str, Any]:
-        """Weights, targets, Adam's moments and the running losses."""
+        """Return weights, targets, Adam's moments and the running losses."""
         return {
             "weights": {name: stack.weights.cpu().clone() for name, stack in self.stacks.items()},
             "targets": {name: stack.weights.cpu().clone() for name, stack in self.target_stacks.items()},
@@ -139,7 +139,7 @@ class StackedLearner(abc.ABC, Generic[C]):
         self._sums = {name: total.to(self.device) for name, total in state["sums"].items()}
 
     def member_setting(self, name: str) -> Any:
-        """A hyper-parameter of `per_member`, tensor [K, 1, 1]."""
+        """Return a hyper-parameter of `per_member`, tensor [K, 1, 1]."""
         return self._settings[name]
 
     def _per_member(self, name: str) -> Any:
@@ -179,7 +179,7 @@ class CriticLearner(StackedLearner[CC], Generic[CC]):
     """A learner with critics, warm-up and targets."""
 
     def _descend_on_target(self, name: str, batch: TransitionBatch, targets: Any) -> None:
-        """One step of a critic's least squares Q(s, a) towards `targets` [K, B, 1]."""
+        """Take one step of a critic's least squares Q(s, a) towards `targets` [K, B, 1]."""
         critic = self.stacks[name]
         error = critic.forward(batch.critic_states, batch.actions).sub_(targets)
         if name == "critic":
@@ -188,7 +188,7 @@ class CriticLearner(StackedLearner[CC], Generic[CC]):
         self.adams[name].step()
 
     def _follow(self) -> None:
-        """theta' <- (1 - tau) theta' + tau theta."""
+        """Move the targets: theta' <- (1 - tau) theta' + tau theta."""
         for name, target in self.target_stacks.items():
             target.weights.lerp_(self.stacks[name].weights, self.config.tau)
 
@@ -198,15 +198,15 @@ class CriticLearner(StackedLearner[CC], Generic[CC]):
 
 
 def fresh_critic(config: TrainConfig, policy: MlpPolicy, seed: int, *, layer_norm: bool = False) -> Critic:
-    """A critic of the configuration's sizes."""
+    """Make a critic of the configuration's sizes."""
     return Critic(critic_inputs(config, policy), config.hidden, layer_norm=layer_norm, seed=seed)
 
 
 def remembers(config: TrainConfig) -> bool:
-    """Whether the critics of a training see past amplitudes."""
+    """Decide whether the critics of a training see past amplitudes."""
     return isinstance(config, CriticConfig) and config.critic_memory
 
 
 def critic_inputs(config: TrainConfig, policy: MlpPolicy) -> int:
-    """How many numbers a critic sees of a state."""
+    """Count the numbers that a critic sees of a state."""
     return policy.window + (len(SPANS_S) if remembers(config) else 0)

@@ -1,12 +1,12 @@
-"""What TD3+BC and ReBRAC share: two critics, smoothed target actions, a delayed actor held near an amplitude.
+"""Common part of TD3+BC and ReBRAC: two critics, smoothed target actions, a delayed actor that stays near an amplitude.
 
 Source: Fujimoto et al. 2018 (TD3). Actions in penalties and noise are 2a - 1 in [-1, 1], so that published coefficients keep their
 meaning; rewards are scaled to returns of deviation 1.
 
-Ours: with `anchor: constant` the actor's a is a constant amplitude, by default 1, the participant's cDBS, instead of the logged one. Logged
-amplitudes of the random controller are draws that nobody prefers: their pull is one to the middle of [B, 1], away from the standard of
-care. Held near cDBS instead, the policy departs from it where the critic says so, in proportion to what it says. The critic's penalty
-stays with the logged actions: it is about where values are known, not about what is good.
+Ours: with `anchor: constant` the actor's a is a constant amplitude instead of the logged one; the default is 1, the participant's cDBS.
+Logged amplitudes of the random controller are draws without a preference: they pull to the middle of [B, 1], away from the standard of
+care. An actor near cDBS instead departs from it where the critic shows a gain, in proportion to that gain. The critic's penalty stays with
+the logged actions: it is about where values are known, not about what is good.
 """
 
 from __future__ import annotations
@@ -74,25 +74,26 @@ class Td3Learner(CriticLearner[Any]):
         return bool(self._updates % self.config.actor_every == 0)
 
     def _smoothed_target_actions(self, batch: TransitionBatch) -> Any:
-        """a~ = pi'(s') + clipped noise, [K, B, 1]."""
+        """Compute a~ = pi'(s') + clipped noise, [K, B, 1]."""
         c = self.config
         # Noise in [-1, 1] units is half as large on [0, 1].
         noise = torch.clamp(batch.noise * c.smoothing, -c.smoothing_clip, c.smoothing_clip).mul_(0.5)
         return self.target_actor.act(batch.next_states).add_(noise).clamp_(0.0, 1.0)
 
     def _smaller_target_value(self, states: Any, actions: Any) -> Any:
-        """min Q'(s', a~), [K, B, 1]."""
+        """Compute min Q'(s', a~), [K, B, 1]."""
         values = self.target_stacks["critic"].forward(states, actions).clone()
         return torch.minimum(values, self.target_stacks["critic_2"].forward(states, actions))
 
     def _critic_steps(self, batch: TransitionBatch, next_values: Any) -> None:
-        """Both critics towards r + gamma times the next values."""
+        """Move both critics towards r + gamma times the next values."""
         targets = torch.add(batch.rewards, next_values, alpha=self.scale.gamma)
         for name in ("critic", "critic_2"):
             self._descend_on_target(name, batch, targets)
 
     def _actor_step(self, batch: TransitionBatch, actions: Any, penalty: Any, uphill: Any, values: Any) -> None:
-        """The actor down the mean of b (pi(s) - a)^2 - Q / mean |Q|; `uphill` is the slope of Q by the action, `values` is used up."""
+        """Move the actor down the mean of b (pi(s) - a)^2 - Q / mean |Q|. `uphill` is the slope of Q by the action; `values` is
+        overwritten."""
         size = values.abs_().mean(dim=(1, 2), keepdim=True)
         anchor = batch.actions if self.config.anchor == "logged" else self.member_setting("anchor_amplitude")
         # b (2 pi - 2 a)^2 - Q / mean |Q|, its slope by pi averaged over the batch; mean |Q| counts as a constant.

@@ -32,7 +32,7 @@ class CloningLearner(StackedLearner[CloningConfig]):
         return {"policy": policy}
 
     def update(self, batch: TransitionBatch) -> None:
-        """One step of least squares."""
+        """Take one step of least squares."""
         actions = self.policy_stack.act(batch.states)
         error = actions - batch.actions
         self._note("cloning_loss", error.square())

@@ -6,10 +6,9 @@ One update, in this order, on a batch of the replay buffer:
 2. actor: one step up the mean of Q(s, pi(s)) (eq:ac_objective);
 3. targets: theta' <- (1 - tau) theta' + tau theta.
 
-There are no terminal flags. A session ends because the clinic's time is over, not because the participant reached a final state; cutting
-the bootstrap there would teach the critic that stopping the clock stops the pathology. There is no exploration noise (the data are
-logged) and no term but the above: nothing holds the actor near the logged actions, so read `action_distance` and `mean_q` of the
-learning curves.
+There are no terminal flags. A session ends because the clinic's time is over, not because the participant reached a final state. Cutting
+the bootstrap there would teach the critic that stopping the clock stops the pathology. There is no exploration noise (the data are logged)
+and no term but the above. Nothing keeps the actor near the logged actions, so read `action_distance` and `mean_q` of the learning curves.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class DdpgLearner(CriticLearner[DdpgConfig]):
         return {"policy": policy, "critic": fresh_critic(config, policy, seeds[0])}
 
     def update(self, batch: TransitionBatch) -> None:
-        """One DDPG update, in the order of the module's text."""
+        """Run one DDPG update, in the order of the module's text."""
         critic, actor = self.stacks["critic"], self.policy_stack
         next_values = self.target_stacks["critic"].forward(batch.next_critic_states, self.target_actor.act(batch.next_states))
         self._descend_on_target("critic", batch, torch.add(batch.rewards, next_values, alpha=self.scale.gamma))

@@ -54,7 +54,7 @@ class IqlLearner(CriticLearner[IqlConfig]):
         }
 
     def update(self, batch: TransitionBatch) -> None:
-        """One update, in the order of the module's text."""
+        """Run one update, in the order of the module's text."""
         logged = self.target_stacks["critic"].forward(batch.critic_states, batch.actions).clone()
         logged = torch.minimum(logged, self.target_stacks["critic_2"].forward(batch.critic_states, batch.actions))
         value = self.stacks["value"]

@@ -6,7 +6,7 @@ One update on a batch (s, a, r, s', a'), where a' is the action logged after a:
 2. every second update, actor: down the mean of b (pi(s) - a)^2 - Q(s, pi(s)) / mean |Q(s, pi(s))|, Q = min(Q_1, Q_2), then the targets
    follow.
 
-Its third hidden layer is left out: the actor keeps the paper's shape. `anchor` says which a the actor stays near; see `_td3`.
+Its third hidden layer is omitted: the actor keeps the paper's shape. `anchor` says which a the actor stays near; see `_td3`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class RebracLearner(Td3Learner):
         self._penalty, self._critic_penalty = self.member_setting("actor_penalty"), self.member_setting("critic_penalty")
 
     def update(self, batch: TransitionBatch) -> None:
-        """One update, in the order of the module's text."""
+        """Run one update, in the order of the module's text."""
         next_actions = self._smoothed_target_actions(batch)
         values = self._smaller_target_value(batch.next_critic_states, next_actions)
         values.sub_((next_actions - batch.next_actions).square_().mul_(batch.next_known).mul_(4.0 * self._critic_penalty))
@@ -60,7 +60,7 @@ class RebracLearner(Td3Learner):
         self._counted()
 
     def _smaller_value_slope(self, states: Any, actions: Any) -> tuple[Any, Any]:
-        """Slope by the action of min(Q_1, Q_2), and its value, both [K, B, 1]."""
+        """Compute the slope by the action of min(Q_1, Q_2), and its value, both [K, B, 1]."""
         first, second = self.stacks["critic"], self.stacks["critic_2"]
         values = first.forward(states, actions).clone()
         slope = first.action_gradient(self._ones)

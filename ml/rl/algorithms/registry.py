@@ -52,7 +52,7 @@ ALGORITHMS: Final[Mapping[str, Algorithm]] = MappingProxyType({item.name: item f
 
 
 def algorithm(name: str) -> Algorithm:
-    """An algorithm by name. Raises ValueError for a name that is none."""
+    """Find an algorithm by name. Raises ValueError for an unknown name."""
     if name not in ALGORITHMS:
         raise ValueError(f"there is no algorithm {name!r}; there are {', '.join(ALGORITHMS)}")
     return ALGORITHMS[name]

@@ -40,7 +40,7 @@ class Td3BcLearner(Td3Learner):
         self._penalty = 1.0 / self.member_setting("alpha")
 
     def update(self, batch: TransitionBatch) -> None:
-        """One update, in the order of the module's text."""
+        """Run one update, in the order of the module's text."""
         self._critic_steps(batch, self._smaller_target_value(batch.next_critic_states, self._smoothed_target_actions(batch)))
         if self._actors_turn:
             if self._warm:

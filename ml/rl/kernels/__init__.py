@@ -1,1 +1,1 @@
-"""What the algorithms compute with: networks, K of them side by side, batches. Private to `ml.rl`; its face exports what others may use."""
+"""Numerical parts of the algorithms: networks, K of them side by side, batches. Private to `ml.rl`, which exports what others may use."""

@@ -1,4 +1,4 @@
-"""What learners are fed: the buffer in one tensor, rewards on the critic's scale, and batches drawn from a counter."""
+"""Data for learners: the buffer in one tensor, rewards on the critic's scale, and batches drawn from a counter."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ class TransitionBatch(NamedTuple):
 
     @property
     def critic_states(self) -> Any:
-        """What the critics see of the states, [K, B, W + M]."""
+        """States as the critics see them, [K, B, W + M]."""
         return self.states if self.remembering is None else self.remembering
 
     @property
     def next_critic_states(self) -> Any:
-        """What the critics see of the next states, [K, B, W + M]."""
+        """Next states as the critics see them, [K, B, W + M]."""
         return self.next_states if self.next_remembering is None else self.next_remembering
 
 
@@ -79,7 +79,7 @@ class PackedTransitions:
         return int(self._rows.shape[0])
 
     def take(self, index: Any, noise: Any = None) -> TransitionBatch:
-        """The rows of an int64 tensor [K, B]; a copy, so that nothing a learner does can reach the buffer."""
+        """Copy the rows of an int64 tensor [K, B]; a learner cannot change the buffer through the copy."""
         w, seen = self._window, self._seen
         rows = self._rows.index_select(0, index.reshape(-1)).view(*index.shape, -1)
         now, actions, rewards, after, next_actions, known = rows.split((seen, 1, 1, seen, 1, 1), dim=-1)
@@ -87,29 +87,29 @@ class PackedTransitions:
         return batch._replace(remembering=now, next_remembering=after) if self._remembers else batch
 
     def probe(self, members: int = 1) -> TransitionBatch:
-        """Up to 2048 rows spread evenly over the buffer, the same for each of K policies, for measurements."""
+        """Take up to 2048 rows spread evenly over the buffer, the same for each of K policies, for measurements."""
         index = torch.from_numpy(np.unique(np.linspace(0, len(self) - 1, _PROBE_STATES).astype(np.int64)))
         one = self.take(index[None].to(self._rows.device))
         return TransitionBatch(*(None if column is None else column.expand(members, -1, -1) for column in one))
 
     def to(self, device: str) -> PackedTransitions:
-        """The same on another device."""
+        """Move the tensor to another device."""
         self._rows = self._rows.to(device)
         return self
 
     def digest(self) -> str:
-        """SHA-256 of the packed numbers."""
+        """Compute the SHA-256 of the packed numbers."""
         return hashlib.sha256(self._rows.cpu().numpy().tobytes()).hexdigest()
 
 
 class RewardScale(NamedTuple):
     """Rewards as the critic sees them: (r - shift) * factor.
 
-    A session's end is a time limit, not a terminal state, so every target bootstraps; an affine change of the rewards is then an affine
-    change of every return, Q' = factor (Q - shift / (1 - gamma)), and no policy gains or loses by it. The shift is the buffer's mean
-    reward: without it the critic would spend its first ten thousands of updates sinking from 0 to r / (1 - gamma). The factor is
-    sqrt(1 - gamma^2) / sd(r), which gives discounted sums of independent rewards a standard deviation of 1, the scale that the networks'
-    initial weights and Adam's steps suit.
+    A session's end is a time limit, not a terminal state, so every target bootstraps. An affine change of the rewards is then an affine
+    change of every return, Q' = factor (Q - shift / (1 - gamma)). No policy gains or loses by it. The shift is the buffer's mean reward.
+    Without it the critic would spend its first ten thousands of updates sinking from 0 to r / (1 - gamma). The factor is sqrt(1 - gamma^2)
+    / sd(r). It gives discounted sums of independent rewards a standard deviation of 1. The networks' initial weights and Adam's steps suit
+    that scale.
     """
 
     shift: float
@@ -118,21 +118,22 @@ class RewardScale(NamedTuple):
 
     @staticmethod
     def of(rewards: NDArray[np.float64], gamma: float) -> RewardScale:
-        """The scale of a buffer's rewards, shape [N]; factor 1 where all are equal."""
+        """Compute the scale of a buffer's rewards, shape [N]; factor 1 where all are equal."""
         deviation = float(rewards.std())
         return RewardScale(float(rewards.mean()), math.sqrt(1 - gamma**2) / deviation if deviation > 1e-12 else 1.0, gamma)
 
     def scaled(self, rewards: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Rewards for the critic."""
+        """Scale rewards for the critic."""
         return (rewards - self.shift) * self.factor
 
     def value(self, scaled: float) -> float:
-        """A critic's output in the unit of the rewards."""
+        """Convert a critic's output to the unit of the rewards."""
         return scaled / self.factor + self.shift / (1 - self.gamma)
 
 
 def packed(transitions: Transitions, normalise: Any, scale: RewardScale, memory: tuple[Any, Any] | None = None) -> PackedTransitions:
-    """Transitions for learners: windows z-scored by `normalise` (a policy's own), rewards scaled, `memory` as `ml.rl.memory` gives it."""
+    """Pack transitions for learners: windows z-scored by `normalise` (a policy's own), rewards scaled, `memory` as `ml.rl.memory` gives
+    it."""
     following = np.full(transitions.actions.size, np.nan)
     consecutive = (np.diff(transitions.session) == 0) & (np.diff(transitions.step) == 1)
     following[:-1][consecutive] = transitions.actions[1:][consecutive]
@@ -147,10 +148,10 @@ def packed(transitions: Transitions, normalise: Any, scale: RewardScale, memory:
 
 
 def batch_indices(seed: int, block: int, size: int, batch: int) -> Any:
-    """Rows of the 256 batches of a block, int64 tensor [256, batch], drawn uniformly with replacement from a buffer of `size` rows."""
+    """Draw the rows of the 256 batches of a block, int64 tensor [256, batch], uniformly with replacement from a buffer of `size` rows."""
     return torch.from_numpy(np.random.default_rng([seed, _BATCH_STREAM, block]).integers(0, size, (BLOCK, batch)))
 
 
 def batch_noise(seed: int, block: int, batch: int) -> Any:
-    """Standard normal numbers of the 256 batches of a block, float32 tensor [256, batch, 1]."""
+    """Draw standard normals for the 256 batches of a block, float32 tensor [256, batch, 1]."""
     return torch.from_numpy(np.random.default_rng([seed, _NOISE_STREAM, block]).standard_normal((BLOCK, batch, 1), dtype=np.float32))

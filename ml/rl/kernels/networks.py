@@ -1,9 +1,9 @@
 """The networks of the deep actor-critic: policy (actor) and state-action value function (critic).
 
 Sizes, initial weights and the place where the action joins the critic follow Lillicrap et al. 2016 (Continuous control with deep
-reinforcement learning), which Gao et al. 2023, section 5.1 and appendix C.1, follow. Two things are ours: inputs are z-scored with one
-mean and standard deviation of beta held *inside* the policy network (so that an exported policy takes raw beta amplitudes) instead of
-batch normalisation, and the action bound is [0, 1] instead of [-1, 1].
+reinforcement learning). So do Gao et al. 2023, section 5.1 and appendix C.1. Two things are ours. Inputs are z-scored with one mean and
+standard deviation of beta instead of batch normalisation. Both are *inside* the policy network, so that an exported policy takes raw beta
+amplitudes. The action bound is [0, 1] instead of [-1, 1].
 """
 
 from __future__ import annotations
@@ -62,22 +62,22 @@ class MlpPolicy(nn.Module):
         initialise(self.layers, torch.Generator().manual_seed(seed))
 
     def normalise(self, beta: Any) -> Any:
-        """Z-scores of beta amplitudes, same shape."""
+        """Convert beta amplitudes to z-scores, same shape."""
         return (beta - self.mean) / self.std
 
     def act_on_scores(self, scores: Any) -> Any:
-        """Amplitude fractions [N, 1] for windows that are z-scored already, tensor [N, W]: training scales its data once."""
+        """Compute amplitude fractions [N, 1] for windows that are z-scored already, tensor [N, W]: training scales its data once."""
         hidden = scores
         for layer in self.layers[:-1]:
             hidden = torch.relu(layer(hidden))
         return 0.5 * (torch.tanh(self.layers[-1](hidden)) + 1.0)
 
     def forward(self, windows: Any) -> Any:
-        """Amplitude fractions [N, 1] for beta windows, float32 tensor [N, W]."""
+        """Compute amplitude fractions [N, 1] for beta windows, float32 tensor [N, W]."""
         return self.act_on_scores(self.normalise(windows))
 
     def act(self, states: NDArray[Any]) -> NDArray[np.float64]:
-        """Amplitude fractions in [0, 1], shape [N], for beta windows [N, W]; NaN where a window holds NaN.
+        """Compute amplitude fractions in [0, 1], shape [N], for beta windows [N, W]; NaN where a window has NaN.
 
         Raises:
             ValueError: states of another shape.
@@ -100,7 +100,7 @@ class MlpPolicy(nn.Module):
         return sum(layer.weight.numel() for layer in self.layers)
 
     def to_onnx(self) -> bytes:
-        """The policy as ONNX (opset 17): `beta_window` float32 [N, W] to `amplitude_fraction` float32 [N, 1].
+        """Export the policy as ONNX (opset 17): `beta_window` float32 [N, W] to `amplitude_fraction` float32 [N, 1].
 
         The bytes depend on the weights alone (and the onnx version), so that their SHA-256 names the policy.
         """
@@ -135,7 +135,7 @@ class MlpPolicy(nn.Module):
 
     @staticmethod
     def from_onnx(content: bytes) -> MlpPolicy:
-        """The inverse of `to_onnx`, for fine-tuning a stored policy.
+        """Read what `to_onnx` wrote, for fine-tuning a stored policy.
 
         Raises:
             PolicyFileError: the bytes are not an ONNX file that `to_onnx` wrote.
@@ -170,8 +170,8 @@ class MlpPolicy(nn.Module):
 class Critic(nn.Module):
     """The state-action value function Q(s, a) on z-scored windows.
 
-    The action joins at the second hidden layer, beside the first layer's units, as in Lillicrap et al.; as 2a - 1, their range of actions,
-    which is also nearer to the z-scores that the other inputs are.
+    The action joins at the second hidden layer, next to the first layer's units, as in Lillicrap et al. (2016). It enters as 2a - 1, their
+    range of actions, which is also nearer to the z-scores of the other inputs.
 
     Args:
         window: W.
@@ -199,9 +199,9 @@ class Critic(nn.Module):
             self.action.weight.uniform_(-bound, bound, generator=generator)
 
     def forward(self, scores: Any, actions: Any) -> Any:
-        """Values [N, 1] of actions [N, 1] in z-scored windows [N, W], tensors of float32."""
+        """Compute values [N, 1] of actions [N, 1] in z-scored windows [N, W], tensors of float32."""
         hidden = self._rectified(self.layers[0](scores))
-        # The action's column of the second layer stands apart: the actor's gradient then needs no product with the other columns.
+        # The action's column of the second layer is separate: the actor's gradient then needs no product with the other columns.
         hidden = self._rectified(self.layers[1](hidden) + self.action(2.0 * actions - 1.0))
         for layer in self.layers[2:-1]:
             hidden = self._rectified(layer(hidden))
@@ -227,7 +227,7 @@ class Value(nn.Module):
         initialise(self.layers, torch.Generator().manual_seed(seed))
 
     def forward(self, scores: Any) -> Any:
-        """Values [N, 1] of z-scored windows, float32 tensor [N, W]."""
+        """Compute values [N, 1] of z-scored windows, float32 tensor [N, W]."""
         hidden = scores
         for layer in self.layers[:-1]:
             hidden = torch.relu(layer(hidden))
@@ -235,7 +235,7 @@ class Value(nn.Module):
 
 
 def initialise(layers: Any, generator: Any) -> None:
-    """Lillicrap's initial weights: uniform within 1 / sqrt(inputs) of 0, the last layer within 0.003; drawn from `generator` alone."""
+    """Draw Lillicrap's initial weights: uniform within 1 / sqrt(inputs) of 0, the last layer within 0.003; from `generator` alone."""
     with torch.no_grad():
         for i, layer in enumerate(layers):
             bound = _FINAL_INIT if i == len(layers) - 1 else 1.0 / math.sqrt(layer.in_features)

@@ -1,9 +1,9 @@
 """K networks of one shape side by side: their weights in one tensor, their matrix products in one call, their gradients by hand.
 
-Six small networks trained one after the other leave most of a processor core idle between calls; side by side they share the calls.
-The gradients are written out (back-propagation through ReLU layers is ten lines) instead of recorded: nothing is allocated within an
-update, every product writes straight into the gradient that Adam reads, and no gradient is computed that nobody uses. All tensors
-have the member as first dimension, K = 1 included. Member k's numbers depend on member k's weights and batch alone.
+Six small networks trained one after the other leave most of a processor core idle between calls; side by side they share the calls. The
+gradients are written out (back-propagation through ReLU layers is ten lines) instead of recorded. Nothing is allocated within an update,
+every product is written straight into the gradient that Adam reads, and no unused gradient is computed. All tensors have the member as
+first dimension, K = 1 included. Member k's numbers depend on member k's weights and batch alone.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ class Stack:
         return int(self.weights.shape[0])
 
     def forward(self, scores: Any, actions: Any = None) -> Any:
-        """Outputs [K, B, 1] for z-scored windows [K, B, W] and, for critics, actions [K, B, 1].
+        """Compute outputs [K, B, 1] for z-scored windows [K, B, W] and, for critics, actions [K, B, 1].
 
-        The answer lies in memory that the next call uses again.
+        The next call overwrites the memory of the answer.
         """
         memory = self._last = self._memory_for(int(scores.shape[1]))
         signed = None if actions is None else torch.sub(actions, 0.5).mul_(2.0)
@@ -94,14 +94,14 @@ class Stack:
                 slope = self._through(i, slope, memory)
 
     def action_gradient(self, slope: Any) -> Any:
-        """d loss / d actions [K, B, 1], from d loss / d output of the last `forward`; the weights' gradient is left alone."""
+        """Compute d loss / d actions [K, B, 1], from d loss / d output of the last `forward`; the weights' gradient does not change."""
         memory = self._required_memory(slope)
         for i in reversed(range(2, len(self._w))):
             slope = self._through(i, slope, memory)
         return torch.bmm(slope, self._action_w).mul_(2.0)
 
     def _through(self, i: int, slope: Any, memory: _Memory) -> Any:
-        """The slope before layer i's input was rectified, from the slope at layer i's output."""
+        """Compute the slope before layer i's input was rectified, from the slope at layer i's output."""
         below = torch.bmm(slope, self._w[i], out=memory.slopes[i - 1])
         if self._norm:
             below = _layer_norm_slope(below, memory.inputs[i], memory.inverse_deviation[i - 1])
@@ -122,11 +122,11 @@ class StackedActor(Stack):
     """K policies: the perceptron's output x bounded to (tanh(x) + 1) / 2."""
 
     def act(self, scores: Any) -> Any:
-        """Amplitude fractions [K, B, 1] for z-scored windows [K, B, W]."""
+        """Compute amplitude fractions [K, B, 1] for z-scored windows [K, B, W]."""
         return torch.tanh(self.forward(scores)).add_(1.0).mul_(0.5)
 
     def backward_from_actions(self, slope: Any, actions: Any) -> None:
-        """`backward` from d loss / d actions, both [K, B, 1]; `actions` are the answers of the last `act`."""
+        """Run `backward` from d loss / d actions, both [K, B, 1]; `actions` are the answers of the last `act`."""
         # d a / d x = (1 - tanh(x)^2) / 2 = 2 a (1 - a)
         self.backward(torch.addcmul(actions, actions, actions, value=-1.0).mul_(slope).mul_(2.0))
 
@@ -151,7 +151,7 @@ class StackedAdam:
         self._decay = decay
 
     def step(self) -> None:
-        """One step down `stack.gradient`."""
+        """Take one step down `stack.gradient`."""
         self._steps.add_(1.0)
         for (weights, gradients, first, second, maxima, steps), rate in self._calls:
             torch._fused_adam_(
@@ -171,7 +171,7 @@ class StackedAdam:
             )
 
     def state(self) -> dict[str, Any]:
-        """Moments and step counts; copies."""
+        """Copy moments and step counts."""
         return {"moments": self._moments.cpu().clone(), "steps": self._steps.cpu().clone()}
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -187,7 +187,7 @@ def into_module(row: Any, module: MlpPolicy | Critic | Value) -> None:
 
 
 class _Memory:
-    """What a forward pass leaves for its backward pass, for `rows` rows."""
+    """Values that a forward pass leaves for its backward pass, for `rows` rows."""
 
     def __init__(self, weights: Sequence[Any], rows: int) -> None:
         members, device = int(weights[0].shape[0]), weights[0].device
@@ -199,7 +199,7 @@ class _Memory:
 
 
 def _views(flat: Any, shapes: dict[str, Any]) -> dict[str, Any]:
-    """Views [K, *shape] of the columns of `flat`, by parameter name."""
+    """Return views [K, *shape] of the columns of `flat`, by parameter name."""
     views, start = {}, 0
     for name, shape in shapes.items():
         views[name] = flat[:, start : start + shape.numel()].view(flat.shape[0], *shape)
@@ -208,13 +208,13 @@ def _views(flat: Any, shapes: dict[str, Any]) -> dict[str, Any]:
 
 
 def _layer_norm(hidden: Any) -> tuple[Any, Any]:
-    """Each row centred and scaled to unit deviation, and one over the deviation it had."""
+    """Centre each row and scale it to unit deviation; also return one over the deviation it had."""
     deviation, mean = torch.var_mean(hidden, dim=-1, correction=0, keepdim=True)
     inverse = deviation.add_(_LAYER_NORM_EPSILON).rsqrt_()
     return torch.sub(hidden, mean).mul_(inverse), inverse
 
 
 def _layer_norm_slope(slope: Any, normed: Any, inverse: Any) -> Any:
-    """The slope before layer normalisation: minus its mean and its part along the normalised row, over the deviation."""
+    """Compute the slope before layer normalisation: minus its mean and its part along the normalised row, over the deviation."""
     along = torch.mul(slope, normed).mean(dim=-1, keepdim=True)
     return slope.sub_(slope.mean(dim=-1, keepdim=True)).addcmul_(normed, along, value=-1.0).mul_(inverse)
