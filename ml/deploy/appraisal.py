@@ -1,11 +1,13 @@
-"""What a policy would ask for on beta that was logged, held against what was tried before; and what that may mean for a battery.
+"""Appraisal of a policy: the amplitudes that it requests on logged beta, compared with those tried before, and what they may mean for a
+battery.
 
-Two warnings belong on the sheet of a bundle: a policy that often asks for amplitudes below those that were ever tried at random (B: its
-estimates rest on no data there), and one that often asks for less than the clinician allows (the limits decide then, not the network).
+The sheet of a bundle has two warnings. One is about a policy that often requests amplitudes below those ever tried at random: its estimates
+rest on no data below B. The other is about a policy that often requests less than the clinician allows: the limits decide then, not the
+network.
 
-Battery: of all that an implant draws, stimulation is a share that differs between implants and participants and that no recording holds.
-With that share as an assumption, the life against cDBS is 1 / (1 - share * (1 - r)), where r lies between the mean of the squared amplitude
-(an output stage without loss) and the mean amplitude (a fixed supply voltage). Source of the energy model: `ml/energy.py`.
+Battery: stimulation takes a share of all that an implant draws. The share differs between implants and participants, and no recording
+contains it. With that share as an assumption, the life against cDBS is 1 / (1 - share * (1 - r)). Here r is between the mean of the squared
+amplitude (an output stage without loss) and the mean amplitude (a fixed supply voltage). Source of the energy model: `ml/energy.py`.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ STIMULATION_SHARE = Range(0.3, 0.9)
 
 
 def of(fractions: NDArray[np.float64], manifest: BundleManifest) -> dict[str, Any]:
-    """What the network asks for, as entries of the manifest; only their number where the windows were not logged.
+    """Summarise what the network requests, as entries of the manifest; only the number of windows where they were not logged.
 
     Args:
         fractions: its answers to the test windows, [M].
@@ -53,11 +55,11 @@ FROZEN_AFTER = 5
 SATURATED_AT = 3.0
 """Times the highest beta amplitude that was logged."""
 LEVEL_SPREAD = 2.5
-"""A window's mean may lie this factor outside the range of those logged; a unit ten times off lies farther."""
+"""Factor by which a window's mean may be outside the range of the logged ones; a unit that is wrong by ten is farther outside."""
 
 
 def plausible_beta(windows: NDArray[np.float64] | None) -> dict[str, Any]:
-    """Limits of beta for the safety envelope, as entries of the manifest.
+    """Derive limits of beta for the safety envelope, as entries of the manifest.
 
     Args:
         windows: logged, [N, W]; None where nothing was, so that no level is known.
@@ -74,7 +76,7 @@ def plausible_beta(windows: NDArray[np.float64] | None) -> dict[str, Any]:
 
 
 class WarningCode(StrEnum):
-    """What a clinician must know of a policy before it is used."""
+    """Facts that a clinician must know of a policy before it is used."""
 
     UNTRIED = "untried"
     BELOW_LOGGED = "below_logged"
@@ -96,7 +98,7 @@ class BundleWarning:
 
 
 def warnings(manifest: BundleManifest) -> list[BundleWarning]:
-    """What stands out in a policy's answers; `wording` makes sentences of it."""
+    """List the warnings about a policy's answers; `wording` makes sentences of them."""
     m, out = manifest, []
     if m.schedule is not None:
         return []
@@ -110,7 +112,7 @@ def warnings(manifest: BundleManifest) -> list[BundleWarning]:
 
 
 def battery_gain(energy_of_cdbs: float, charge_of_cdbs: float, share: Range = STIMULATION_SHARE) -> Range:
-    """Battery life as a multiple of that under cDBS: the range over both models of the output stage and all shares.
+    """Compute battery life as a multiple of that under cDBS: the range over both models of the output stage and all shares.
 
     Args:
         energy_of_cdbs, charge_of_cdbs: mean square and mean of the amplitude over cDBS, 0 or more.

@@ -1,4 +1,4 @@
-"""A bundle that tells nobody by its files what it runs: one sealed file of one size, beside sheet, runner and a manifest without names."""
+"""Blinded bundle, whose files do not reveal what it runs: one sealed file of one size, with sheet, runner and a manifest without names."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BLINDED = "blinded"
 
 @dataclass(frozen=True)
 class Common:
-    """What all sessions of a blinded plan have in common, and so may be read: limits in mA and mA/s, window, period in s."""
+    """Values that all sessions of a blinded plan share, and that may be read: limits in mA and mA/s, window, period in s."""
 
     min_ma: float
     max_ma: float
@@ -27,7 +27,7 @@ class Common:
 
 
 def room_for(largest_network: int) -> int:
-    """Bytes of the sealed file of every session of a plan whose largest ONNX file has so many."""
+    """Compute the size in bytes of the sealed file of every session of a plan, given the size of its largest ONNX file."""
     room = _ROOM
     while room < largest_network + _ROOM // 2:
         room *= 2
@@ -35,7 +35,7 @@ def room_for(largest_network: int) -> int:
 
 
 def blind(content: bytes, common: Common, nonce: str, room: int) -> bytes:
-    """The bundle, unsigned, with all that tells its controller in one sealed file.
+    """Blind a bundle, unsigned: move all that reveals its controller into one sealed file.
 
     Args:
         content: of a bundle of a blinded session. nonce: 32 hexadecimal digits. room: bytes of the sealed file.

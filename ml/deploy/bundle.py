@@ -76,7 +76,7 @@ class OpenBundle:
         return dict(json.loads(self.manifest.to_bytes()))
 
     def controller(self) -> BoundedController:
-        """The network or the schedule within the clinician's limits; one per session."""
+        """Make the network or the schedule within the clinician's limits; one per session."""
         return make_controller(self.manifest, self.network)
 
 
@@ -129,7 +129,8 @@ def build_scheduled_bundle(manifest: BundleManifest) -> bytes:
 
 
 def make_controller(manifest: BundleManifest, network: WindowNetwork | None) -> BoundedController:
-    """A network, or the manifest's schedule, within the clinician's limits. Raises BundleError where there is neither."""
+    """Make a controller of a network, or of the manifest's schedule, within the clinician's limits. Raises BundleError where there is
+    neither."""
     signal = Signal(manifest.beta_unit, manifest.beta_source)
     if manifest.schedule is not None:
         return ScheduledController(manifest.schedule, manifest.limits(), signal)
@@ -143,25 +144,26 @@ def _runner_files() -> dict[str, bytes]:
 
 
 def _whole(manifest: BundleManifest, files: dict[str, bytes], sheet: str) -> bytes:
-    """The ZIP of all files with their manifest."""
+    """Pack all files into a ZIP with their manifest."""
     return pack_whole(manifest, files | {SHEET: sheet.encode()})
 
 
 def pack_whole(manifest: BundleManifest, files: dict[str, bytes]) -> bytes:
-    """The ZIP of files with a manifest that names them."""
+    """Pack files into a ZIP with a manifest that names them."""
     full = replace(manifest, files={name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
     return _pack(files | {MANIFEST: full.to_bytes()})
 
 
 def describe(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDArray[Any]) -> BundleManifest:
-    """The manifest that `build_bundle` would write, all but the files; arguments and errors as there."""
+    """Describe the bundle by the manifest that `build_bundle` would write, all but the files; arguments and errors as there."""
     return _described(policy_onnx, manifest, test_windows)[0]
 
 
 def _described(
     policy_onnx: bytes, manifest: BundleManifest, test_windows: NDArray[Any]
 ) -> tuple[BundleManifest, MlpNetwork | None, OnnxPolicy, NDArray[np.float64]]:
-    """The manifest with all that the network itself says, its layers where it is a plain one, the policy, test windows with the edges."""
+    """Complete the manifest from the network. Also return its layers where it is a plain one, the policy, and test windows with the
+    edges."""
     usual = np.asarray(test_windows, dtype=np.float64)
     if usual.ndim != 2 or usual.shape[1] != manifest.window or len(usual) == 0 or not np.isfinite(usual).all():
         raise BundleError(f"test windows must be finite and of shape [M, {manifest.window}], M at least 1, not {list(usual.shape)}")
@@ -188,8 +190,8 @@ def _described(
 def _plain(
     policy_onnx: bytes, windows: NDArray[np.float64], expected: NDArray[np.float64], usual: NDArray[np.float64]
 ) -> tuple[MlpNetwork | None, str | None]:
-    """The network as layers, if the file is a plain one whose layers give the file's own answers in numpy and with the header's tanh;
-    else why not."""
+    """Read the network as layers, if the file is a plain one; else return the reason. Its layers must give the file's own answers in numpy
+    and with the header's tanh."""
     try:
         network = mlp_of(policy_onnx, usual)
     except (NoPlainNetwork, ValueError) as error:
@@ -212,8 +214,8 @@ def verify_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) ->
 def open_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) -> OpenBundle:
     """Check a bundle and load its network.
 
-    Every file is named in the manifest and has its SHA-256, nothing else is inside, ONNX file and reference runner give the test vectors'
-    fractions and decisions again within 1e-5 and, with a public key, the manifest is signed by it.
+    Every file is named in the manifest and has its SHA-256, and nothing else is inside. ONNX file and reference runner reproduce the test
+    vectors' fractions and decisions within 1e-5. With a public key, the manifest must be signed by it.
 
     Raises:
         BundleError: whatever is not as it should be; the message names it.
@@ -238,7 +240,7 @@ def open_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) -> O
 
 
 def _opened(outer: BundleManifest, sealed: bytes, nonce: str) -> tuple[BundleManifest, bytes, dict[str, bytes]]:
-    """Manifest and files that a blinded bundle keeps to itself."""
+    """Open the sealed manifest and files of a blinded bundle."""
     try:
         files = unseal(sealed, nonce)
         raw = files.pop(MANIFEST)
@@ -252,7 +254,7 @@ def _opened(outer: BundleManifest, sealed: bytes, nonce: str) -> tuple[BundleMan
 
 
 def _loaded(manifest: BundleManifest, raw: bytes, files: dict[str, bytes], digest: str) -> OpenBundle:
-    """The network of a bundle, which answers its test vectors. `raw`: of the manifest. `digest`: by which logs name the bundle."""
+    """Load the network of a bundle, and check it with the test vectors. `raw`: of the manifest. `digest`: by which logs name the bundle."""
     if manifest.schedule is not None:
         _check_decisions(raw, None, files[VECTORS], "the schedule")
         return OpenBundle(manifest, None, digest)
@@ -282,7 +284,7 @@ def _check_decisions(raw: bytes, network: MlpNetwork | None, stated: bytes, what
 
 
 def _check_names(manifest: BundleManifest, present: set[str]) -> None:
-    """The files named, and those inside, are one of the four sets that a bundle can be."""
+    """Check that the files named, and those inside, are one of the four sets that a bundle can be."""
     named = set(manifest.files)
     if manifest.sealed is not None:
         _compare_names(named, {SHEET, SEALED, *RUNNER}, present)
@@ -302,7 +304,7 @@ def _compare_names(named: set[str], wanted: set[str], present: set[str]) -> None
 
 
 def sign(content: bytes, private_key: Ed25519PrivateKey) -> bytes:
-    """The bundle with a signature of its manifest, which by its hashes covers every file; an older signature is replaced.
+    """Sign the manifest of a bundle, which by its hashes covers every file; an older signature is replaced.
 
     Raises:
         BundleError: the bundle is not intact, or names another key.
@@ -357,7 +359,7 @@ def _pack(files: dict[str, bytes]) -> bytes:
 
 
 def unpack(content: bytes) -> dict[str, bytes]:
-    """The files of a bundle. Raises BundleError for other bytes."""
+    """Unpack the files of a bundle. Raises BundleError for other bytes."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = archive.infolist()

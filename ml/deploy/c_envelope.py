@@ -79,7 +79,7 @@ static inline float betaloop_tanh(float x) {{
 
 
 def header_tanh(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The tanh of the C header, in float32: for networks with tanh between their layers, where its error may grow."""
+    """Compute the tanh of the C header, in float32: for networks with tanh between their layers, where its error may grow."""
     x = np.clip(x, np.float32(-_LARGEST), np.float32(_LARGEST))
     s = x * x
     over, under = (np.float32(0.0) * s, np.float32(0.0) * s)

@@ -4,9 +4,9 @@
     betaloop_start(&state);
     /* every period: */ betaloop_decision d = betaloop_decide(&state, now_ms, sample_or_0);
 
-`float_header` holds float32 weights of any size, `fixed_point_header` a small network in whole numbers (`ml/deploy/fixed_point.py`), and
+`float_header` has float32 weights of any size, `fixed_point_header` a small network in whole numbers (`ml/deploy/fixed_point.py`).
 `self_test` is a program that checks either against the bundle's test vectors. Names of people, participants and policies reach the C text
-through `comment` and `string_literal` alone, which let nothing through that could end a comment or a string.
+through `comment` and `string_literal` alone. They let nothing through that could end a comment or a string.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ ALL_REASONS = sum(REASON_NAMES)
 
 
 def comment(text: str) -> str:
-    """Text that can stand in a C comment: what could end it, start a trigraph or a line splice becomes '_'."""
+    """Escape text for a C comment: what could end it, start a trigraph or a line splice becomes '_'."""
     return "".join(char if char in _SAFE else "_" for char in text)
 
 
 def string_literal(text: str) -> str:
-    """Text as a C string: everything but plain letters, digits and a few signs as octal bytes of UTF-8."""
+    """Write text as a C string: everything but plain letters, digits and a few signs as octal bytes of UTF-8."""
     return '"' + "".join(chr(byte) if chr(byte) in _SAFE and byte < 128 else f"\\{byte:03o}" for byte in text.encode()) + '"'
 
 
 def float_header(manifest: BundleManifest, network: MlpNetwork) -> str:
-    """The controller with float32 weights."""
+    """Write the controller with float32 weights."""
     sizes = [network.window, *(len(b) for _, b in network.layers)]
     parts = [_preamble(manifest, "float32 weights"), "typedef float betaloop_score;\n", TYPES]
     for index, (weights, bias) in enumerate(network.layers):
@@ -80,7 +80,7 @@ def float_header(manifest: BundleManifest, network: MlpNetwork) -> str:
 
 
 def fixed_point_header(manifest: BundleManifest, fixed: FixedPointNetwork) -> str:
-    """The controller in whole numbers."""
+    """Write the controller in whole numbers."""
     kind = f"int8 weights in {fixed.planes} plane{'s' if fixed.planes > 1 else ''}, guaranteed error of the fraction {fixed.bound:.3g}"
     parts = [_preamble(manifest, kind), "typedef int16_t betaloop_score;\n", TYPES]
     for index, layer in enumerate(fixed.layers):
@@ -136,7 +136,7 @@ def fixed_point_header(manifest: BundleManifest, fixed: FixedPointNetwork) -> st
 
 
 def _answer(total: str, output: Output) -> list[str]:
-    """The C lines from the last sum to the fraction; a sum that is no number stays none, for the envelope to see."""
+    """Write the C lines from the last sum to the fraction; a sum that is no number stays none, so that the envelope sees it."""
     bent = f"betaloop_tanh({total})" if output.kind == "tanh" else total
     lines = [f"    float answer = {_float(output.gain)} * ({bent}) + {_float(output.offset)};"]
     lines += [] if output.low is None else [f"    if (answer < {_float(output.low)}) answer = {_float(output.low)};"]
@@ -154,7 +154,7 @@ def self_test(
     *,
     exact: bool,
 ) -> str:
-    """A program that includes a header, runs the test vectors through it and exits 0 when every answer is right.
+    """Write a program that includes a header, runs the test vectors through it and exits 0 when every answer is right.
 
     Args:
         manifest: of the bundle. header: file name to include.
@@ -253,7 +253,7 @@ def _int64(value: int) -> str:
 
 
 def _float(value: Any) -> str:
-    """A float32 that reads back as the same number."""
+    """Write a float32 so that it reads back as the same number."""
     text = f"{float(np.float32(value)):.9g}"
     return (text if any(c in text for c in ".e") else text + ".0") + "f"
 

@@ -1,12 +1,12 @@
 """A small network in whole numbers, for implants without a floating-point unit: int8 weights, int16 activations, int32 accumulators.
 
-Each row of weights has one scale. A row is one plane of int8, or two (a coarse one, and a fine one in steps of 1/256 of the coarse), where
-one cannot keep the guaranteed error small. Between layers a row's sum is brought to int16 by a whole multiplier and a shift; only the last
-sum and its tanh are real numbers (and those of hidden layers with tanh, which files made elsewhere may have).
+Each row of weights has one scale. A row is one plane of int8. Where one plane cannot keep the guaranteed error small, it is two: a coarse
+one, and a fine one in steps of 1/256 of the coarse. Between layers a row's sum is brought to int16 by a whole multiplier and a shift. Only
+the last sum and its tanh are real numbers (and those of hidden layers with tanh, which files made elsewhere may have).
 
-The error bound is analytical: intervals of the real network's activations over all windows, and through them the errors of inputs, weights,
-biases, multipliers and roundings, each at its worst sign. It holds for every window there can be, not for those that were tried; z-scores
-beyond `SCORE_LIMIT` are cut, and the bound is then against the real network on the cut window.
+The error bound is analytical. It starts from intervals of the real network's activations over all windows. Through them it carries the
+errors of inputs, weights, biases, multipliers and roundings, each at its worst sign. It applies to every possible window, not only to those
+that were tried. Z-scores beyond `SCORE_LIMIT` are cut, and the bound is then against the real network on the cut window.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class FixedLayer:
     shift: int
 
     def sums(self, activations: Ints) -> Ints:
-        """Sums [N, outputs] of activations [N, inputs]. Raises OverflowError where an accumulator leaves int32: not with weights from
+        """Sum activations [N, inputs] to [N, outputs]. Raises OverflowError where an accumulator leaves int32: not with weights from
         `quantise`."""
         parts = [activations @ plane.T for plane in self.planes]
         if any(np.abs(part).max(initial=0) > _INT32 for part in parts):
@@ -94,12 +94,12 @@ class FixedPointNetwork:
         return sum(sum(p.size for p in a.planes) + 4 * a.bias.size + 4 * (a.multiplier.size or a.unit.size) for a in self.layers)
 
     def cut(self, states: NDArray[Any]) -> NDArray[np.float64]:
-        """Beta windows [N, W] with z-scores beyond the limit cut to it."""
+        """Cut beta windows [N, W] to the limit of their z-scores."""
         reach = SCORE_LIMIT * self.std
         return np.clip(np.asarray(states, dtype=np.float64), self.mean - reach, self.mean + reach)
 
     def act(self, states: NDArray[Any]) -> NDArray[np.float64]:
-        """Amplitude fractions [N] for beta windows [N, W], by the same whole numbers as the C header."""
+        """Compute amplitude fractions [N] for beta windows [N, W], by the same whole numbers as the C header."""
         scores = (np.asarray(states, dtype=np.float32) - np.float32(self.mean)) / np.float32(self.std)
         scaled = np.clip(scores, -SCORE_LIMIT, SCORE_LIMIT).astype(np.float32) * np.float32(_INT16 / SCORE_LIMIT)
         hidden: Ints = np.where(scaled < 0, np.ceil(scaled - np.float32(0.5)), np.floor(scaled + np.float32(0.5))).astype(np.int64)
@@ -130,13 +130,13 @@ class CutNetwork:
         self._network.push(float(self._fixed.cut(np.array([beta]))[0]))
 
     def fraction(self) -> float:
-        """Amplitude fraction for the window as it stands."""
+        """Compute the amplitude fraction for the current window."""
         return self._network.fraction()
 
 
 def quantise(network: MlpNetwork) -> FixedPointNetwork | None:
-    """The network in whole numbers with one plane, or two where one keeps too little; None where it is too large for an implant or its
-    sums do not fit."""
+    """Quantise the network to whole numbers with one plane, or two where one keeps too little. None where it is too large for an implant or
+    its sums do not fit."""
     if sum(w.size + b.size for w, b in network.layers) > MAX_PARAMETERS:
         return None
     if network.output.kind == "linear" and (network.output.low is None or network.output.high is None):
@@ -197,7 +197,7 @@ def _quantise(network: MlpNetwork, planes: int) -> FixedPointNetwork | None:
 
 
 def _split(weights: NDArray[np.float64], planes: int) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
-    """Rows in steps of their scale [outputs], as one plane or two."""
+    """Split rows in steps of their scale [outputs], into one plane or two."""
     largest = np.abs(weights).max(axis=1)
     row_scale = np.where(largest > 0, largest, 1.0) / 127.0
     in_steps = weights / row_scale[:, None]

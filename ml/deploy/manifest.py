@@ -1,4 +1,4 @@
-"""What a controller bundle says about itself: whose policy, which signal, which limits, which files, who approved."""
+"""Manifest of a controller bundle: whose policy, which signal, which limits, which files, who approved."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Approval:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanCard:
-    """What the sheet of the signed plan says of the session that a bundle is for: the bundle's own sheet says the same.
+    """Text of the signed plan's sheet about the session that a bundle is for: the bundle's own sheet repeats it.
 
     Attributes:
         head, minutes: of its title line. lines: label and text, in order. warnings: a sentence each.
@@ -58,7 +58,7 @@ class PlanCard:
 
     @staticmethod
     def from_json(stored: dict[str, Any]) -> PlanCard:
-        """As JSON gives it. Raises TypeError, ValueError, KeyError for another shape."""
+        """Read a card from JSON. Raises TypeError, ValueError, KeyError for another shape."""
         lines = tuple((str(label), str(text)) for label, text in stored["lines"])
         return PlanCard(**stored | {"lines": lines, "warnings": tuple(map(str, stored["warnings"])), "blinded": stored["blinded"] is True})
 
@@ -78,8 +78,8 @@ class BundleManifest:
         normalisation_mean, normalisation_std: z-scoring constants inside the network; None where the file does not show them.
         min_ma, max_ma, cdbs_ma, ramp_ma_per_s: the clinician's limits, as in `EnvelopeLimits`.
         max_beta_age_s, beta_max, level_low, level_high, frozen_after: as in `EnvelopeLimits`.
-        limits_stated_by: who stated the limits, and when; None where nobody did and they are defaults.
-        device_min_ma, device_max_ma: amplitude limits read from the participant's stimulator; None where no recording held them.
+        limits_stated_by: who stated the limits, and when; None where they are defaults.
+        device_min_ma, device_max_ma: amplitude limits read from the participant's stimulator; None where no recording has them.
         snapshot_sha256: of the buffer snapshot that the policy was trained on; None for a policy made elsewhere.
         policy_code_version: of the betaloop that trained the policy.
         code_version: of the betaloop that made the bundle.
@@ -92,8 +92,8 @@ class BundleManifest:
         test_windows_from: where the beta windows of the test vectors were logged; None where they are made up.
         test_windows: how many of them there are, before those at the edges.
         logged_lower_bound: B, lowest amplitude fraction that the study's random controller draws; None where not known.
-        asked_mean, asked_below_bound, asked_below_minimum: over the logged test windows, the mean fraction that the network asks for, and
-            the shares of windows for which it asks for less than B, and for less than the clinician's minimum.
+        asked_mean: over the logged test windows, the mean fraction that the network requests. asked_below_bound, asked_below_minimum: the
+            shares of windows with less than B, and with less than the clinician's minimum.
         energy_of_cdbs, charge_of_cdbs: mean square and mean of the amplitude over cDBS, over the logged test windows and within limits.
         int8_bound, int8_planes, int8_bytes: of the fixed-point header; None where there is none.
         taken_by: who took the bundle first, and when; None for one made without a service.
@@ -207,7 +207,7 @@ class BundleManifest:
             raise BundleError("the manifest needs a policy_id or a schedule")
 
     def _check_sealed(self, nonce: str) -> None:
-        """The manifest of a blinded bundle tells its session, and nothing of its controller."""
+        """Check that the manifest of a blinded bundle names its session, and nothing of its controller."""
         if not re.fullmatch(r"[0-9a-f]{32}", nonce):
             raise BundleError(f"sealed must be 32 hexadecimal digits, not '{nonce}'")
         if self.slot is None or self.card is None or not self.card.blinded:
@@ -216,7 +216,7 @@ class BundleManifest:
             raise BundleError("a sealed bundle names neither network nor schedule")
 
     def _check_device_limits(self) -> None:
-        """The clinician's limits lie within what the stimulator was set to allow."""
+        """Check that the clinician's limits are within what the stimulator was set to allow."""
         if self.device_max_ma is not None and self.max_ma > self.device_max_ma + 1e-6:
             raise BundleError(f"the highest amplitude, {self.max_ma:g} mA, is above the stimulator's own limit, {self.device_max_ma:g} mA")
         if self.device_min_ma is not None and self.min_ma < self.device_min_ma - 1e-6:
@@ -233,7 +233,7 @@ class BundleManifest:
         return sum(i * o + o for i, o in pairwise(self.layers))
 
     def limits(self) -> EnvelopeLimits:
-        """The limits for the safety envelope. Raises BundleError where they contradict each other."""
+        """Collect the limits for the safety envelope. Raises BundleError where they contradict each other."""
         names = [f.name for f in fields(EnvelopeLimits)]
         try:
             return EnvelopeLimits(**{name: getattr(self, name) for name in names})
@@ -241,16 +241,16 @@ class BundleManifest:
             raise BundleError(f"the limits in the manifest cannot be used: {error}") from error
 
     def output(self) -> Output:
-        """What follows the last layer."""
+        """Describe what follows the last layer."""
         return Output(self.output_kind, self.output_gain, self.output_offset, self.output_low, self.output_high)
 
     def to_bytes(self) -> bytes:
-        """The manifest as JSON; the same manifest always gives the same bytes."""
+        """Write the manifest as JSON; the same manifest always gives the same bytes."""
         return (json.dumps(asdict(self), sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
     @staticmethod
     def from_bytes(content: bytes) -> BundleManifest:
-        """The inverse of `to_bytes`. Raises BundleError naming what is missing, unknown or of the wrong type."""
+        """Read what `to_bytes` wrote. Raises BundleError naming what is missing, unknown or of the wrong type."""
         try:
             values = json.loads(content)
         except ValueError as error:
@@ -280,7 +280,7 @@ Made = TypeVar("Made")
 
 
 def _nested(name: str, stored: Any, make: Callable[[dict[str, Any]], Made]) -> Made | None:
-    """An object inside the manifest. Raises BundleError where it is another."""
+    """Read an object inside the manifest. Raises BundleError where it has another shape."""
     if stored is None:
         return None
     try:
@@ -302,7 +302,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
 
 
 def _check_keys(where: str, kind: type[Any], values: dict[str, Any]) -> None:
-    """Names and JSON types of an object against a dataclass of simple fields."""
+    """Check names and JSON types of an object against a dataclass of simple fields."""
     known = {f.name: f for f in fields(kind)}
     unknown = sorted(set(values) - set(known))
     if unknown:

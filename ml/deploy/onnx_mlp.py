@@ -1,8 +1,8 @@
-"""The layers of a policy file, whoever made it: read from the ONNX graph where that is a plain multi-layer perceptron.
+"""Layers of a policy file, whatever its origin: read from the ONNX graph where that is a plain multi-layer perceptron.
 
-Plain means one path from the window to the answer, of matrix products, sums and products with constants, ReLU, tanh and logistic
-functions, and a clip at its end. Whatever is affine is folded (in float64) into one matrix and bias per layer; a logistic function is a
-tanh of half its input, halved and moved by a half. What is read is proven by the test vectors of the bundle, not by this file.
+Plain means one path from the window to the answer. It has matrix products, sums and products with constants, ReLU, tanh and logistic
+functions, and a clip at its end. Whatever is affine is folded (in float64) into one matrix and bias per layer. A logistic function is a
+tanh of half its input, halved and moved by a half. The test vectors of the bundle prove what is read, not this file.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ Numbers = NDArray[np.float64]
 
 
 class NoPlainNetwork(ValueError):
-    """The graph is no plain multi-layer perceptron; the message says what stands in the way."""
+    """The graph is no plain multi-layer perceptron; the message says why."""
 
 
 def mlp_of(policy_onnx: bytes, windows: NDArray[Any] | None = None) -> MlpNetwork:
-    """The network of a policy file in numpy.
+    """Read the network of a policy file into numpy.
 
     Args:
         policy_onnx: a file that `OnnxPolicy` takes.
-        windows: the participant's beta windows [M, W], whose mean and standard deviation are used where the file has none of its own,
-            so that the fixed-point inputs cover the range of beta.
+        windows: the participant's beta windows [M, W]. Their mean and standard deviation are used where the file has none of its own, so
+            that the fixed-point inputs cover the range of beta.
 
     Raises:
         NoPlainNetwork: the graph holds more than a plain network.
@@ -73,7 +73,7 @@ def _of(constants: dict[str, NDArray[Any]], name: str) -> NDArray[Any]:
 
 
 class _Path:
-    """What has been read so far: finished layers, and behind them an affine map that is not finished yet."""
+    """Part of the graph that has been read so far: finished layers, and after them an affine map that is not finished yet."""
 
     def __init__(self, width: int) -> None:
         self.mean, self.std = np.zeros(width), np.ones(width)  # (x - mean) / std of the window, as long as nothing else has come
@@ -85,7 +85,7 @@ class _Path:
         self.clip: tuple[float | None, float | None] | None = None
 
     def take(self, operator: str, attributes: dict[str, Any], inputs: list[NDArray[Any] | None]) -> None:
-        """Go on by one operator; `inputs` has None where the path enters."""
+        """Read one more operator; `inputs` has None where the path enters."""
         known: dict[str, Callable[[dict[str, Any], list[Any]], None]] = {
             "Gemm": self._gemm, "MatMul": self._matmul, "BatchNormalization": self._batch_normalisation, "Slice": self._slice,
             "ReduceMean": self._reduce_mean, "Clip": self._clip, "Min": self._clip_high, "Max": self._clip_low,
@@ -110,7 +110,7 @@ class _Path:
         return len(self.offset)
 
     def _row(self, value: NDArray[Any]) -> Numbers:
-        """A constant as one number per column."""
+        """Convert a constant to one number per column."""
         return _columns(value, self.size)
 
     def _elementwise(self, operator: str, inputs: list[NDArray[Any] | None]) -> None:
@@ -198,7 +198,7 @@ class _Path:
         self._clip({}, [None, self._row(_other(inputs))])
 
     def network(self, windows: Numbers | None) -> MlpNetwork:
-        """The finished network."""
+        """Return the finished network."""
         if self.size != 1:
             raise NoPlainNetwork(f"it ends with {self.size} values instead of one")
         low, high = self.clip or (None, None)
@@ -218,7 +218,7 @@ class _Path:
         return MlpNetwork(out, mean, std, tuple(activations), output)
 
     def _scale(self, windows: Numbers | None) -> tuple[float, float]:
-        """Mean and standard deviation for the z-scores of all positions of the window."""
+        """Compute mean and standard deviation for the z-scores of all positions of the window."""
         if windows is None or (np.any(self.mean) and np.any(self.std != 1.0)):
             return float(self.mean.mean()) if np.ptp(self.mean) else float(self.mean[0]), float(np.abs(self.std).mean())
         level, spread = float(np.float32(windows.mean())), float(np.float32(windows.std()))
@@ -226,7 +226,7 @@ class _Path:
 
 
 def _columns(value: NDArray[Any], size: int) -> Numbers:
-    """A constant that is broadcast over the windows, as one number per column [size]."""
+    """Convert a constant that is broadcast over the windows to one number per column [size]."""
     value = np.asarray(value, dtype=np.float64)
     if value.size not in (1, size) or (value.ndim and value.size != value.shape[-1]):
         raise NoPlainNetwork(f"a constant of shape {list(value.shape)} meets {size} values")

@@ -44,7 +44,7 @@ footer { margin-top: 10px; color: #51606d; font-size: 8.2pt; }
 
 
 def render(manifest: BundleManifest, model_sha256: str | None) -> str:
-    """The sheet.
+    """Render the sheet.
 
     Args:
         manifest: of the bundle, all but its files.
@@ -99,7 +99,7 @@ _SIGNED_BY = """<div class="lines"><div>Clinician, date: limits checked against 
 
 
 def _blinded(m: BundleManifest, card: PlanCard) -> str:
-    """The sheet of a session of a blinded plan: its letter, common limits and stop rules, and nothing that tells what runs."""
+    """Render the sheet of a session of a blinded plan: its letter, common limits and stop rules, and nothing that reveals what runs."""
     code = escape(m.participant)
     taken = f"First taken by {escape(re.sub(r'[.][0-9]{6} ', ' ', m.taken_by))}. " if m.taken_by else ""
     return f"""<!doctype html>
@@ -119,7 +119,7 @@ def _blinded(m: BundleManifest, card: PlanCard) -> str:
 
 
 def _planned(m: BundleManifest) -> str:
-    """What the sheet of the signed plan says of this session, word for word."""
+    """Repeat what the sheet of the signed plan says of this session, word for word."""
     if m.card is None or m.slot is None:
         return ""
     warned = "".join(f'<div class="warn">{escape(text)}</div>' for text in m.card.warnings)
@@ -145,7 +145,7 @@ def _approval(m: BundleManifest) -> str:
 
 
 def _session(m: BundleManifest) -> str:
-    """Which session of which visit, and that it runs once."""
+    """Say which session of which visit it is for, and that it runs once."""
     slot = m.slot
     if slot is None:
         return '<div class="warn">For no session of a signed plan: runs on the bench alone, with nobody connected.</div>'
@@ -159,7 +159,7 @@ def _session(m: BundleManifest) -> str:
 
 
 def _implausible(m: BundleManifest) -> str:
-    """What else counts as beta that is not to be trusted, as part of a sentence."""
+    """List what else counts as beta that is not to be trusted, as part of a sentence."""
     found = [] if m.beta_max is None else [f"above {m.beta_max:.3g} {escape(m.beta_unit)}"]
     found += [] if m.frozen_after is None else [f"the same {m.frozen_after} times in a row"]
     if m.level_low is not None and m.level_high is not None:
@@ -175,7 +175,7 @@ def _made(m: BundleManifest) -> str:
 
 
 def _when(text: str) -> str:
-    """An ISO 8601 time as people read it; any other text as it is."""
+    """Format an ISO 8601 time for people; any other text stays as it is."""
     try:
         return f"{datetime.fromisoformat(text):%Y-%m-%d %H:%M %Z}".strip()
     except ValueError:
@@ -200,7 +200,7 @@ def _device(m: BundleManifest) -> str:
 
 
 def _scale(m: BundleManifest) -> str:
-    """The amplitudes to scale: the stimulator's own range, the clinician's within it, cDBS marked."""
+    """Draw the amplitudes to scale: the stimulator's own range, the clinician's within it, cDBS marked."""
     top = max(m.max_ma, m.device_max_ma or 0.0) * 1.04
 
     def x(ma: float) -> float:
@@ -258,7 +258,7 @@ def _network(m: BundleManifest) -> list[tuple[str, str]]:
 
 
 def _expected(m: BundleManifest) -> list[tuple[str, str]]:
-    """What the policy asks for on logged beta, or the schedule delivers, and what follows for energy and battery."""
+    """List what the policy requests on logged beta, or the schedule delivers, and what follows for energy and battery."""
     if m.schedule is not None:
         fractions = [hold.amplitude for hold in m.schedule.holds for _ in range(hold.steps)]
         given = [min(max(a * m.cdbs_ma, m.min_ma), m.max_ma) / m.cdbs_ma for a in fractions]
@@ -271,7 +271,7 @@ def _expected(m: BundleManifest) -> list[tuple[str, str]]:
     below = f"below {m.min_ma:g} mA (lowest) in {100 * (m.asked_below_minimum or 0):.0f} %"
     if m.logged_lower_bound is not None and m.asked_below_bound is not None:
         below += f", below {m.logged_lower_bound * m.cdbs_ma:.3g} mA (B, lowest tried at random) in {100 * m.asked_below_bound:.0f} %"
-    if m.card is not None:  # what is predicted of the session stands on its card, and no second number of it here
+    if m.card is not None:  # the card has the prediction of the session, so no second number of it here
         return [("Asked for", f"{asked}; {below}. On logged beta: in closed loop beta answers to the amplitude.")]
     return [
         ("Asked for", f"{asked}; {below}"),

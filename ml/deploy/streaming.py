@@ -1,11 +1,12 @@
 """P_beta as it is known at the end of each period: the definition of `ml/signals` without the samples that are yet to come.
 
-A period's value is the same zero-phase band-pass and the same root mean square over the same samples.
-What differs from the value that is computed afterwards: (1) the filter's right edge lies at the last sample of the period, where it is
-mirrored, instead of in the samples that follow; (2) its left edge lies `CONTEXT_S` before the period, instead of where the recording or a
-long gap left it; (3) samples that have just begun after a long gap are judged by what has come of them, so that too few at the end of a
-period are not counted there, though more follow; (4) short gaps are predicted from the samples of the context and the period alone.
-The measured effect stands in docs/deployment.md.
+A period's value is the same zero-phase band-pass and the same root mean square over the same samples. It differs from the value that is
+computed afterwards in four ways.
+(1) The filter's right edge is at the last sample of the period, where it is mirrored, instead of in the samples that follow.
+(2) Its left edge is `CONTEXT_S` before the period, instead of where the recording or a long gap left it.
+(3) Samples that have just begun after a long gap are assessed by those that have come. So too few at the end of a period are not counted
+there, though more follow.
+(4) Short gaps are predicted from the samples of the context and the period alone. docs/deployment.md has the measured effect.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class StreamingBeta:
         self._pieces.append((start_s, rate_hz, samples))
 
     def value(self, end_s: float) -> float:
-        """P_beta of the period (end_s - period_s, end_s], unit of the samples; NaN where too few samples have come.
+        """Compute P_beta of the period (end_s - period_s, end_s], unit of the samples; NaN where too few samples have come.
 
         Raises:
             ValueError: the band does not fit below half of a stretch's rate.
@@ -66,7 +67,8 @@ class StreamingBeta:
 
 
 def split_by_period(stretches: Sequence[Stretch], period_s: float, periods: int) -> Iterator[list[Stretch]]:
-    """Recorded stretches as they would have come: for each period (k, k + 1] its pieces, in order of time; samples up to 0 in the first."""
+    """Split recorded stretches as they would have come: for each period (k, k + 1] its pieces, in order of time; samples up to 0 in the
+    first."""
     arrivals: list[list[Stretch]] = [[] for _ in range(periods)]
     for start_s, rate_hz, samples in sorted(stretches, key=lambda piece: piece[0]):
         row = np.clip(np.ceil((start_s + np.arange(samples.size) / rate_hz) / period_s - 1e-9).astype(np.int64) - 1, 0, None)
@@ -78,7 +80,7 @@ def split_by_period(stretches: Sequence[Stretch], period_s: float, periods: int)
 
 
 def _since(piece: Stretch, t_s: float) -> Stretch:
-    """The part of a stretch from a time on."""
+    """Cut a stretch to the part from a time on."""
     start_s, rate_hz, samples = piece
     skip = max(0, math.ceil((t_s - start_s) * rate_hz))
     return start_s + skip / rate_hz, rate_hz, samples[skip:]

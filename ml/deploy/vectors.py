@@ -34,12 +34,12 @@ class Step:
 
     @property
     def finite(self) -> bool:
-        """Whether beta is a number."""
+        """True where beta is a number."""
         return math.isfinite(self.beta)
 
 
 def edge_windows(windows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The windows given, and windows of many scales that drive the network into saturation. Shape [M + 10, W]."""
+    """Add windows of many scales that drive the network into saturation to the windows given. Shape [M + 10, W]."""
     level = float(np.abs(windows).mean()) or 1.0
     ramp = np.linspace(0.0, 2.0, windows.shape[1])
     return np.concatenate([windows, *(np.stack([np.ones_like(ramp), ramp]) * level * scale for scale in _SCALES)])
@@ -57,8 +57,8 @@ def session(manifest: BundleManifest, controller: BoundedController, windows: ND
 
 
 def _script(manifest: BundleManifest, signal: Signal, betas: NDArray[np.float64]) -> Iterator[tuple[float, BetaSample | None]]:
-    """Times and samples: start, NaN, negative, silence, wrong unit, wrong source, late, huge, zero, gap; then, where limits say what they
-    are, frozen, saturated and another level; an early decision."""
+    """Yield times and samples: start, NaN, negative, silence, wrong unit, wrong source, late, huge, zero, gap. Then, where limits define
+    them, frozen, saturated and another level; an early decision."""
     period, w = manifest.period_s, manifest.window
     level = float(betas.mean()) or 1.0
     values = iter(np.resize(betas, 60 * (w + 8)).tolist())
@@ -107,7 +107,7 @@ def _script(manifest: BundleManifest, signal: Signal, betas: NDArray[np.float64]
 
 
 def to_json(windows: NDArray[np.float64], expected: NDArray[np.float64], steps: Sequence[Step]) -> bytes:
-    """The file `test_vectors.json`; no number comes as null in `beta`, no sample as null in `t_s`."""
+    """Write the file `test_vectors.json`; no number comes as null in `beta`, no sample as null in `t_s`."""
     rows: list[dict[str, Any]] = [
         {
             "now_s": s.now_s,

@@ -25,7 +25,7 @@ class PolicyWindow:
         self._window[0, -1] = beta
 
     def fraction(self) -> float:
-        """Amplitude fraction for the window as it stands. Raises ValueError for an answer that is not one number."""
+        """Compute the amplitude fraction for the current window. Raises ValueError for an answer that is not one number."""
         answer = np.asarray(self._policy.act(self._window), dtype=np.float64)
         if answer.shape != (1,):
             raise ValueError(f"answer of shape {list(answer.shape)} instead of [1]")

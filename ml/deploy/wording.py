@@ -8,7 +8,7 @@ from ml.energy import saving_percent
 
 
 def warning_sentences(manifest: BundleManifest) -> list[str]:
-    """The bundle's warnings for the clinician; empty where nothing stands out."""
+    """Write the bundle's warnings for the clinician as sentences; empty where there are none."""
     return [_sentence(warning, manifest) for warning in warnings(manifest)]
 
 
@@ -23,7 +23,7 @@ def _sentence(warning: BundleWarning, m: BundleManifest) -> str:
 
 
 def energy_words(energy_of_cdbs: float) -> str:
-    """Stimulation energy against cDBS."""
+    """Describe stimulation energy against cDBS."""
     saved = saving_percent(energy_of_cdbs, 1.0)
     if abs(saved) < 0.5:
         return "as much stimulation energy as cDBS"
@@ -31,7 +31,7 @@ def energy_words(energy_of_cdbs: float) -> str:
 
 
 def battery_life_words(energy_of_cdbs: float, charge_of_cdbs: float) -> str:
-    """Battery life against cDBS, with the assumption that it rests on."""
+    """Describe battery life against cDBS, with the assumption that it rests on."""
     gain = battery_gain(energy_of_cdbs, charge_of_cdbs)
     share = f"{100 * STIMULATION_SHARE.low:.0f} to {100 * STIMULATION_SHARE.high:.0f} %"
     return (
@@ -41,5 +41,5 @@ def battery_life_words(energy_of_cdbs: float, charge_of_cdbs: float) -> str:
 
 
 def battery_words(energy_of_cdbs: float, charge_of_cdbs: float) -> str:
-    """Energy and battery life in one sentence."""
+    """Describe energy and battery life in one sentence."""
     return f"{energy_words(energy_of_cdbs)}; {battery_life_words(energy_of_cdbs, charge_of_cdbs)}"

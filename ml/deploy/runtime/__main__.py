@@ -48,7 +48,8 @@ ENDED_WELL = (End.COMPLETE, End.STOPPED)
 
 
 def main(arguments: list[str]) -> int:
-    """Exit code 0: everything agrees, and the session came to its end; 1: something did not, said on standard error."""
+    """Run the command. Exit code 0: everything agrees, and the session came to its end; 1: something did not, as standard error
+    explains."""
     folder, options = _read(arguments)
     try:
         key = None if "--key" not in options else public_key(options["--key"])
@@ -65,7 +66,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"this bundle cannot be used: {error}\n")
         return 1
     said = "signature right, " if key else ""
-    # of a schedule no fraction is compared, so that the difference tells what runs
+    # of a schedule no fraction is compared, so that the difference would reveal what runs
     how = "" if is_blinded(manifest) else f": worst difference {worst:.3g} of a fraction, {worst_ma:.3g} mA"
     sys.stderr.write(f"{said}test vectors agree{how}\n")
     controller = make_controller(manifest, network)
@@ -75,7 +76,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _tell_time(manifest: dict[str, Any], controller: BoundedController, decisions: int) -> None:
-    """Measure and tell what a decision takes; of a blinded session it stands in the log alone, for it tells the network's size."""
+    """Log the time per decision. Hide it from a blinded screen: it reveals the network's size."""
     if is_blinded(manifest):
         sys.stdout.write(f"{_what(manifest)}: what a decision takes stands masked in its log\n")
         return
@@ -83,7 +84,7 @@ def _tell_time(manifest: dict[str, Any], controller: BoundedController, decision
 
 
 def _read(arguments: list[str]) -> tuple[Path, dict[str, str]]:
-    """The folder, and the options with their values, written `--name=value` or `--name value`."""
+    """Parse the folder, and the options with their values, written `--name=value` or `--name value`."""
     folder, options, waits = Path("."), {}, ""
     for argument in arguments:
         name, given, value = argument.partition("=")
@@ -98,7 +99,7 @@ def _read(arguments: list[str]) -> tuple[Path, dict[str, str]]:
 
 
 def _what(manifest: dict[str, Any]) -> str:
-    """Whose controller it is, and of which size: the paper compares full policies with distilled ones."""
+    """Name the controller's owner and its size: the paper compares full policies with distilled ones."""
     slot = manifest.get("slot") or {}
     if is_blinded(manifest):
         return f"{manifest['participant']}, session {manifest['card']['head']}, blinded"
@@ -108,7 +109,7 @@ def _what(manifest: dict[str, Any]) -> str:
 
 
 def public_key(text: str) -> bytes:
-    """The 32 bytes of a key given as digits or as a file with them. Raises ValueError, OSError."""
+    """Read the 32 bytes of a key given as digits or as a file with them. Raises ValueError, OSError."""
     digits = text.strip()
     if not re.fullmatch(r"[0-9a-fA-F]{64}", digits):
         digits = Path(text).read_text("ascii").strip()
@@ -127,7 +128,7 @@ def check_files(folder: Path, manifest: dict[str, Any], raw: bytes, key: bytes |
 
 
 def check(manifest: dict[str, Any], network: MlpNetwork | None, vectors: dict[str, Any]) -> tuple[float, float]:
-    """Worst differences of fractions and of decisions (mA) from the test vectors. Raises ValueError where one is too large."""
+    """Compute the worst differences of fractions and of decisions (mA) from the test vectors. Raises ValueError where one is too large."""
     worst = worst_ma = 0.0
     if network is not None:
         worst = float(np.abs(network.act(np.array(vectors["windows"])) - np.array(vectors["expected"])).max())
@@ -147,7 +148,7 @@ def check(manifest: dict[str, Any], network: MlpNetwork | None, vectors: dict[st
 
 
 def make_controller(manifest: dict[str, Any], network: MlpNetwork | None) -> BoundedController:
-    """The network or schedule of a manifest within its limits. Raises ValueError, KeyError, TypeError for a manifest that is none."""
+    """Make the network or schedule of a manifest within its limits. Raises ValueError, KeyError, TypeError for a manifest that is none."""
     stated = {name: manifest[name] for name in _LIMITS} | {name: manifest.get(name) for name in _OPTIONAL_LIMITS}
     limits, said = EnvelopeLimits(**stated), Signal(manifest["beta_unit"], manifest["beta_source"])
     if manifest.get("schedule"):
@@ -211,7 +212,7 @@ def _report(outcome: Outcome) -> int:
 
 
 def open_link(where: str) -> QueueLink:
-    """The device side at `-`, `tcp:PORT` or `tail:FILE`. Raises ValueError for another text, OSError for a port that is taken."""
+    """Open the device side at `-`, `tcp:PORT` or `tail:FILE`. Raises ValueError for another text, OSError for a port that is taken."""
     kind, _, rest = where.partition(":")
     if where == "-":
         return from_lines(sys.stdin)
@@ -225,16 +226,16 @@ def open_link(where: str) -> QueueLink:
 
 
 def _stop_on_signals(link: QueueLink) -> None:
-    """Have Ctrl-C and a stop of the system end the session as the stop button does: on clinical settings, with its log whole."""
+    """Make Ctrl-C and a stop of the system end the session as the stop button does: on clinical settings, with its log whole."""
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, lambda *_: link.put(Event.STOP))
 
 
 def replay(manifest: dict[str, Any], manifest_sha256: str, controller: BoundedController, log: Path | None) -> None:
-    """One lone number per period from standard input, as fast as they come, amplitudes and reasons out: for tests of a bundle.
+    """Read one lone number per period from standard input, as fast as they come; write amplitudes and reasons. For tests of a bundle.
 
     Raises:
-        LogFailed: the log is there already or cannot be written. BrokenPipeError: nobody reads the amplitudes.
+        LogFailed: the log is there already or cannot be written. BrokenPipeError: the reader of the amplitudes is gone.
     """
     facts = describe(manifest, manifest_sha256, controller, Tablet(ledger=Ledger(LEDGER)).now(), "replay")
     sink = None if log is None else LogFile(log, manifest["period_s"], facts)

@@ -1,8 +1,8 @@
 """The control loop: one decision per period by the runner's own clock, whatever the device side sends or does not send.
 
-Every period has a time at which its beta amplitude is due. One that comes in time is decided on as it comes; where none has come within
-`GRACE` of a period the decision is made without it, and the envelope answers with cDBS. One that comes late is taken into the window and
-decided on with the next one. Periods that a standstill of the tablet has cost are not made up for.
+Every period has a time at which its beta amplitude is due. One that comes in time is decided on as it comes. Where none has come within
+`GRACE` of a period, the decision is made without it, and the envelope answers with cDBS. One that comes late enters the window and is
+decided on with the next one. Periods lost to a standstill of the tablet are not made up for.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LEAD_S = 300.0
 
 
 class End(StrEnum):
-    """How a session ended; always on clinical settings."""
+    """End of a session; always on clinical settings."""
 
     COMPLETE = "complete"
     STOPPED = "stopped"
@@ -62,7 +62,7 @@ class LiveSession:
         over: whether the day that the bundle is for has ended; asked at every decision. charge: of the tablet's battery, per cent.
 
     Attributes:
-        rows: of the log, so far. missed: how many of them came after periods that were lost to a standstill. detail: of the end, in words.
+        rows: of the log, so far. missed: the number of rows after periods that were lost to a standstill. detail: of the end, in words.
     """
 
     controller: BoundedController
@@ -115,7 +115,7 @@ class LiveSession:
         return self._end or End.FAULT
 
     def _collect(self, n: int) -> tuple[BetaSample | None, list[str]]:
-        """What comes until period n is to be decided on: its beta amplitude, and what was wrong with the link."""
+        """Collect what comes until period n is to be decided on: its beta amplitude, and the faults of the link."""
         fresh: BetaSample | None = None
         faults: list[str] = []
         last_s = self._began_s + self.decisions[-1].t_s if self.decisions else -math.inf
@@ -170,7 +170,7 @@ class LiveSession:
         return taken.sample
 
     def _distrust(self, what: str, faults: list[str]) -> None:
-        """Start the window anew."""
+        """Start the window again."""
         self.controller.envelope.forget()
         self._phase_known = False
         if len(faults) < 3:
@@ -182,7 +182,7 @@ class LiveSession:
             self._window.append(sample.beta)
 
     def _clock(self) -> float:
-        """Seconds since the start."""
+        """Compute the seconds since the start."""
         return self.link.now() - self._began_s
 
     def _since_start(self, sample: BetaSample) -> BetaSample:
@@ -248,7 +248,7 @@ class LiveSession:
             self.detail += f"; and {error}"
 
     def _say_end(self) -> None:
-        """The last line: clinical settings."""
+        """Send the last line: clinical settings."""
         try:
             self.link.send(end_line(len(self.decisions), self._clock(), self._limits.cdbs_ma, (self._end or End.FAULT).value))
         except DeviceGone as error:

@@ -14,7 +14,7 @@ class WindowNetwork(Protocol):
         """Move the window on by one beta amplitude."""
 
     def fraction(self) -> float:
-        """Amplitude fraction for the window as it stands."""
+        """Compute the amplitude fraction for the current window."""
 
 
 class BoundedController:
@@ -33,7 +33,7 @@ class BoundedController:
         self.envelope = Envelope(limits, signal)
 
     def fresh(self) -> BoundedController:
-        """The same at the start of a session; the network is shared, and its window is filled before it is asked."""
+        """Copy the controller at the start of a session; the network is shared, and its window is filled before it is asked."""
         return BoundedController(self.network, self.envelope.limits, self.envelope.signal)
 
     def observe(self, now_s: float, sample: BetaSample) -> int:

@@ -1,8 +1,8 @@
 """The log of a controller: a kind line, a line that says whose session it is, a header, and one row per decision.
 
-The row of a decision holds the beta amplitude of the period that ended at `due_s`, and the amplitude decided for the time from `t_s` to the
-next decision's: beta and amplitude of one row are those of two steps. Readers know it by its first line. The second line is JSON, so that
-an uploaded log finds the session that it is of; versions before 3 lack it.
+The row of a decision has the beta amplitude of the period that ended at `due_s`. Its amplitude applies from `t_s` to the next decision's.
+So beta and amplitude of one row are those of two steps. Readers recognise the file by its first line. The second line is JSON, so that an
+uploaded log finds its session; versions before 3 lack it.
 """
 
 from __future__ import annotations
@@ -60,17 +60,17 @@ class Row(NamedTuple):
 
 
 def kind_line(period_s: float) -> str:
-    """The first line of a log, without its end."""
+    """Write the first line of a log, without its end."""
     return f"# betaloop controller log, version {VERSION}, period {period_s:g} s"
 
 
 def description_line(facts: Mapping[str, Any]) -> str:
-    """The second line of a log, without its end."""
+    """Write the second line of a log, without its end."""
     return "# " + json.dumps(facts, sort_keys=True, ensure_ascii=True, allow_nan=False)
 
 
 def cells(row: Row) -> list[Any]:
-    """A row, in the order of `COLUMNS`."""
+    """List the cells of a row, in the order of `COLUMNS`."""
     sample, decision = row.sample, row.decision
     shown = row.window[len(row.window) - decision.valid :] if decision.valid else []
     hold, log_density = row.drawn or ("", None)
@@ -101,20 +101,21 @@ def cells(row: Row) -> list[Any]:
 
 
 def seal_facts(facts: Mapping[str, Any], nonce: str) -> str:
-    """What the head of a blinded log says, as text that tells nothing by its look or length."""
+    """Seal the head of a blinded log, as text that reveals nothing by its look or length."""
     plain = json.dumps(facts, sort_keys=True, allow_nan=False).encode().ljust(FACTS_BYTES)
     return nonce + mask(plain, nonce, "facts").hex()
 
 
 def seal_row(number: int, drawn: tuple[int, float | None] | None, nonce: str) -> str:
-    """Hold and log density of a row, as text of one length; -1 and NaN where nothing was drawn."""
+    """Seal hold and log density of a row, as text of one length; -1 and NaN where nothing was drawn."""
     hold, density = drawn or (-1, None)
     plain = _ROW.pack(hold, float("nan") if density is None else density)
     return f"{number}:{mask(plain, nonce, f'row {number}').hex()}"
 
 
 def masked(row: Row, number: int, nonce: str) -> list[Any]:
-    """A row of a blinded session: no draws, no timing, no request and no reason of the controller's, which tell a network from a schedule.
+    """Mask a row of a blinded session: no draws, no timing, no request and no reason of the controller. Any of them separates a network
+    from a schedule.
 
     The amplitude is as it was.
     """
@@ -155,7 +156,7 @@ class LogFile:
         self._rows += 1
 
     def close(self) -> None:
-        """Raises LogFailed where what was written cannot be kept."""
+        """Close the file. Raises LogFailed where what was written cannot be kept."""
         try:
             self._stream.close()
         except OSError as error:

@@ -14,7 +14,7 @@ LATEST = 0.5  # a message may come this share of a period late before it counts 
 
 
 class DeviceSide:
-    """What is stimulated with, and why.
+    """Amplitude of the stimulation, and its reason.
 
     Args:
         participant, side: who is connected; `-` for a side that is not stated. clinical_ma: cDBS amplitude, as programmed.
@@ -49,7 +49,7 @@ class DeviceSide:
         return None
 
     def look(self, now_s: float) -> float:
-        """The amplitude in force, mA; ask several times per period. With the watchdog's messages missing: clinical settings."""
+        """Return the amplitude in force, mA; call it several times per period. With the watchdog's messages missing: clinical settings."""
         if not self.over and self._last_s is not None and now_s - self._last_s > (self._watchdog + LATEST) * self._period_s:
             self._clinical("watchdog")
         return self.amplitude_ma
@@ -86,7 +86,7 @@ def main(port: int, participant: str, side: str, unit: str, source: str) -> int:
 
 
 def _received(link: socket.socket) -> bytes:
-    """What has come within a moment; nothing where the runner is gone, too: the watchdog sees to that."""
+    """Receive what has come within a moment; nothing where the runner is gone, too: the watchdog sees to that."""
     try:
         content = link.recv(4096)
     except OSError:

@@ -1,15 +1,15 @@
-"""The safety envelope: what stands between a network's wish and the stimulator. `ml/deploy/c_envelope.py` holds the same rules in C.
+"""The safety envelope between a network's request and the stimulator. `ml/deploy/c_envelope.py` has the same rules in C.
 
 It knows nothing of how the fraction was made. Every period it decides on one amplitude in milliamperes, and says why:
 
 * amplitudes lie within the clinician's limits, always;
-* from one decision to the next the amplitude moves by no more than the ramp limit times the time between them, and never by more than the
-  ramp limit times one period, however late a decision comes;
-* beta that has not come when it was due, is not a number, negative, of another unit or source, or not yet a whole window without a gap,
-  beta that is saturated, frozen or on a level that was never logged (where the limits say what that is), and a network that fails or
-  answers outside [0, 1], give the cDBS amplitude in the very decision in which that is found. This return to the programmed therapy is
-  *not* ramped: a ramp would leave the participant under-treated for some periods on a signal that nobody trusts. It is the one exception
-  to the ramp limit;
+* from one decision to the next the amplitude moves by no more than the ramp limit times the time between them. However late a decision
+  comes, it moves by no more than the ramp limit times one period;
+* untrusted beta, or a network that fails or answers outside [0, 1], gives the cDBS amplitude in the very decision in which that is found.
+  Untrusted is beta that has not come when it was due, is not a number, negative, or of another unit or source. So is beta without a whole
+  window without a gap. Where the limits define them, so is beta that is saturated, frozen or on a level that was never logged. This return
+  to the programmed therapy is *not* ramped: a ramp would leave the participant under-treated for some periods on an untrusted signal. It is
+  the one exception to the ramp limit;
 * the network is asked again once a whole window of valid beta amplitudes has come; from cDBS the amplitude then moves at the ramp limit.
 """
 
@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 SPACING_TOLERANCE = 0.5
 """Two beta amplitudes may lie this share of a period closer or farther than one period; beyond, the window has a gap."""
 STALE_AFTER = 0.9
-"""A beta amplitude older than this share of a period is stale: the next one is due, and a decision in time finds that it has not come. A
+"""Share of a period after which a beta amplitude is stale. The next one is due then, and a decision in time finds that it has not come. A
 tenth of a period is left for the jitter of the decisions."""
 RANGE_TOLERANCE = 1e-4
 """A fraction this far outside [0, 1] is rounding and is cut; farther outside it is a fault."""
@@ -36,7 +36,7 @@ FLAG_MA = 1e-4
 
 
 class Reason:
-    """Why a decision differs from the network's wish: bits of `Decision.reasons`, the same in the C header."""
+    """Reason why a decision differs from the network's request: bits of `Decision.reasons`, the same in the C header."""
 
     NO_BETA = 1  # no beta amplitude has come yet
     STALE_BETA = 2  # the newest beta amplitude is too old
@@ -44,12 +44,12 @@ class Reason:
     WRONG_SIGNAL = 8  # the beta amplitude is of another unit or source than the network was trained on
     WINDOW_INCOMPLETE = 16  # fewer than W valid beta amplitudes since the start or the last fault
     WINDOW_GAP = 32  # the beta amplitude is not one period after the one before
-    LATE_SAMPLE = 64  # a beta amplitude not newer than the last one, or from the future, was left out
+    LATE_SAMPLE = 64  # a beta amplitude not newer than the last one, or from the future, was ignored
     POLICY_FAILED = 128  # the network raised an error
     POLICY_OUTPUT = 256  # the network's answer is no fraction in [0, 1]
     MINIMUM = 512  # raised to the clinician's minimum
     MAXIMUM = 1024  # lowered to the clinician's maximum
-    RAMP = 2048  # held back by the ramp limit
+    RAMP = 2048  # limited by the ramp limit
     SATURATED_BETA = 4096  # the beta amplitude is above what any recording of the participant makes plausible
     FROZEN_BETA = 8192  # the same beta amplitude came again and again
     BETA_LEVEL = 16384  # the mean of the window is far from every level that was logged: another unit, a loose contact
@@ -59,11 +59,11 @@ class Reason:
 _NOTES = Reason.LATE_SAMPLE | Reason.WINDOW_GAP  # no trouble in themselves: the window that they leave behind is judged
 REASON_NAMES = {value: name.lower() for name, value in vars(Reason).items() if name.isupper()}
 OF_THE_CONTROLLER = Reason.POLICY_FAILED | Reason.POLICY_OUTPUT | Reason.MINIMUM | Reason.MAXIMUM | Reason.RAMP
-"""Reasons that cDBS, one amplitude within its limits, never gives: they tell a blinded session's controller."""
+"""Reasons that cDBS, one amplitude within its limits, never gives: they reveal a blinded session's controller."""
 
 
 def reason_names(reasons: int) -> tuple[str, ...]:
-    """Names of the bits, lowest first."""
+    """Name the bits, lowest first."""
     return tuple(name for bit, name in REASON_NAMES.items() if reasons & bit)
 
 
@@ -73,13 +73,13 @@ class EnvelopeLimits:
 
     Attributes:
         min_ma, max_ma: lowest and highest amplitude, mA.
-        cdbs_ma: cDBS amplitude, mA: what fraction 1 means, and the fall-back. Lies within the limits.
+        cdbs_ma: cDBS amplitude, mA: what fraction 1 means, and the fall-back. It is within the limits.
         ramp_ma_per_s: fastest change of the amplitude, mA per second.
         window: W, beta amplitudes per decision.
         period_s: m, seconds per decision.
         max_beta_age_s: age above which a beta amplitude is stale, less than one period; None means `STALE_AFTER` of a period.
-        beta_max: beta amplitude above which the input counts as saturated; None where nobody knows.
-        level_low, level_high: range of the mean of a window, in the unit of the beta amplitudes; None where nobody knows.
+        beta_max: beta amplitude above which the input counts as saturated; None where it is unknown.
+        level_low, level_high: range of the mean of a window, in the unit of the beta amplitudes; None where it is unknown.
         frozen_after: so many equal beta amplitudes in a row count as frozen, 2 or more; None leaves them uncounted.
 
     Raises:
@@ -128,7 +128,7 @@ class EnvelopeLimits:
 
 
 class Signal(NamedTuple):
-    """What a beta amplitude is: its unit and how it was made."""
+    """Unit of a beta amplitude, and how it was made."""
 
     unit: str
     source: str
@@ -148,7 +148,7 @@ class Decision(NamedTuple):
     Attributes:
         t_s: time of the decision, seconds.
         amplitude_ma: amplitude to deliver, mA.
-        fallback: True when the cDBS amplitude stands in for the network.
+        fallback: True when the cDBS amplitude replaces the network's.
         reasons: bits of `Reason`; 0 when the network's wish was delivered as it is.
         fraction: the network's answer as it came; None where it was not asked or failed.
         requested_ma: the wish in mA, before the limits; None where there was none.
@@ -168,7 +168,7 @@ class Decision(NamedTuple):
     detail: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """The entry for a log; numbers that are not finite become None, as JSON has none."""
+        """Convert the decision to an entry for a log; numbers that are not finite become None, as JSON has none."""
         values = self._asdict() | {"reasons": list(reason_names(self.reasons))}
         return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
 
@@ -203,12 +203,12 @@ class Envelope:
         self._last_beta, self._equal, self._level = -1.0, 0, 0.0
 
     def forget(self) -> None:
-        """Trust nothing that came so far, as after a break of the link: cDBS until a whole window has come anew."""
+        """Trust nothing that came so far, as after a break of the link: cDBS until a whole new window has come."""
         self._last_sample_s, self._streak, self._equal = None, 0, 0
 
     def begin(self, now_s: float) -> None:
-        """Start a decision: when the clock has run back, what came before it is forgotten, so that a corrected clock does not lock the
-        network out."""
+        """Start a decision. When the clock has run back, what came before is forgotten, so that a corrected clock does not lock the network
+        out."""
         if self._last_sample_s is not None and now_s < self._last_sample_s - _TIME_EPSILON_S:
             self._last_sample_s, self._streak = None, 0
         if self._last_decision_s is not None and now_s < self._last_decision_s:
@@ -241,7 +241,7 @@ class Envelope:
         return reasons, True
 
     def _implausible(self, beta: float) -> int:
-        """Whether a beta amplitude is saturated, or one of a row of equal ones; as float32, which is what every runtime compares."""
+        """Detect a beta amplitude that is saturated, or one of a row of equal ones; as float32, which is what every runtime compares."""
         beta = _float32(beta)
         self._equal = self._equal + 1 if beta == self._last_beta and self._equal else 1
         self._last_beta = beta
@@ -291,11 +291,11 @@ class Envelope:
         return Decision(now_s, amplitude, False, reasons, fraction, requested, age, self._streak)
 
     def _most_ma(self, now_s: float) -> float:
-        """The largest change that the ramp limit allows at this decision, mA."""
+        """Compute the largest change that the ramp limit allows at this decision, mA."""
         period = self.limits.period_s
         last = self._last_decision_s
         elapsed = period if last is None else now_s - last
-        if not elapsed > 0:  # a clock that stands, has run back or is not a number
+        if not elapsed > 0:  # a clock that has stopped, has run back or is not a number
             return 0.0
         self._last_decision_s = now_s
         return self.limits.ramp_ma_per_s * min(elapsed, period)
@@ -306,7 +306,7 @@ def _float32(value: float) -> float:
 
 
 def _asked(ask: Callable[[], float]) -> tuple[float | None, int, str]:
-    """The network's fraction; or why it cannot be used."""
+    """Ask the network for its fraction; or return why it cannot be used."""
     try:
         fraction = float(ask())
     except Exception as error:  # whatever a network does, the participant is stimulated: the fault goes into the log

@@ -1,6 +1,6 @@
-"""Where lines of a device side come from: standard input, a TCP connection on loopback, a file that grows. Each is read by a thread.
+"""Sources of the lines of a device side: standard input, a TCP connection on loopback, a file that grows. Each is read by a thread.
 
-The runner waits on one queue, with its own clock: what sends and what is sent to may stand still or go away, and the loop goes on.
+The runner waits on one queue, with its own clock. Sender and receiver may stop or go away, and the loop goes on.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ MOST_WAITING = 1000
 
 
 class Event(Enum):
-    """What came."""
+    """Event other than a line."""
 
     LINE = "line"
     LOST = "lost"  # the device is gone; another may come
     ENDED = "ended"  # nothing more will come
-    STOP = "stop"  # somebody at the tablet ends the session
+    STOP = "stop"  # a person at the tablet ends the session
 
 
 class Arrival(NamedTuple):
@@ -44,24 +44,24 @@ class Arrival(NamedTuple):
 
 
 class DeviceGone(OSError):
-    """Nobody takes the amplitudes any more."""
+    """The receiver of the amplitudes is gone."""
 
 
 class Link(Protocol):
     """Both directions between the runner and a device side, and the clock."""
 
     def now(self) -> float:
-        """Seconds on a clock that never runs back and does not stand still while the tablet sleeps."""
+        """Read a clock that never runs back and does not stop while the tablet sleeps, in seconds."""
 
     def next(self, until_s: float) -> Arrival | None:
-        """What came next; None where nothing came until a time of the clock."""
+        """Wait for what comes next; None where nothing came until a time of the clock."""
 
     def send(self, line: str) -> None:
-        """Hand a line over. Raises DeviceGone where nobody takes it."""
+        """Hand a line over. Raises DeviceGone where there is no receiver."""
 
 
 def monotonic_s() -> float:
-    """Seconds since the machine started, its sleep included: a beta amplitude of before the tablet slept is old."""
+    """Count the seconds since the machine started, its sleep included: a beta amplitude from before a sleep is old."""
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
@@ -77,7 +77,7 @@ class QueueLink:
         self._write = write or _to_standard_output
 
     def now(self) -> float:
-        """As `Link.now`."""
+        """Read the clock, as `Link.now`."""
         return monotonic_s()
 
     def put(self, event: Event, text: str = "") -> None:
@@ -86,14 +86,14 @@ class QueueLink:
             self._arrivals.put(Arrival(self.now(), event, text))
 
     def next(self, until_s: float) -> Arrival | None:
-        """As `Link.next`."""
+        """Wait for the next arrival, as `Link.next`."""
         try:
             return self._arrivals.get(timeout=max(0.0, until_s - self.now()))
         except Empty:
             return None
 
     def send(self, line: str) -> None:
-        """As `Link.send`."""
+        """Hand a line over, as `Link.send`."""
         try:
             self._write(line)
         except OSError as error:
@@ -101,7 +101,7 @@ class QueueLink:
 
 
 def from_lines(lines: Iterable[str]) -> QueueLink:
-    """Lines as they come, such as those of standard input; their end ends the session."""
+    """Read lines as they come, such as those of standard input; their end ends the session."""
     link = QueueLink()
 
     def pump() -> None:
@@ -116,7 +116,7 @@ def from_lines(lines: Iterable[str]) -> QueueLink:
 
 
 def from_growing_file(path: Path) -> QueueLink:
-    """Whole lines that are added to a file from now on. A file that shrinks, or goes, is a lost device."""
+    """Read whole lines that are added to a file from now on. A file that shrinks, or goes, is a lost device."""
     link, follower = QueueLink(), _Follower(path)
 
     def pump() -> None:
@@ -130,7 +130,7 @@ def from_growing_file(path: Path) -> QueueLink:
 
 
 class _Follower:
-    """What a file has got since the last look; what stood there at first is past."""
+    """Text that a file has got since the last look; its first content is past."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._rest = path, b""
@@ -168,7 +168,7 @@ class LoopbackLink(QueueLink):
     """One device side at a time on a port of this machine alone; lines in both directions over the one connection.
 
     Args:
-        port: 0 for any free one, which `port` then tells.
+        port: 0 for any free one, which `port` then gives.
 
     Raises:
         OSError: the port cannot be opened.
@@ -183,7 +183,7 @@ class LoopbackLink(QueueLink):
         _start(self._accept)
 
     def _to_device(self, line: str) -> None:
-        """Send to whoever is connected. One that takes nothing is cut off: the loop waits for nobody."""
+        """Send to the connected device. One that takes nothing is cut off: the loop never waits."""
         if line.startswith("controller "):
             self._greeting = line
         device = self._device
@@ -240,7 +240,7 @@ def _to_standard_output(line: str) -> None:
 
 
 def give_up_standard_output() -> None:
-    """After its reader went away: what is left to write at exit goes nowhere."""
+    """Redirect standard output after its reader went away: what is left to write at exit goes nowhere."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

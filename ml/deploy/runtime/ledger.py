@@ -1,8 +1,8 @@
-"""Which slots this tablet has run: a folder with one file per slot, made before the first amplitude and never taken back.
+"""Slots that this tablet has run: a folder with one file per slot, made before the first amplitude and never taken back.
 
-A file is made whole or not at all, and reaches the disk before stimulation changes: a process that is killed, a second one that starts at
-the same time, and a bundle of the same slot taken anew all find it. What was withdrawn, and the latest time that the tablet has seen, are
-remembered too, so that a clock that is set back opens nothing.
+A file is made whole or not at all, and reaches the disk before stimulation changes. So it is found by a process that was killed, by a
+second one that starts at the same time, and by a new bundle of the same slot. Withdrawals, and the latest time that the tablet has seen,
+are remembered too. So a clock that is set back opens nothing.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class Ledger:
     folder: Path
 
     def check_clock(self, now: datetime) -> None:
-        """Raise NotAllowed where the tablet's clock stands on a day before one that it has shown already.
+        """Raise NotAllowed where the tablet's clock is on a day before one that it has shown already.
 
-        Within a day a clock that was fast may be set right: that opens nothing, for a slot runs on its own day alone and once, and what was
-        withdrawn is remembered.
+        Within a day a clock that was fast may be set right. That opens nothing: a slot runs once, on its own day alone, and withdrawals are
+        remembered.
         """
         latest = self._latest()
         if latest is not None and now < latest - CLOCK_TOLERANCE and now.date() < latest.astimezone(now.tzinfo).date():
@@ -54,7 +54,7 @@ class Ledger:
         self._replace(_WITHDRAWN, withdrawals_body(withdrawn))
 
     def withdrawn(self) -> Withdrawals | None:
-        """The newest list of withdrawals that this tablet was given."""
+        """Read the newest list of withdrawals that this tablet was given."""
         try:
             return withdrawals_of(json.loads((self.folder / _WITHDRAWN).read_bytes()))
         except FileNotFoundError:
@@ -111,7 +111,7 @@ class Ledger:
 
 
 def _used(slot: Slot, lines: list[str]) -> NotAllowed:
-    """What is known of a run that was begun."""
+    """Describe what is known of a run that was begun."""
     try:
         notes: dict[str, Any] = {}
         for line in lines:
@@ -131,7 +131,7 @@ def _used(slot: Slot, lines: list[str]) -> NotAllowed:
 
 
 def _last_row(log: Path) -> str:
-    """How far a log came; nothing where there is none."""
+    """Describe how far a log came; nothing where there is none."""
     try:
         with log.open(encoding="utf-8", newline="") as stream:
             rows = list(csv.DictReader(line for line in stream if not line.startswith("#") and line.endswith("\n")))

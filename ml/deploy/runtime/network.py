@@ -16,8 +16,8 @@ _ZERO = np.zeros(1, dtype=np.float32)  # an array: a Python number would be conv
 
 
 class Output(NamedTuple):
-    """How the last sum x becomes a fraction: gain * tanh(x) + offset (`tanh`) or gain * x + offset (`linear`), cut to [low, high] where
-    these are stated."""
+    """Conversion of the last sum x to a fraction: gain * tanh(x) + offset (`tanh`) or gain * x + offset (`linear`), cut to [low, high]
+    where these are stated."""
 
     kind: str = "tanh"
     gain: float = 0.5
@@ -89,7 +89,7 @@ class MlpNetwork:
         self._scores[self._newest] = (beta - self.mean) / self.std
 
     def fraction(self) -> float:
-        """Amplitude fraction for the window as it stands."""
+        """Compute the amplitude fraction for the current window."""
         dot, maximum = np.dot, np.maximum
         for matrix, inputs, outputs, relu in self._steps:
             if relu:
@@ -104,7 +104,8 @@ class MlpNetwork:
         return min(max(answer, self._limits[0]), self._limits[1])
 
     def act(self, states: NDArray[Any], tanh: Callable[[Any], Any] = np.tanh) -> NDArray[np.float64]:
-        """Amplitude fractions, shape [N], for beta windows [N, W]; the window kept inside does not move. `tanh`: on float32 arrays."""
+        """Compute amplitude fractions, shape [N], for beta windows [N, W]; the network's own window does not move. `tanh`: on float32
+        arrays."""
         hidden = ((np.asarray(states, dtype=np.float32) - np.float32(self.mean)) / np.float32(self.std)).T
         for (weights, biases), kind in zip(self.layers, self.activations, strict=False):
             total = weights @ hidden + biases[:, None]
@@ -116,7 +117,7 @@ class MlpNetwork:
         return np.asarray(answer if self._limits is None else np.clip(answer, *self._limits), dtype=np.float64)
 
     def to_bytes(self) -> bytes:
-        """Weights and biases layer by layer, row by row, little-endian float32."""
+        """Write weights and biases layer by layer, row by row, little-endian float32."""
         return b"".join(np.ascontiguousarray(a, dtype="<f4").tobytes() for layer in self.layers for a in layer)
 
     @staticmethod
@@ -128,7 +129,7 @@ class MlpNetwork:
         activations: Sequence[str] = (),
         output: Output = OWN_OUTPUT,
     ) -> MlpNetwork:
-        """The inverse of `to_bytes`, for the sizes [W, ..., 1]. Raises ValueError where the bytes are too few or too many."""
+        """Read what `to_bytes` wrote, for the sizes [W, ..., 1]. Raises ValueError where the bytes are too few or too many."""
         numbers = np.frombuffer(content, dtype="<f4") if len(content) % 4 == 0 else np.empty(0, dtype="<f4")
         if numbers.size != sum(o * i + o for i, o in pairwise(sizes)):
             raise ValueError(f"{len(content)} bytes of weights do not fit layers of {list(sizes)}")

@@ -15,8 +15,8 @@ From the runner:
     end SEQ T_MS CDBS_MA HOW                         the session is over: clinical settings
     refused CODE                                     nothing will run: clinical settings
 
-The watchdog: a device side that has not got WATCHDOG whole messages in a row, each a PERIOD_MS after the one before, returns to clinical
-settings by itself, and stays there until a new session. A line without its end is no message.
+The watchdog: a device side expects whole messages, each a PERIOD_MS after the one before. Without WATCHDOG of them in a row it returns to
+clinical settings on its own, and stays there until a new session. A line without its end is no message.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ _WHOLE = re.compile(r"[0-9]{1,15}")
 
 
 def number(text: str) -> float:
-    """A decimal number, NaN for any other text: float() alone takes "1_5" for 15."""
+    """Parse a decimal number, NaN for any other text: float() alone takes "1_5" for 15."""
     return float(text) if _NUMBER.fullmatch(text) else math.nan
 
 
 class Peer(NamedTuple):
-    """Who a device side must be: the bundle's participant, side (None: not stated), signal and period."""
+    """Identity that a device side must have: the bundle's participant, side (None: not stated), signal and period."""
 
     participant: str
     side: str | None
@@ -55,7 +55,7 @@ class Peer(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """What a line came to.
+    """Result of a line.
 
     Attributes:
         sample: a beta amplitude, at the time of the runner's clock at which its period ended; NaN for a value that is no number.
@@ -85,7 +85,7 @@ class Reader:
         self._offset_s = math.inf
 
     def restart(self) -> None:
-        """The link was lost: a new one begins with its own hello, numbers and clock."""
+        """Restart after a lost link: a new one begins with its own hello, numbers and clock."""
         self._greeted, self._seq, self._offset_s = self._bare, None, math.inf
 
     def take(self, line: str, arrived_s: float) -> Taken:
@@ -133,7 +133,7 @@ class Reader:
         if before is not None and seq != before + 1:
             fault = f"number {seq} after number {before}"
         elif before is not None and abs((sent_s - self._sent_s) - (arrived_s - self._arrived_s)) > JUMP * self._peer.period_s:
-            # a burst of delayed lines differs too: by what its first line was late, which the oldest offset tells
+            # a burst of delayed lines differs too: by the delay of its first line, which the oldest offset shows
             ahead = sent_s + self._offset_s - arrived_s
             if ahead > JUMP * self._peer.period_s or sent_s <= self._sent_s:
                 fault = "the device's clock jumped"
@@ -149,7 +149,7 @@ class Reader:
 
 
 def greeting(peer: Peer, limits: EnvelopeLimits) -> str:
-    """The runner's first line."""
+    """Write the runner's first line."""
     side = peer.side or "-"
     return (
         f"controller {VERSION} {peer.participant} {side} {1000 * peer.period_s:g} {limits.cdbs_ma:g} {limits.min_ma:g} {limits.max_ma:g} "
@@ -158,11 +158,11 @@ def greeting(peer: Peer, limits: EnvelopeLimits) -> str:
 
 
 def amplitude_line(seq: int, now_s: float, decision: Decision) -> str:
-    """The message of a decision."""
+    """Write the message of a decision."""
     what = "cdbs" if decision.fallback else "policy"
     return f"amplitude {seq} {1000 * now_s:.0f} {decision.amplitude_ma:.6g} {what} {','.join(reason_names(decision.reasons)) or '-'}\n"
 
 
 def end_line(seq: int, now_s: float, cdbs_ma: float, how: str) -> str:
-    """The last message of a session."""
+    """Write the last message of a session."""
     return f"end {seq} {1000 * now_s:.0f} {cdbs_ma:.6g} {how}\n"

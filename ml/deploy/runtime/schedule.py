@@ -12,7 +12,7 @@ from .envelope import BetaSample, Decision, EnvelopeLimits, Signal
 
 @dataclass(frozen=True)
 class ScheduledHold:
-    """One amplitude that is held: first step and length, fraction of cDBS, and the log of its density; None where nothing was drawn."""
+    """One constant amplitude: first step and length, fraction of cDBS, and the log of its density; None where nothing was drawn."""
 
     start: int
     steps: int
@@ -22,7 +22,7 @@ class ScheduledHold:
 
 @dataclass(frozen=True)
 class Schedule:
-    """What a session without a network delivers.
+    """Amplitudes of a session without a network.
 
     Attributes:
         design: `paper`, `stratified`, `ladder`, `near`, or `constant`.
@@ -49,13 +49,13 @@ class Schedule:
             raise ValueError("the schedule holds no amplitude")
 
     def hold_at(self, step: int) -> int | None:
-        """Index of the hold that a step belongs to; None after the last."""
+        """Find the index of the hold that a step belongs to; None after the last."""
         index = bisect_right([hold.start for hold in self.holds], step) - 1
         return index if 0 <= step < self.holds[index].start + self.holds[index].steps else None
 
     @staticmethod
     def from_json(stored: dict[str, Any]) -> Schedule:
-        """The inverse of `dataclasses.asdict`. Raises ValueError, KeyError or TypeError for another shape."""
+        """Read what `dataclasses.asdict` gave. Raises ValueError, KeyError or TypeError for another shape."""
         return Schedule(**stored | {"holds": tuple(ScheduledHold(**hold) for hold in stored["holds"])})
 
 
@@ -69,10 +69,10 @@ class _Wish:
         self.hold: int | None = None
 
     def push(self, beta: float) -> None:
-        """Beta changes nothing in what is wished; that it comes is the envelope's condition."""
+        """Ignore beta: it changes no amplitude of a schedule. That it comes is the envelope's condition."""
 
     def fraction(self) -> float:
-        """Fraction of the step that begins now; step 0 is the first one that is asked for."""
+        """Compute the fraction of the step that begins now; step 0 is the first one that is asked for."""
         if self._began_s is None or self.now_s < self._began_s:
             self._began_s = self.now_s
         step = round((self.now_s - self._began_s) / self._period_s)
@@ -95,15 +95,15 @@ class ScheduledController(BoundedController):
         self.schedule = schedule
 
     def fresh(self) -> ScheduledController:
-        """The same schedule from its first step."""
+        """Copy the schedule at its first step."""
         return ScheduledController(self.schedule, self.envelope.limits, self.envelope.signal)
 
     def decide(self, now_s: float, sample: BetaSample | None, reasons: int = 0) -> Decision:
-        """As `BoundedController.decide`; a clock that runs back begins the schedule anew, within the same limits."""
+        """Decide as `BoundedController.decide`; a clock that runs back restarts the schedule, within the same limits."""
         self._wish.now_s, self._wish.hold = now_s, None
         return super().decide(now_s, sample, reasons)
 
     def drawn(self) -> tuple[int, float | None] | None:
-        """Hold of the last decision and the log of its density; None where the schedule was not followed or has ended."""
+        """Return the hold of the last decision and the log of its density; None where the schedule was not followed or has ended."""
         index = self._wish.hold
         return None if index is None else (index, self.schedule.holds[index].log_density)

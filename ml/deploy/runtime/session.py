@@ -40,7 +40,7 @@ OF_BLINDED_LOG = (
 
 @dataclass(frozen=True, kw_only=True)
 class Tablet:
-    """What a session needs of the machine that it runs on.
+    """Parts of the machine that a session needs.
 
     Attributes:
         ledger: which slots this tablet has run. withdrawn: a list that was brought along; None where none was.
@@ -56,7 +56,7 @@ class Tablet:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a session went: how it ended, in words where there are any, and the loop with its decisions."""
+    """Outcome of a session: how it ended, in words where there are any, and the loop with its decisions."""
 
     end: End
     detail: str
@@ -76,13 +76,13 @@ def slot_of(manifest: Mapping[str, Any]) -> Slot:
 
 
 def check_allowed(manifest: Mapping[str, Any], tablet: Tablet, participant: str | None = None) -> Slot:
-    """The slot that a bundle may run in now.
+    """Find the slot that a bundle may run in now.
 
     Args:
-        participant: who is there, where somebody stated it.
+        participant: who is there, where it was stated.
 
     Raises:
-        NotAllowed: nobody signed the plan, it is another participant's, another day, withdrawn, or the slot was run already.
+        NotAllowed: the plan is not signed, it is another participant's, another day, withdrawn, or the slot was run already.
     """
     slot = slot_of(manifest)
     if not manifest.get("approvals"):
@@ -115,7 +115,7 @@ def run_slot(
 
     Args:
         manifest: as JSON gives it. manifest_sha256: of its bytes. controller: within its envelope. log: a new file. participant: who is
-            there, where somebody stated it.
+            there, where it was stated.
 
     Raises:
         NotAllowed: it may not run; nothing was sent but the refusal. LogFailed: the log cannot be begun.
@@ -151,7 +151,7 @@ def run_slot(
 def run_bench(
     manifest: Mapping[str, Any], manifest_sha256: str, controller: BoundedController, link: Link, log: Path | None, seconds: float | None
 ) -> Outcome:
-    """Run a bundle with nobody connected: no slot, no ledger; lone numbers are taken for beta. Raises LogFailed."""
+    """Run a bundle without a participant: no slot, no ledger; lone numbers are taken for beta. Raises LogFailed."""
     facts = describe(manifest, manifest_sha256, controller, datetime.now().astimezone(), "bench")
     sink = None if log is None else LogFile(log, manifest["period_s"], facts)
     session = LiveSession(controller, _peer(manifest), link, sink.write if sink else lambda _row: None, seconds, bare=True)
@@ -165,7 +165,7 @@ def run_bench(
 def describe(
     manifest: Mapping[str, Any], manifest_sha256: str, controller: BoundedController, now: datetime, purpose: str
 ) -> dict[str, Any]:
-    """What a log says of itself. `purpose`: `session`, `bench` or `replay`; of a replay the time runs as its source says."""
+    """Describe a log in its head. `purpose`: `session`, `bench` or `replay`; of a replay the time runs as its source says."""
     slot = dict(manifest.get("slot") or {})
     schedule = manifest.get("schedule") or {}
     design = {name: schedule[name] for name in ("design", "level", "seed", "lower_bound") if name in schedule}
@@ -187,12 +187,12 @@ def describe(
 
 
 def is_blinded(manifest: Mapping[str, Any]) -> bool:
-    """Whether nobody at the tablet is to know what runs."""
+    """Decide whether people at the tablet must not know what runs."""
     return bool((manifest.get("card") or {}).get("blinded"))
 
 
 def latency(manifest: Mapping[str, Any], controller: BoundedController, decisions: int = TIMED_DECISIONS) -> dict[str, float]:
-    """Microseconds by the clock on the wall that a whole decision takes on this machine: `n`, `mean`, `std`, `median`, `p99`.
+    """Measure the time of a whole decision on this machine by the wall clock, in microseconds: `n`, `mean`, `std`, `median`, `p99`.
 
     Timed in a session of its own, so that the controller stays at the start of its own.
     """
@@ -214,23 +214,23 @@ def latency(manifest: Mapping[str, Any], controller: BoundedController, decision
 
 
 def latency_words(measured: Mapping[str, float]) -> str:
-    """What `latency` measured, as the paper's table has it: mean and standard deviation in milliseconds."""
+    """Describe what `latency` measured, as the paper's table has it: mean and standard deviation in milliseconds."""
     mean, std, median = (measured[name] / 1000.0 for name in ("mean", "std", "median"))
     return f"a decision takes {mean:.3g} ms, SD {std:.3g} ms (median {median:.3g} ms, n = {measured['n']:.0f})"
 
 
 def battery_percent() -> float | None:
-    """Charge of the tablet's own battery as its operating system tells it; None where it has none."""
+    """Read the charge of the tablet's own battery from its operating system; None where it has none."""
     for source in sorted(POWER.glob("BAT*/capacity")):
         try:
             return float(source.read_text("ascii"))
         except (OSError, ValueError):
-            continue  # a battery that tells nothing is as good as none
+            continue  # a battery that reports nothing is as good as none
     return None
 
 
 def parse_manifest(raw: bytes) -> dict[str, Any]:
-    """The manifest as JSON gives it. Raises ValueError where it is no object."""
+    """Parse the manifest as JSON. Raises ValueError where it is no object."""
     manifest = json.loads(raw)
     if not isinstance(manifest, dict):
         raise ValueError("manifest.json must hold one object")

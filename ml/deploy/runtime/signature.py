@@ -18,7 +18,7 @@ Point = tuple[int, int, int, int]
 
 
 def verifies(public_key: bytes, message: bytes, signature: bytes) -> bool:
-    """Whether a signature of 64 bytes is that of a message under a public key of 32 bytes."""
+    """Verify a signature of 64 bytes of a message under a public key of 32 bytes."""
     if len(public_key) != 32 or len(signature) != 64:
         return False
     key, commitment = _point(public_key), _point(signature[:32])
@@ -31,7 +31,7 @@ def verifies(public_key: bytes, message: bytes, signature: bytes) -> bool:
 
 
 def _point(encoded: bytes) -> Point | None:
-    """The point of 32 bytes; None where they encode none."""
+    """Decode the point of 32 bytes; None where they encode none."""
     number = int.from_bytes(encoded, "little")
     y, odd = number & (2**255 - 1), number >> 255
     if y >= _P:

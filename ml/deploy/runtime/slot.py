@@ -1,7 +1,7 @@
 """The session slot that a bundle is for, and whether it may run now: on its day, once, while nothing of it has been withdrawn.
 
-What a blinded slot runs is masked, and padded to one size for all sessions of a plan. That keeps people from learning by looking, and no
-more: the tablet must run what is inside, so that whoever writes a program can read it.
+The content of a blinded slot is masked, and padded to one size for all sessions of a plan. That keeps people from learning by looking, and
+no more. The tablet must run the content, so a person who writes a program can read it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SEALED = "session.bin"
 
 
 class Refusal(StrEnum):
-    """Why a bundle does not run."""
+    """Reason why a bundle does not run."""
 
     NO_SLOT = "no_slot"
     NOT_SIGNED = "not_signed"
@@ -113,14 +113,14 @@ class Withdrawals:
     def check(self, slot: Slot, policy_id: int | None) -> None:
         """Raise NotAllowed for a slot of a plan, or with a policy, that was taken back."""
         if policy_id is not None and policy_id in self.policies:
-            which = f"policy {policy_id}" if slot.label is None else f"what session {slot.label} was to run"  # a blinded one is not told
+            which = f"policy {policy_id}" if slot.label is None else f"what session {slot.label} was to run"  # a blinded one is not named
             raise NotAllowed(Refusal.WITHDRAWN, f"{which} was withdrawn; have the plan changed and signed anew")
         if slot.plan_id in self.plans:
             raise NotAllowed(Refusal.WITHDRAWN, f"plan {slot.plan_id} was replaced or withdrawn; take a bundle of the present plan")
 
 
 def read_withdrawals(path: Path, public_key: bytes) -> Withdrawals:
-    """The list in a file: one line of JSON, and its Ed25519 signature in hexadecimal digits in a second one.
+    """Read the list in a file: one line of JSON, and its Ed25519 signature in hexadecimal digits in a second one.
 
     Raises:
         NotAllowed: the file cannot be read, or its signature is not that of the key.
@@ -135,7 +135,7 @@ def read_withdrawals(path: Path, public_key: bytes) -> Withdrawals:
 
 
 def withdrawals_of(stored: dict[str, Any]) -> Withdrawals:
-    """From JSON. Raises KeyError, TypeError, ValueError for another shape."""
+    """Read withdrawals from JSON. Raises KeyError, TypeError, ValueError for another shape."""
     if stored["kind"] != "betaloop withdrawals":
         raise ValueError("it is no list of withdrawals")
     datetime.fromisoformat(stored["issued_at"])
@@ -143,19 +143,19 @@ def withdrawals_of(stored: dict[str, Any]) -> Withdrawals:
 
 
 def withdrawals_body(withdrawn: Withdrawals) -> bytes:
-    """The JSON line that is signed."""
+    """Write the JSON line that is signed."""
     facts = {"kind": "betaloop withdrawals", "issued_at": withdrawn.issued_at}
     return json.dumps(facts | {"policies": sorted(withdrawn.policies), "plans": sorted(withdrawn.plans)}, sort_keys=True).encode()
 
 
 def mask(content: bytes, nonce: str, part: str = "") -> bytes:
-    """Masked, or masked again and so as it was. `nonce`: hexadecimal digits. `part`: of what."""
+    """Mask content; masking it again restores it. `nonce`: hexadecimal digits. `part`: of what."""
     stream = hashlib.shake_256(bytes.fromhex(nonce) + part.encode()).digest(len(content))
     return (np.frombuffer(content, dtype=np.uint8) ^ np.frombuffer(stream, dtype=np.uint8)).tobytes()
 
 
 def seal(files: Mapping[str, bytes], nonce: str, room: int) -> bytes:
-    """Files in one, filled up to `room` bytes, or to the next power of two where they need more."""
+    """Seal files in one, filled up to `room` bytes, or to the next power of two where they need more."""
     head = json.dumps([[name, len(content)] for name, content in files.items()]).encode()
     whole = struct.pack(">Q", len(head)) + head + b"".join(files.values())
     while room < len(whole):
@@ -164,7 +164,7 @@ def seal(files: Mapping[str, bytes], nonce: str, room: int) -> bytes:
 
 
 def unseal(content: bytes, nonce: str) -> dict[str, bytes]:
-    """The inverse of `seal`. Raises ValueError for other bytes."""
+    """Unpack what `seal` wrote. Raises ValueError for other bytes."""
     plain = mask(content, nonce)
     try:
         (length,) = struct.unpack(">Q", plain[:8])
@@ -187,7 +187,7 @@ def same_session(outer: Mapping[str, Any], inner: Mapping[str, Any]) -> None:
 
 
 def opened(outer: dict[str, Any], content: bytes) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The manifest and the files that a blinded bundle keeps to itself. Raises ValueError, KeyError, TypeError for other bytes."""
+    """Open the sealed manifest and files of a blinded bundle. Raises ValueError, KeyError, TypeError for other bytes."""
     files = unseal(content, outer["sealed"])
     inner = json.loads(files.pop("manifest.json"))
     same_session(outer, inner)
