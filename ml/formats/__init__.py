@@ -65,7 +65,7 @@ HINT = (
 
 
 def sniff(path: Source) -> FileKind:
-    """What a file is, by its content; its name and extension are not asked.
+    """Detect the kind of a file by its content, whatever its name and extension.
 
     Raises:
         UndecodableFile: empty, or nothing this service reads.
@@ -95,7 +95,7 @@ def sniff(path: Source) -> FileKind:
 
 
 def _kind_of_zip(path: Source) -> FileKind:
-    """A zip of Percept reports where it holds no RC+S file; what cannot be opened is left to the decoder of RC+S, which says why."""
+    """Detect a zip of Percept reports, which has no RC+S file. What cannot be opened is left to the decoder of RC+S, which reports why."""
     try:
         with ZipFiles(path, ArchiveLimits()) as files:
             if not find_sessions(files, FileReport("archive")) and report_members(files):
@@ -131,7 +131,7 @@ def decode(path: Path, kind: FileKind | None = None, options: DecodeOptions | No
 
 
 def _is_empty(recording: RecordingLog) -> bool:
-    """Whether an RC+S recording has neither a sample nor an amplitude in its stimulation log."""
+    """Decide whether an RC+S recording has neither a sample nor an amplitude in its stimulation log."""
     logged = (e.data for e in recording.events if e.kind == "stimulation" and e.data["origin"] == "StimLog")
     stimulated = any(program["amplitude_ma"] is not None for data in logged for program in data["programs"])
     return recording.duration_s == 0 and not recording.traces and not stimulated

@@ -28,7 +28,8 @@ READ_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, 
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """A file that is not read, by its place in the archive's list, from 1, and its ending, for its name may be a person's; and why."""
+    """A file that is not read: its place in the archive's list, from 1, its ending and the reason. Its name may be a person's and is
+    omitted."""
 
     number: int
     suffix: str
@@ -39,12 +40,12 @@ class LeftOut:
 
 
 def numbered(number: int, suffix: str) -> str:
-    """A member of an archive as a report may call it."""
+    """Name a member of an archive as a report may call it."""
     return f"member {number}{f' ({suffix})' if suffix else ''}"
 
 
 def cleaned_suffix(name: str) -> str:
-    """The ending of a file's name where it is a known one, in lower case; else nothing, for it may be a part of a name."""
+    """Return the ending of a file's name where it is a known one, in lower case. Else return nothing, since it may be a part of a name."""
     suffix = PurePosixPath(name.replace("\\", "/")).suffix.lower()
     return suffix if suffix in SUFFIXES else ""
 
@@ -53,14 +54,14 @@ INSIDE = "an archive inside the archive; unpack it and upload it by itself"
 
 
 def hint_of(left_out: Sequence[LeftOut], hint: str) -> str:
-    """What to do about an archive that holds nothing of use: archives inside it come first."""
+    """Describe what to do about an archive without anything of use: archives inside it come first."""
     inside = sum(one.reason == INSIDE for one in left_out)
     several = f"{inside} other archives, which are" if inside > 1 else "another archive, which is"
     return f"It holds {several} not opened: unpack it and upload what is inside. {hint}" if inside else hint
 
 
 def told(left_out: Sequence[LeftOut], most: int = 5) -> list[str]:
-    """Sentences about what was left out: members of one ending and one reason are one sentence with their count."""
+    """Describe ignored members in sentences: members of one ending and one reason are one sentence with their count."""
     groups: dict[tuple[str, str], list[int]] = defaultdict(list)
     for one in left_out:
         groups[one.suffix, one.reason].append(one.number)
@@ -79,7 +80,7 @@ _watcher: ContextVar[Callable[[float], None] | None] = ContextVar("watcher", def
 
 @contextmanager
 def reading_of_members(watch: Callable[[float], None]) -> Iterator[None]:
-    """Tell `watch`, while archives are read inside the context, which share of their unpacked bytes was read, 0 to 1."""
+    """Report to `watch`, while archives are read inside the context, which share of their unpacked bytes was read, 0 to 1."""
     token = _watcher.set(watch)
     try:
         yield
@@ -94,13 +95,13 @@ class _Watched(io.BufferedIOBase):
         self._stream, self._count = stream, count
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Bytes as of the stream."""
+        """Read bytes from the stream and count them."""
         found = self._stream.read(-1 if size is None else size)
         self._count(len(found))
         return found
 
     def readable(self) -> bool:
-        """It is."""
+        """Return True: it can be read."""
         return True
 
     def close(self) -> None:
@@ -115,15 +116,15 @@ class Files(Protocol):
     left_out: list[LeftOut]
 
     def names(self) -> list[str]:
-        """Names in sorted order."""
+        """List names in sorted order."""
 
     def open(self, name: str) -> IO[bytes]:
-        """The file's bytes as a stream."""
+        """Open the file's bytes as a stream."""
 
 
 @dataclass(slots=True)
 class FolderFiles:
-    """Files below a folder; links are left out and said."""
+    """Files below a folder; links are ignored and reported."""
 
     root: Path
     left_out: list[LeftOut] = field(default_factory=list)
@@ -138,11 +139,11 @@ class FolderFiles:
                 self._paths[name] = path
 
     def names(self) -> list[str]:
-        """Names in sorted order."""
+        """List names in sorted order."""
         return sorted(self._paths)
 
     def open(self, name: str) -> IO[bytes]:
-        """The file's bytes as a stream."""
+        """Open the file's bytes as a stream."""
         return self._paths[name].open("rb")
 
 
@@ -219,11 +220,11 @@ class ZipFiles:
             self._members[name], self._number[name] = info, number
 
     def names(self) -> list[str]:
-        """Names in sorted order."""
+        """List names in sorted order."""
         return sorted(self._members)
 
     def open(self, name: str) -> IO[bytes]:
-        """The member's bytes as a stream. Raises UndecodableFile for a member that cannot be unpacked."""
+        """Open the member's bytes as a stream. Raises UndecodableFile for a member that cannot be unpacked."""
         try:
             stream = self._zip.open(self._members[name])
         except READ_ERRORS as error:

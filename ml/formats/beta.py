@@ -28,7 +28,8 @@ def step_trace(
     details: Mapping[str, Any],
     t_end_first_s: float | None = None,
 ) -> TraceLog:
-    """A trace of (stream, channel, unit) on the grid of steps; rows covered too little, or without a number, are invalid and NaN.
+    """Make a trace of (stream, channel, unit) on the grid of steps; rows with too little coverage, or without a number, are invalid and
+    NaN.
 
     Args:
         names: stream, channel, unit.
@@ -54,11 +55,12 @@ def time_domain_traces(
     details: Mapping[str, Any],
     t0_s: float = 0.0,
 ) -> list[TraceLog]:
-    """RMS amplitude and power of one channel's beta band: the stream `beta` is the measure that the options name, the other is beside it.
+    """Compute RMS amplitude and power of one channel's beta band. The stream `beta` is the measure that the options name; the other comes
+    with it.
 
     Where rows are not whole, `beta_error` is the standard error of `beta`.
 
-    Stretches sampled too slowly for the band are left out; none where all are.
+    Stretches sampled too slowly for the band are ignored; no trace where all are.
 
     Args:
         stretches: gap-free pieces in uV.
@@ -86,7 +88,8 @@ def time_domain_traces(
 
 
 def beta_streams(found: BandRows, options: DecodeOptions) -> list[tuple[str, str, str, NDArray[np.float64]]]:
-    """(stream, unit, measure, values [rows]) of samples in uV: both measures, and the error of `beta` where a valid row is not whole."""
+    """List (stream, unit, measure, values [rows]) of samples in uV: both measures, and the error of `beta` where a valid row is not
+    whole."""
     valid = found.reached >= options.min_valid_fraction - 1e-9
     streams = [(stream, unit, str(measure), getattr(found, measure)) for stream, unit, measure in options.beta_streams]
     if np.any(found.rms_error[valid] > 0):
@@ -96,6 +99,6 @@ def beta_streams(found: BandRows, options: DecodeOptions) -> list[tuple[str, str
 
 
 def channel_spectrum(stretches: Sequence[Stretch], channel: str) -> list[SpectrumLog]:
-    """The channel's spectrum in uV2/Hz up to 100 Hz; empty where no stretch is long enough for one."""
+    """Estimate the channel's spectrum in uV2/Hz up to 100 Hz; empty where no stretch is long enough for one."""
     hz, density, seconds = spectrum(stretches)
     return [SpectrumLog(channel, "uV2/Hz", hz, density, round(seconds, 3))] if seconds else []

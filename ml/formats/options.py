@@ -1,4 +1,4 @@
-"""How to decode, and how much a file may ask of the machine."""
+"""Options of decoding, and limits of what a file may use of the machine."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class DecodeOptions:
         min_valid_fraction: coverage: share of a window's samples that must have been measured for it to be valid, 0..1; one sample
             less will do.
         table_beta_unit: unit of `beta` in a table whose header states none.
-        table_lfp_unit: unit of `lfp` in a table whose header states none; such a table is refused where nobody states it.
+        table_lfp_unit: unit of `lfp` in a table whose header states none; without it such a table is refused.
         max_table_rows: rows a table of steps may have.
         max_lfp_rows: rows a table of raw LFP may have.
         keep_samples: keep the samples of each recording (`RecordingLog.samples`), which changes no other number.
@@ -61,7 +61,7 @@ class DecodeOptions:
 
     @property
     def beta_streams(self) -> tuple[tuple[str, str, BetaMeasure], tuple[str, str, BetaMeasure]]:
-        """(stream, unit, measure) of the two traces that time-domain samples in uV give: `beta`, and the other measure beside it."""
+        """(stream, unit, measure) of the two traces that time-domain samples in uV give: `beta`, and the other measure."""
         if self.beta_measure == "rms":
             return ("beta", "uV", "rms"), ("beta_power", "uV2", "power")
         return ("beta", "uV2", "power"), ("beta_rms", "uV", "rms")

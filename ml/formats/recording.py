@@ -1,4 +1,4 @@
-"""What a decoder hands over: recordings with their 2 s traces and events, and one report per file.
+"""Result of a decoder: recordings with their 2 s traces and events, and one report per file.
 
 Everything here is plain data. Times are seconds in the recording's own clock unless a name says otherwise; where that clock starts is
 `RecordingLog.started_at` (UTC), when the file states it.
@@ -28,8 +28,8 @@ Hemisphere = Literal["left", "right"]
 class UndecodableFile(Exception):
     """A file of which nothing can be used: what is wrong, where, and what to do about it, in the user's words.
 
-    `what` and `where` may quote the file and are for its sender alone; `stored_what` and `stored_where` say the same without the file's own
-    texts, which may identify a person, and are what a stored report may hold. They are equal where not given.
+    `what` and `where` may quote the file and are for its sender alone. `stored_what` and `stored_where` say the same without the file's own
+    texts, which may identify a person. A stored report may contain them. They are equal where not given.
     """
 
     def __init__(self, what: str, where: str, hint: str, stored_what: str | None = None, stored_where: str | None = None) -> None:
@@ -44,7 +44,7 @@ class UndecodableFile(Exception):
         return UndecodableFile, self.args_of()
 
     def args_of(self) -> tuple[str, str, str, str, str]:
-        """What makes the same error again, in another process too."""
+        """Return the arguments that make the same error again, in another process too."""
         return self.what, self.where, self.hint, self.stored_what, self.stored_where
 
     @property
@@ -60,7 +60,7 @@ class UndecodableFile(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Why a file, or a part of it, could not be used."""
+    """Reason why a file, or a part of it, could not be used."""
 
     what: str
     where: str
@@ -69,7 +69,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class FileReport:
-    """What became of one file of an upload. Every list holds sentences for the person who uploaded it."""
+    """Report on one file of an upload. Every list has sentences for the person who uploaded it."""
 
     name: str
     understood: list[str] = field(default_factory=list)
@@ -108,7 +108,7 @@ class TraceLog:
         return self.t_end_first_s + self.dt_s * np.arange(self.values.size, dtype=np.float64)
 
     def same_as(self, other: TraceLog) -> bool:
-        """Equal in every field, NaN counted equal to NaN."""
+        """Compare every field, NaN counted equal to NaN."""
         named = ("stream", "channel", "unit", "source", "dt_s", "t_end_first_s", "details")
         return (
             all(getattr(self, name) == getattr(other, name) for name in named)
@@ -142,7 +142,7 @@ class SampleLog:
 
     @staticmethod
     def of(channel: str, unit: str, stretches: Sequence[Stretch]) -> SampleLog:
-        """The samples of stretches in their order."""
+        """Join the samples of stretches in their order."""
         sizes = [x.size for _, _, x in stretches]
         t_s = [start + np.arange(x.size) / rate for start, rate, x in stretches]
         return SampleLog(
@@ -155,7 +155,7 @@ class SampleLog:
         )
 
     def between(self, begin_s: float, end_s: float) -> SampleLog:
-        """The samples after `begin_s` and up to `end_s`, to the microsecond, as rows of traces take them."""
+        """Select the samples after `begin_s` and up to `end_s`, to the microsecond, as rows of traces take them."""
         inside = np.flatnonzero((self.t_s > begin_s + 1e-6) & (self.t_s <= end_s + 1e-6))
         first = np.zeros(self.t_s.size, dtype=bool)
         first[self.starts] = True
@@ -168,7 +168,7 @@ class SampleLog:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpectrumLog:
-    """Power spectral density of one channel over a whole recording, gaps left out.
+    """Power spectral density of one channel over a whole recording, without gaps.
 
     Attributes:
         channel: as in the traces. unit: e.g. `uV2/Hz`.
@@ -183,7 +183,7 @@ class SpectrumLog:
     seconds: float
 
     def same_as(self, other: SpectrumLog) -> bool:
-        """Equal in every field."""
+        """Compare every field."""
         named = (self.channel, self.unit, self.seconds) == (other.channel, other.unit, other.seconds)
         return named and np.array_equal(self.hz, other.hz) and np.array_equal(self.density, other.density)
 
@@ -228,11 +228,11 @@ class EventLog:
 class RecordingLog:
     """One recording of one device in one clock.
 
-    `device_key` is opaque and may still be a serial number: decode redacted bytes, or replace it, before anything is stored.
-    `fingerprint` is a SHA-256 over the decoded content without the device's name, so the same recording in another archive has the same.
-    `run` says which recordings of one file were made together (the two sides of a Percept, the two implants of a participant) and so belong
-    to one session; None for what is no session: surveys, tests, the history that a device keeps.
-    `samples` are there only where they were asked for (`DecodeOptions.keep_samples`).
+    `device_key` is opaque and may still be a serial number: decode redacted bytes, or replace it, before anything is stored. `fingerprint`
+    is a SHA-256 over the decoded content without the device's name, so the same recording in another archive has the same. `run` says which
+    recordings of one file were made together and so belong to one session. Examples are the two sides of a Percept, the two implants of a
+    participant. It is None for what is no session: surveys, tests, a device's history. `samples` are there only where they were requested
+    (`DecodeOptions.keep_samples`).
     """
 
     kind: str
@@ -263,7 +263,8 @@ class DecodedFile:
 
 
 def fingerprint(kind: str, parts: Iterable[str | bytes | NDArray[Any]]) -> str:
-    """SHA-256 (hex) over the kind and the parts in order; every part is length-prefixed so that no two lists of parts collide."""
+    """Compute the SHA-256 (hex) over the kind and the parts in order; every part is length-prefixed so that no two lists of parts
+    collide."""
     digest = hashlib.sha256()
     for part in (kind, *parts):
         raw = part.encode() if isinstance(part, str) else part if isinstance(part, bytes) else np.ascontiguousarray(part).tobytes()

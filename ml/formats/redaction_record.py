@@ -1,4 +1,4 @@
-"""What every redactor shares: its account of what it did, and the keyed pseudonym of a device."""
+"""Common part of the redactors: the account of what one did, and the keyed pseudonym of a device."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PSEUDONYM = re.compile(r"device-[0-9a-f]{16}")
 
 @dataclass(slots=True)
 class Redaction:
-    """What was done, in sentences for the upload's report.
+    """Account of a redaction, in sentences for the upload's report.
 
     Attributes:
         removed: identity that was taken out.
@@ -29,7 +29,7 @@ class Redaction:
 
 
 def pseudonym(serial: str, key: bytes) -> str:
-    """Keyed pseudonym of a device; a pseudonym stays as it is. Raises ValueError for a key under 16 bytes."""
+    """Make the keyed pseudonym of a device; a pseudonym stays as it is. Raises ValueError for a key under 16 bytes."""
     if len(key) < 16:
         raise ValueError("the pseudonym key must have at least 16 bytes")
     if PSEUDONYM.fullmatch(serial):

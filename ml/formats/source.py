@@ -1,4 +1,4 @@
-"""What decoders read: a file's bytes, wherever they lie."""
+"""Input of decoders: a file's bytes, wherever they are."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ class Source(Protocol):
         """Its last name, for reports that have no better one."""
 
     def open(self, mode: Literal["rb"]) -> BinaryIO:
-        """Its bytes from the first on; they can be sought in. Raises OSError."""
+        """Open its bytes from the first on; they can be sought in. Raises OSError."""
 
 
 @dataclass(frozen=True)
 class InMemory:
-    """A file that lies on no disk."""
+    """A file that is on no disk."""
 
     content: bytes = field(repr=False)
     name: str = "table"
 
     def open(self, mode: Literal["rb"] = "rb") -> BinaryIO:
-        """The content from the first byte on."""
+        """Open the content from the first byte on."""
         return io.BytesIO(self.content)

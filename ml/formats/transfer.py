@@ -1,4 +1,4 @@
-"""What a decoder gave, on its way from the process that decoded a file to the one that stores it: JSON, and arrays beside it.
+"""Transfer of decoded data from the process that decoded a file to the one that stores it: JSON, and arrays next to it.
 
 Nothing that is read here can run: no pickle, and no class but those of `recording`. The size is checked before anything is loaded, for
 it follows from the file of a stranger.
@@ -44,7 +44,7 @@ def write(decoded: DecodedFile, folder: Path) -> None:
 
 
 def read(folder: Path) -> DecodedFile:
-    """The decoded file that `write` wrote. Raises ValueError where the folder holds anything else."""
+    """Read the decoded file that `write` wrote. Raises ValueError where the folder has anything else."""
     text, numbers = folder / _TEXT, folder / _NUMBERS
     if text.stat().st_size > MOST_TEXT or numbers.stat().st_size > 2 * MOST_NUMBERS:
         raise ValueError("what the decoder left is larger than it may be")

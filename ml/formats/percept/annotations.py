@@ -1,8 +1,8 @@
 """Annotations and symptom ratings of a Percept report, under whatever keys its version writes them.
 
-Their keys differ between versions and are in no public document, so they are found by their words: below a key that speaks of annotations,
-ratings, scores, symptoms or notes every object with a time is one. What stays of it is its time, a number from 0 to 100 under a key of
-known words, and a text made of known words alone; both the report as it was written and the redacted one give the same.
+Their keys differ between versions and are in no public document, so they are found by their words. Below a key about annotations, ratings,
+scores, symptoms or notes, every object with a time is one. Three things of it stay: its time, a number from 0 to 100 under a key of known
+words, and a text of known words alone. Both the original report and the redacted one give the same.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SPEAKS_OF = frozenset(
     }
 )
 VALUES = frozenset({"rating", "score", "severity", "value", "level", "intensity", "symptom", "scale", "patient", "clinician", "reported"})
-"""Words of keys whose number is a rating, beside names of symptoms."""
+"""Words of keys whose number is a rating, in addition to names of symptoms."""
 
 TIMES = frozenset({"date", "time", "datetime", "timestamp", "stamp", "utc", "unix", "event", "start", "begin", "annotation", "rating"})
 OFFSETS_S = {"milliseconds": 1e-3, "ms": 1e-3, "mses": 1e-3, "seconds": 1.0, "s": 1.0}
@@ -38,7 +38,7 @@ LARGEST = 100.0
 MOST = 5_000
 DEEPEST = 40
 _CLOSED = frozenset({"PatientInformation", "PrescriptionSummary"})
-"""Sections that say who somebody is."""
+"""Sections that identify a person."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Annotation:
     """One annotation, or one number of a rating.
 
     Attributes:
-        at: when. label: what it says, in known words; what it stands under where it says nothing else.
+        at: when. label: its text, in known words; else the key above it.
         value: the rating, 0 to 100; None of an annotation. under: its key, as far as that is technical.
     """
 
@@ -66,14 +66,14 @@ class Found:
 
 @dataclass(frozen=True)
 class _Run:
-    """The streaming run that an object lies in: its start, and the tick before its first packet, ms."""
+    """The streaming run that an object is in: its start, and the tick before its first packet, ms."""
 
     start: datetime | None = None
     first_tick_ms: float | None = None
 
 
 def gather(report: Mapping[str, Any]) -> Found:
-    """All annotations and ratings of a report."""
+    """Collect all annotations and ratings of a report."""
     found = Found()
     for name, value in report.items():
         if name not in _CLOSED:
@@ -84,18 +84,18 @@ def gather(report: Mapping[str, Any]) -> Found:
 
 
 def as_section(found: Found) -> list[dict[str, Any]]:
-    """The annotations as the redacted report holds them."""
+    """Write the annotations as the redacted report has them."""
     said = ({"DateTime": a.at.isoformat(), "Name": a.label, "Under": a.under, "Value": a.value} for a in found.kept)
     return [{name: value for name, value in one.items() if value is not None} for one in said]
 
 
 def speaks_of(key: str) -> bool:
-    """Whether what stands under a key is annotations or ratings, by the key's words."""
+    """Decide, by the words of a key, whether its value is annotations or ratings."""
     return bool(SPEAKS_OF & set(parts(key))) or key == "EventSummary"
 
 
 def _records(value: Any, key: str, inside: bool, run: _Run, depth: int) -> Iterator[tuple[str, dict[str, Any], _Run]]:
-    """Objects at or below a key that speaks of annotations, the outermost with a time of their own; with that key, cleaned."""
+    """Yield objects at or below a key about annotations, the outermost with a time of their own; with that key, cleaned."""
     if depth > DEEPEST:
         return
     if isinstance(value, list):
@@ -126,7 +126,7 @@ def _run_of(value: dict[str, Any], outer: _Run) -> _Run:
 
 
 def _time(record: dict[str, Any], run: _Run) -> datetime | None:
-    """When it was: a date, Unix seconds or milliseconds, or seconds or ticks within the run that it stands in."""
+    """Find the time: a date, Unix seconds or milliseconds, or seconds or ticks within the run around it."""
     for key, value in record.items():
         words = set(parts(key))
         if words and words <= TIMES and words & {"date", "time", "datetime", "timestamp", "stamp"}:
@@ -149,7 +149,7 @@ def _time(record: dict[str, Any], run: _Run) -> datetime | None:
 
 
 def _unix(number: float | None) -> datetime | None:
-    """A time in Unix seconds or milliseconds of the years that implants of this kind exist in."""
+    """Convert Unix seconds or milliseconds to a time of the years in which implants of this kind exist."""
     for scale in (1.0, 1000.0):
         if number is not None and 1.2e9 <= number / scale < 4e9:
             return datetime.fromtimestamp(number / scale, UTC)

@@ -1,7 +1,8 @@
-"""What a Percept report holds beside its streams: therapy groups and their history, trends, snapshots, events, battery, in plain values.
+"""Details of a Percept report other than its streams: therapy groups and their history, trends, snapshots, events, battery, in plain
+values.
 
-Nothing in here quotes free text of the report: enumerations are reduced to known shapes, and names that a person may have typed (groups,
-events) to known words or numbers, so that a redacted report gives the same details as the original.
+Nothing in here quotes free text of the report. Enumerations are reduced to known shapes. Names that a person may have typed (groups,
+events) are reduced to known words or numbers. So a redacted report gives the same details as the original.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ MAX_EVENTS = 5_000
 
 
 def event_label(entry: dict[str, Any]) -> str:
-    """A patient event's name where it is a known word, else its number: `event 3`."""
+    """Name a patient's event by its known word, else by its number: `event 3`."""
     name = entry.get("EventName")
     if isinstance(name, str) and name.strip().lower() in EVENT_WORDS:
         return name.strip().lower()
@@ -29,7 +30,7 @@ def event_label(entry: dict[str, Any]) -> str:
 
 
 def groups(value: Any) -> list[dict[str, Any]]:
-    """Therapy groups: programs and sensing per side."""
+    """List therapy groups: programs and sensing per side."""
     out = []
     for group in entries(value):
         settings = group.get("ProgramSettings")
@@ -58,7 +59,7 @@ def groups(value: Any) -> list[dict[str, Any]]:
 
 
 def _letter(value: Any) -> str | None:
-    """`A` of `GroupIdDef.GROUP_A`."""
+    """Extract `A` of `GroupIdDef.GROUP_A`."""
     named = word(value)
     return named.removeprefix("GROUP_") if named else None
 
@@ -77,9 +78,9 @@ def _program(program: dict[str, Any], side: str, rate_hz: float | None) -> dict[
 
 
 def _amplitude(program: dict[str, Any]) -> float | None:
-    """A program's amplitude in mA; of a lead whose segments have amplitudes of their own (SenSight) the sum over its cathodes.
+    """Read a program's amplitude in mA; of a lead whose segments have amplitudes of their own (SenSight) the sum over its cathodes.
 
-    None where one of them does not tell its own.
+    None where one of them lacks its own.
     """
     whole = finite(program.get("AmplitudeInMilliAmps"))
     if whole is not None:
@@ -90,7 +91,7 @@ def _amplitude(program: dict[str, Any]) -> float | None:
 
 
 def contacts(value: Any) -> str:
-    """Electrodes in use with their sign: `-SenSight_1a +Case`."""
+    """List electrodes in use with their sign: `-SenSight_1a +Case`."""
     signs = {"Negative": "-", "Positive": "+"}
     named = ((word(e.get("Electrode")), signs.get(word(e.get("ElectrodeStateResult")) or "")) for e in entries(value))
     return " ".join(f"{sign}{name}" for name, sign in named if name and sign)
@@ -111,7 +112,7 @@ def _sensing(sensing: dict[str, Any]) -> dict[str, Any]:
 
 
 def snapshot(value: dict[str, Any], side: str) -> dict[str, Any]:
-    """Therapy and sensing of one side as they were set when a run began (TherapySnapshot)."""
+    """Read therapy and sensing of one side as they were set when a run began (TherapySnapshot)."""
     own = inside(value, side.capitalize())
     return {
         "group": _letter(value.get("ActiveGroup")),
@@ -127,7 +128,7 @@ def snapshot(value: dict[str, Any], side: str) -> dict[str, Any]:
 
 
 def limits(value: dict[str, Any], side: str) -> dict[str, Any]:
-    """Clinician's amplitude limits of one side, mA, in the shape of `RecordingLog.limits`."""
+    """Read the clinician's amplitude limits of one side, mA, in the shape of `RecordingLog.limits`."""
     own = inside(value, side.capitalize())
     low, high = finite(inside(own, "LowerLimitInMilliAmps")), finite(inside(own, "UpperLimitInMilliAmps"))
     if low is None or high is None:
@@ -136,7 +137,7 @@ def limits(value: dict[str, Any], side: str) -> dict[str, Any]:
 
 
 def group_history(value: Any) -> list[dict[str, Any]]:
-    """Therapy groups at earlier visits, oldest first. The date stands under `SessionDate` or `Sessiondate`."""
+    """List therapy groups at earlier visits, oldest first. The key of the date is `SessionDate` or `Sessiondate`."""
     dated = []
     for entry in entries(value):
         when = moment(entry.get("SessionDate", entry.get("Sessiondate")))
@@ -145,7 +146,8 @@ def group_history(value: Any) -> list[dict[str, Any]]:
 
 
 def trends(value: Any) -> dict[str, Any]:
-    """Averages over 10 minutes by side: times, power in device units, amplitude in mA; sorted, each time once (the newest read counts)."""
+    """Read averages over 10 minutes by side: times, power in device units, amplitude in mA. They are sorted; of equal times the newest read
+    counts."""
     out: dict[str, Any] = {}
     for hemisphere, blocks in value.items() if isinstance(value, dict) else ():
         side = side_of(word(hemisphere) or hemisphere)
@@ -168,7 +170,7 @@ def trends(value: Any) -> dict[str, Any]:
 
 
 def snapshot_events(value: Any) -> list[dict[str, Any]]:
-    """Spectra that the device stored when the patient marked an event. Events may promise a spectrum (`LFP: true`) and hold none."""
+    """List spectra that the device stored when the patient marked an event. Events may promise a spectrum (`LFP: true`) and have none."""
     out = []
     for entry in entries(value)[:MAX_EVENTS]:
         spectra = {}
@@ -183,7 +185,7 @@ def snapshot_events(value: Any) -> list[dict[str, Any]]:
 
 
 def montage(value: Any) -> list[dict[str, Any]]:
-    """The device's own spectra of a survey (LFPMontage): magnitude in uVp, as the programmer shows it."""
+    """List the device's own spectra of a survey (LFPMontage): magnitude in uVp, as the programmer shows it."""
     out = []
     for entry in entries(value)[:200]:
         hz = samples(entry.get("LFPFrequency", entry.get("LFPFrequencyinHertz")))
@@ -200,7 +202,7 @@ def montage(value: Any) -> list[dict[str, Any]]:
 
 
 def battery(report: dict[str, Any]) -> dict[str, Any]:
-    """State of the battery, without its telemetry codes."""
+    """Read the state of the battery, without its telemetry codes."""
     state = report.get("BatteryInformation")
     return {
         "percent": finite(inside(state, "BatteryPercentage")),
@@ -210,7 +212,7 @@ def battery(report: dict[str, Any]) -> dict[str, Any]:
 
 
 def impedance(value: Any) -> list[dict[str, Any]]:
-    """Impedances by side in ohm."""
+    """List impedances by side in ohm."""
     out = []
     for test in entries(value):
         for half in entries(test.get("Hemisphere")):
@@ -226,7 +228,7 @@ DatedEvent = tuple[datetime, str, str, dict[str, Any]]
 
 
 def dated_events(report: dict[str, Any], annotations: Iterable[Annotation] = ()) -> list[DatedEvent]:
-    """The device's event log, the patient's events and the annotations, in time order."""
+    """List the device's event log, the patient's events and the annotations, in time order."""
     out: list[DatedEvent] = [_noted(a) for a in annotations]
     for entry in _log_entries(report):
         when = moment(entry.get("DateTime", entry.get("EventDateTime")))
@@ -247,7 +249,7 @@ def _noted(a: Annotation) -> DatedEvent:
 
 
 def undated_events(report: dict[str, Any]) -> int:
-    """Entries of the patient's events that tell no time: the programmer lists there which events can be marked."""
+    """Count entries of the patient's events without a time: the programmer lists there which events can be marked."""
     return sum(moment(e.get("DateTime", e.get("EventDateTime"))) is None for e in _patient_entries(report))
 
 
@@ -270,7 +272,7 @@ def _patient_entries(report: dict[str, Any]) -> Iterable[dict[str, Any]]:
 
 
 def as_events(dated: Iterable[DatedEvent], origin: datetime) -> tuple[EventLog, ...]:
-    """The events in seconds after `origin`."""
+    """Convert the events to seconds after `origin`."""
     return tuple(EventLog(round((when - origin).total_seconds(), 3), kind, label, data) for when, kind, label, data in dated)
 
 

@@ -45,7 +45,7 @@ _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 
 
 def is_known(text: str) -> bool:
-    """Whether a text is an enumeration that can hold no name, such as `GroupIdDef.GROUP_A` or `ElectrodeDef.SenSight_1a`."""
+    """Decide whether a text is an enumeration that can contain no name, such as `GroupIdDef.GROUP_A` or `ElectrodeDef.SenSight_1a`."""
     match = _ENUM.fullmatch(text)
     if match is None or match[1] not in TYPES:
         return False
@@ -63,7 +63,7 @@ def is_known(text: str) -> bool:
 
 
 def _parts(piece: str) -> list[str]:
-    """`SessionStart` as two words; what is not made of letters alone stays whole."""
+    """Split `SessionStart` into two words; what is not made of letters alone stays whole."""
     found = _WORD.findall(piece)
     return found if "".join(found) == piece and piece else [piece]
 
@@ -72,6 +72,7 @@ _LAST_PART = re.compile(r"[A-Za-z]{1,40}[._]([A-Za-z0-9_]{1,60})")
 
 
 def word(value: Any) -> str | None:
-    """The last part of an enumeration, `GroupIdDef.GROUP_A` or `GroupIdDef_GROUP_A` being `GROUP_A`; None for what is no enumeration."""
+    """Return the last part of an enumeration, `GroupIdDef.GROUP_A` or `GroupIdDef_GROUP_A` being `GROUP_A`; None for what is no
+    enumeration."""
     match = _LAST_PART.fullmatch(value) if isinstance(value, str) else None
     return match[1] if match else None

@@ -18,14 +18,14 @@ SURVEYS = ("LfpMontageTimeDomain", "BrainSenseSurveysTimeDomain", "SenseChannelT
 
 
 def _surveys(report: dict[str, Any], said: FileReport) -> list[SpectrumLog]:
-    """Spectra of surveys and tests of 20 s, named by channel, section and time."""
+    """Read spectra of surveys and tests of 20 s, named by channel, section and time."""
     out: list[SpectrumLog] = []
     seen: set[tuple[str, datetime | None, int]] = set()
     for section in SURVEYS:
         value = report.get(section)
         if section == "BrainSenseSurveysTimeDomain":
             value = _inner(value)
-        # newer reports tell a survey twice
+        # newer reports contain a survey twice
         channels = [c for c in time_domains(section, value) if (c.channel, c.first_packet, c.values.size) not in seen]
         seen.update((c.channel, c.first_packet, c.values.size) for c in channels)
         for c in channels:
@@ -38,12 +38,12 @@ def _surveys(report: dict[str, Any], said: FileReport) -> list[SpectrumLog]:
 
 
 def _inner(value: Any) -> list[dict[str, Any]]:
-    """Entries of a survey as newer versions write it: in lists of their own, by kind of survey."""
+    """List entries of a survey as newer versions write it: in lists of their own, by kind of survey."""
     return [inner for entry in entries(value) for held in entry.values() if isinstance(held, list) for inner in entries(held)]
 
 
 def _counted(dated: Sequence[details.DatedEvent]) -> list[str]:
-    """How many events, annotations and ratings, in words."""
+    """Count events, annotations and ratings, in words."""
     kinds = Counter({"annotation": "annotations", "rating": "ratings"}.get(kind, "events") for _, kind, _, _ in dated)
     return [f"{kinds[name]} {name}" for name in ("events", "annotations", "ratings") if kinds[name]]
 
@@ -51,10 +51,10 @@ def _counted(dated: Sequence[details.DatedEvent]) -> list[str]:
 def history_recording(
     report: dict[str, Any], said: FileReport, options: DecodeOptions, dated: Sequence[details.DatedEvent]
 ) -> RecordingLog | None:
-    """Surveys, and what the device keeps: groups, their history, trends, snapshots, events; a recording that belongs to no session.
+    """Build the recording of surveys and of the device's history: groups, trends, snapshots, events. It belongs to no session.
 
     Args:
-        report: as it was read. said: what was understood is added to it. options: of the decoder. dated: the report's events.
+        report: as it was read. `said`: receives what was understood. options: of the decoder. dated: the report's events.
     """
     spectra = _surveys(report, said)
     diagnostic = report.get("DiagnosticData")

@@ -1,8 +1,7 @@
 """Take identity out of a Percept session report before it is stored.
 
-What stays is listed, not what goes: known sections and keys of the report, and under them numbers, enumerations, times and the few
-texts whose shape says that they are technical. The result decodes to the same recordings, apart from the device's name, which becomes a
-keyed pseudonym.
+The lists name what stays, not what goes: known sections and keys of the report. Under them stay numbers, enumerations, times and the few
+texts with a technical shape. The result decodes to the same recordings, apart from the device's name, which becomes a keyed pseudonym.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from ml.formats.source import Source
 EPOCH = (1980, 1, 1, 0, 0, 0)
 SERIAL = "NeurostimulatorSerialNumber"
 BLANKED = frozenset({"PatientInformation", "ProgrammerTimezone", "ProgrammerLocale", "FeatureInformationCode", "PrescriptionSummary"})
-"""Sections that say who and where somebody is; the programmer's offset from UTC stays."""
+"""Sections that identify a person or a place; the programmer's offset from UTC stays."""
 
 DEEPEST = 40
 MOST_NAMED = 8
@@ -101,7 +100,7 @@ def redact_percept(source: Source, target: Path, key: bytes, limits: ArchiveLimi
 
 
 def _member(files: ZipFiles, member: str, number: int, scrub: _Scrubber, done: Redaction) -> bytes | None:
-    """One report of an archive, clean; None, and a sentence, where it cannot be read."""
+    """Clean one report of an archive; None, and a sentence, where it cannot be read."""
     try:
         with files.open(member) as stream:
             return _dump(scrub.report(read_report(stream, done.repaired)))
@@ -124,7 +123,7 @@ class _Scrubber:
         self._lost: Counter[str] = Counter()
 
     def report(self, report: dict[str, Any]) -> dict[str, Any]:
-        """The report without identity."""
+        """Remove identity from the report."""
         out: dict[str, Any] = {}
         for name, value in report.items():
             if name in BLANKED:
@@ -193,7 +192,7 @@ class _Scrubber:
         return is_known(text)
 
     def sentences(self) -> list[str]:
-        """What was taken out, without showing any of it."""
+        """List what was removed, without showing any of it."""
         said = {
             "patient": "the patient's details (PatientInformation: names, date of birth, identifier, notes, diagnosis)",
             "place": "time zone and language of the programmer, feature codes (the offset from UTC stays)",
@@ -211,7 +210,7 @@ class _Scrubber:
         ]
 
     def _called(self, what: str) -> str:
-        """What was taken out is called, as far as that is technical."""
+        """Name what was removed, as far as the names are technical."""
         names = [name for name, _ in self._named.get(what, Counter()).most_common() if name != "…"]
         more = f" and {len(names) - MOST_NAMED} others" if len(names) > MOST_NAMED else ""
         return f": {', '.join(names[:MOST_NAMED])}{more}" if names else ""

@@ -1,8 +1,8 @@
 """Percept session reports (JSON): streaming runs, surveys and the history that the device keeps. Source: format notes, A′.
 
-Each streaming run gives one recording per side of the brain, on the common grid of steps: `beta` from the samples (`time_domain`), the
-device's `band_power` (`percept_lfp`) and the `amplitude`. The recordings of one run carry the same `run`, and belong to one session. Runs
-of the device's own clock are paired by ticks and channel; when they took place is the programmer's FirstPacketDateTime.
+Each streaming run gives one recording per side of the brain, on the common grid of steps. It has `beta` from the samples (`time_domain`),
+the device's `band_power` (`percept_lfp`) and the `amplitude`. The recordings of one run carry the same `run`, and belong to one session.
+Runs of the device's own clock are paired by ticks and channel; the programmer's FirstPacketDateTime gives their time.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def decode_percept(path: Path, options: DecodeOptions, name: str | None = None) 
 
 
 def report_members(files: ZipFiles, *, damaged: bool = False) -> list[str]:
-    """Members of an archive that begin like a session report; with `damaged` also JSON files that cannot be read, to report them."""
+    """List members of an archive that begin like a session report; with `damaged` also JSON files that cannot be read, to report them."""
     out = []
     for member in files.names():
         try:
@@ -89,7 +89,7 @@ def _next_run(recordings: list[RecordingLog]) -> int:
 
 
 def decode_report(report: dict[str, Any], said: FileReport, options: DecodeOptions, first_run: int = 0) -> tuple[RecordingLog, ...]:
-    """The recordings of one report; what became of each section is added to `said`."""
+    """Decode the recordings of one report; the result of each section is added to `said`."""
     device = device_name(report)
     channels = time_domains("BrainSenseTimeDomain", report.get("BrainSenseTimeDomain"))
     runs = pair_runs(channels, device_powers(report.get("BrainSenseLfp")), said)
@@ -110,7 +110,7 @@ def decode_report(report: dict[str, Any], said: FileReport, options: DecodeOptio
 
 
 def device_name(report: dict[str, Any]) -> str | None:
-    """Serial number of the neurostimulator (or the pseudonym that took its place), None where it was removed."""
+    """Read the serial number of the neurostimulator (or the pseudonym that replaced it); None where it was removed."""
     for part in ("Final", "Initial"):
         serial = inside(report, "DeviceInformation", part, "NeurostimulatorSerialNumber")
         if isinstance(serial, str) and serial.strip():
@@ -121,7 +121,7 @@ def device_name(report: dict[str, Any]) -> str | None:
 def _run_recordings(
     run: Run, number: int, first_run: int, report: dict[str, Any], said: FileReport, options: DecodeOptions, dated: list[details.DatedEvent]
 ) -> list[RecordingLog]:
-    """One recording per side that streamed or was stimulated, with what was marked, noted and rated during the run."""
+    """Build one recording per side that streamed or was stimulated, with what was marked, noted and rated during the run."""
     begin, end = run.span_ms
     noted = _noted_within(dated, run.first_packet, (end - begin) / 1000.0)
     rows = math.ceil((end - begin) / 1000.0 / options.period_s - 1e-6)
@@ -151,7 +151,7 @@ def _run_recordings(
 
 
 def _noted_within(dated: list[details.DatedEvent], start: datetime | None, length_s: float) -> tuple[EventLog, ...]:
-    """Events of people within a run, in seconds of it; none where the run has no date. What the device logs stays in its history."""
+    """Select events of people within a run, in seconds of it; none where the run has no date. What the device logs stays in its history."""
     if start is None:
         return ()
     end = start + timedelta(seconds=length_s)
@@ -164,7 +164,8 @@ def _beta(channel: TimeDomain, begin: float, rows: int, options: DecodeOptions) 
 
 
 def _power_traces(power: DevicePower, side: Side, begin_ms: float, rows: int, options: DecodeOptions) -> list[TraceLog]:
-    """The device's band power of a sensed side, and its amplitude; the run begins `begin_ms` after the first interval does."""
+    """Make traces of the device's band power of a sensed side, and of its amplitude. The run begins `begin_ms` after the first interval
+    does."""
     t_s = (power.ticks_ms - (power.ticks_ms[0] - power.interval_ms) - begin_ms) / 1000.0
     interval = np.full(t_s.size, power.interval_ms / 1000.0)
     out = []
@@ -233,7 +234,7 @@ def _fingerprint(run: Run, side: Side | None, channels: list[TimeDomain]) -> str
 def _describe(
     said: FileReport, label: str, side: Side | None, channels: list[TimeDomain], traces: list[TraceLog], length_s: float
 ) -> None:  # fmt: skip
-    """One sentence per side of a run."""
+    """Describe each side of a run in one sentence."""
     parts = [f"{c.channel}: {c.values.size} samples at {c.rate_hz:g} Hz" for c in channels]
     parts += [f"power of {t.channel}" for t in traces if t.stream == "band_power"]
     parts += ["amplitude" for t in traces if t.stream == "amplitude"]
@@ -261,7 +262,7 @@ def _check_lengths(run: Run, label: str, said: FileReport) -> None:
 
 
 def _indefinite(report: dict[str, Any], said: FileReport, options: DecodeOptions) -> list[RecordingLog]:
-    """Recordings of indefinite streaming: up to six channels, no amplitude, so beta and spectra and no session."""
+    """Build recordings of indefinite streaming: up to six channels, no amplitude, so beta and spectra and no session."""
     runs = pair_runs(time_domains("IndefiniteStreaming", report.get("IndefiniteStreaming")), [], said)
     out = []
     for run in runs:

@@ -1,7 +1,7 @@
 """Percept session reports as JSON: read, and looked into without trusting any field to be there or to be what it should be.
 
-Every section may be missing, a list of one may be the object itself, numbers may be text, and enumerations come in unknown versions
-(format notes, A′).
+Every section may be missing, a list of one may be the object itself, and numbers may be text. Enumerations come in unknown versions (format
+notes, A′).
 """
 
 from __future__ import annotations
@@ -49,24 +49,24 @@ _CHANNEL = re.compile(rf"(?:ELECTRODE_)?{_CONTACT}(?:_(?:AND|{_CONTACT}|LEFT|RIG
 
 
 def looks_like_report(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of a JSON object with a key of a session report."""
+    """Decide whether the first bytes of a file are those of a JSON object with a key of a session report."""
     text = _text(head)
     return text is not None and text.lstrip().startswith("{") and any(m[1] in TELLING for m in _TOP_KEY.finditer(text))
 
 
 def _text(raw: bytes) -> str | None:
-    """Bytes as text, by their byte-order mark or as UTF-8; None for UTF-16 without a mark or worse."""
+    """Decode bytes to text, by their byte-order mark or as UTF-8; None for UTF-16 without a mark or worse."""
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         return raw.decode("utf-16", "replace")
     return None if b"\0" in raw else raw.decode("utf-8-sig", "replace")
 
 
 def read_report(stream: IO[bytes], notes: list[str]) -> dict[str, Any]:
-    """The report as plain values.
+    """Read the report as plain values.
 
     Args:
         stream: its bytes.
-        notes: what was mended is added here, in sentences.
+        notes: receives each repair, in a sentence.
 
     Raises:
         UndecodableFile: empty, too large, not whole JSON, nested beyond reason, or no session report.
@@ -104,21 +104,21 @@ def _parse(text: str, notes: list[str]) -> Any:
 
 
 def entries(value: Any) -> list[dict[str, Any]]:
-    """A section as a list of objects: a single object stands for a list of one, anything else for none."""
+    """Read a section as a list of objects: a single object counts as a list of one, anything else as none."""
     if isinstance(value, dict):
         return [value]
     return [v for v in value if isinstance(v, dict)] if isinstance(value, list) else []
 
 
 def inside(value: Any, *keys: str) -> Any:
-    """What stands below a path of keys, None where any is missing."""
+    """Return the value below a path of keys, None where any is missing."""
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
     return value
 
 
 def finite(value: Any) -> float | None:
-    """A finite number, also where it is written as text; None for anything else."""
+    """Read a finite number, also where it is written as text; None for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         return None
     try:
@@ -129,7 +129,7 @@ def finite(value: Any) -> float | None:
 
 
 def samples(value: Any) -> NDArray[np.float64]:
-    """A list of numbers as float64 [n], NaN for what is none."""
+    """Convert a list of numbers to float64 [n], NaN for what is none."""
     if not isinstance(value, list):
         return np.empty(0)
     try:
@@ -143,7 +143,8 @@ def samples(value: Any) -> NDArray[np.float64]:
 
 
 def packet_list(value: Any) -> NDArray[np.float64]:
-    """A list of packets in any of its spellings, `"1,2,"`, `"[1, 2]"` or `[1, 2]`, as float64 [n] with NaN for what is no number."""
+    """Convert a list of packets in any of its spellings, `"1,2,"`, `"[1, 2]"` or `[1, 2]`, to float64 [n] with NaN for what is no
+    number."""
     if isinstance(value, str):
         value = [part for part in (p.strip() for p in value.strip().strip("[]").split(",")) if part]
     elif isinstance(value, int | float):
@@ -152,7 +153,7 @@ def packet_list(value: Any) -> NDArray[np.float64]:
 
 
 def moment(value: Any) -> datetime | None:
-    """A point in time; text without a zone is UTC, as the programmer writes it. None for anything else."""
+    """Parse a point in time; text without a zone is UTC, as the programmer writes it. None for anything else."""
     if not isinstance(value, str) or len(value) > 40:
         return None
     try:
@@ -164,7 +165,7 @@ def moment(value: Any) -> datetime | None:
 
 
 def utc_offset_h(value: Any) -> float | None:
-    """Hours that the programmer's clock was ahead of UTC, from a text like `+01:00`; None for anything else."""
+    """Parse the hours that the programmer's clock was ahead of UTC, from a text like `+01:00`; None for anything else."""
     found = _OFFSET.fullmatch(value.strip()) if isinstance(value, str) else None
     if found is None:
         return None
@@ -173,14 +174,14 @@ def utc_offset_h(value: Any) -> float | None:
 
 
 def side_of(value: Any) -> Literal["left", "right"] | None:
-    """The side that a channel, a lead or a hemisphere names, None where it names none or both."""
+    """Find the side that a channel, a lead or a hemisphere names, None where it names none or both."""
     parts = re.split(r"[^a-z]+", value.lower()) if isinstance(value, str) else []
     named = [side for side in SIDES if side in parts]
     return named[0] if len(named) == 1 else None
 
 
 def channel_names(value: Any) -> list[str]:
-    """Names of channels in a field, which may name two: `ZERO_TWO_LEFT,ONE_THREE_RIGHT`. Texts that are no channel are left out."""
+    """List the names of channels in a field, which may name two: `ZERO_TWO_LEFT,ONE_THREE_RIGHT`. Texts that are no channel are ignored."""
     if isinstance(value, str):
         value = value.split(",")
     parts: Iterable[Any] = value if isinstance(value, list) else []

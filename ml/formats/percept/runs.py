@@ -1,4 +1,4 @@
-"""Which channels and powers of a Percept report were streamed together. Source: format notes, A′."""
+"""Runs: channels and powers of a Percept report that were streamed together. Source: format notes, A′."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Run:
 
 
 def pair_runs(channels: list[TimeDomain], powers: list[DevicePower], said: FileReport) -> list[Run]:
-    """Channels and powers that were streamed together, in the order of the file.
+    """Pair channels and powers that were streamed together, in the order of the file.
 
     By ticks and channel: FirstPacketDateTime has seconds only and may differ by one within a run.
     """
@@ -80,9 +80,11 @@ def pair_runs(channels: list[TimeDomain], powers: list[DevicePower], said: FileR
 
 
 def _same_run(run: Run, channel: TimeDomain) -> bool:
-    """Another channel of the run: other name, and ticks or else times that begin together, or are apart by what its first packets took.
+    """Recognise another channel of the run: another name, and ticks or else times that begin together. A difference equal to its lost first
+    packets is allowed.
 
-    Where the first packets of one side were lost, ticks and times of that side begin later by the same, and the two run on together.
+    Where the first packets of one side were lost, ticks and times of that side begin later by the same amount. The two then continue
+    together.
     """
     if any(c.channel == channel.channel for c in run.channels):
         return False
@@ -102,7 +104,7 @@ def _same_run(run: Run, channel: TimeDomain) -> bool:
 
 
 def _fits(run: Run, power: DevicePower) -> bool:
-    """Power of the run: of one of its channels, and beginning with it, or, where the first values were lost, lying within it."""
+    """Decide whether power is of the run: of one of its channels, and beginning with it, or within it where the first values were lost."""
     first, last = float(power.ticks_ms[0]) - power.interval_ms, float(power.ticks_ms[-1])
     named = {c.channel for c in run.channels}
     if power.channels and not named & set(power.channels):
@@ -114,11 +116,11 @@ def _fits(run: Run, power: DevicePower) -> bool:
     later_ms = abs(begin - first)
     if later_ms <= SAME_RUN_MS:
         return True
-    # ticks of two runs may cover the same range after the device has begun them anew: then the programmer's times differ
+    # ticks of two runs may cover the same range after the device has restarted them: then the programmer's times differ
     within = min(end, last) - max(begin, first) >= MOSTLY * min(end - begin, last - first)
     return within and seconds <= SAME_RUN_S + later_ms / 1000.0
 
 
 def apart_s(one: datetime | None, other: datetime | None) -> float:
-    """Seconds between two times; 0 where either is not known."""
+    """Compute the seconds between two times; 0 where either is unknown."""
     return abs((one - other).total_seconds()) if one and other else 0.0

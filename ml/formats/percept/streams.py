@@ -1,6 +1,6 @@
 """Streams of a Percept: samples placed in time by their packets' ticks, and the device's own power and amplitude at 2 Hz.
 
-A packet's tick is the time of its last sample, in ms with a resolution of 50 ms. A step of the ticks longer than the packet is loss; a step
+A packet's tick is the time of its last sample, in ms with a resolution of 50 ms. A step of the ticks longer than the packet is loss. A step
 of 2 in the sequence numbers is not, since they count parts of packets. Source: format notes, A′, after the loop that Medtronic published.
 """
 
@@ -20,10 +20,10 @@ from ml.formats.percept.report_json import SIDES, channel_names, entries, finite
 
 Side = Literal["left", "right"]
 TURN_MS = 65_536 * 50.0
-"""After this long the ticks begin anew."""
+"""Time after which the ticks restart."""
 
 MAX_SPAN_MS = 3 * 24 * 3600 * 1000.0
-"""Ticks of one run that span more are broken: nobody streams for three days."""
+"""Longest span of the ticks of one run; a longer one is broken, since no run lasts three days."""
 
 DEFAULT_RATE_HZ = 250.0
 RATE_TOLERANCE = 0.15
@@ -38,7 +38,7 @@ class TimeDomain:
     """Samples of one channel of one run.
 
     Attributes:
-        channel: the device's name. side: of the brain. section: where it stands in the report.
+        channel: the device's name. side: of the brain. section: of the report.
         first_packet: time of the programmer at the first packet, resolution 1 s.
         rate_hz: samples per second. values: uV, [n], NaN where there is no number.
         begin_ms, end_ms: time before the first and of the last sample in ticks; from 0 where the file gives no ticks.
@@ -63,7 +63,7 @@ class TimeDomain:
     notes: list[str] = field(default_factory=list)
 
     def stretches(self, origin_ms: float) -> list[tuple[float, float, NDArray[np.float64]]]:
-        """Gap-free pieces (time of the first sample in s after `origin_ms`, rate, samples in uV); NaN samples cut them too."""
+        """List gap-free pieces (time of the first sample in s after `origin_ms`, rate, samples in uV); NaN samples cut them too."""
         out = []
         for start_ms, first, end in self.pieces:
             good = np.isfinite(self.values[first:end])
@@ -80,7 +80,7 @@ class DevicePower:
 
     Attributes:
         channels: names of the sensed channels. first_packet: as in `TimeDomain`.
-        ticks_ms: end of each value's interval, [n], strictly increasing. interval_ms: what one value stands for.
+        ticks_ms: end of each value's interval, [n], strictly increasing. interval_ms: time that one value covers.
         power: device units by side, [n]; NaN where there is none. amplitude_ma: delivered current by side, [n].
         snapshot: the therapy that was set.
         notes: what was adapted, in sentences.
@@ -96,12 +96,12 @@ class DevicePower:
     notes: list[str] = field(default_factory=list)
 
     def channel_of(self, side: Side) -> str | None:
-        """The sensed channel of a side."""
+        """Find the sensed channel of a side."""
         return next((name for name in self.channels if side_of(name) == side), None)
 
 
 def time_domains(section: str, value: Any) -> list[TimeDomain]:
-    """All channels of a time-domain section that hold samples, placed in time."""
+    """Read all channels of a time-domain section that have samples, placed in time."""
     out = []
     for number, entry in enumerate(entries(value), start=1):
         values = samples(entry.get("TimeDomainData", entry.get("TimeDomainDatainMicroVolts")))
@@ -167,13 +167,13 @@ def place(data: TimeDomain, sizes: NDArray[np.float64], ticks_ms: NDArray[np.flo
 def _one_per_tick(
     first: NDArray[np.int64], counts: NDArray[np.int64], ticks_ms: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Packets that follow each other under one tick as one packet: the tick is that of its last sample, and no signal is missing within."""
+    """Join packets that follow each other under one tick: the tick is that of its last sample, and no signal is missing within."""
     starts = np.flatnonzero(np.concatenate(([True], (np.diff(ticks_ms) != 0) | (first[1:] != first[:-1] + counts[:-1]))))
     return first[starts], np.add.reduceat(counts, starts), ticks_ms[starts]
 
 
 def _true_sizes(data: TimeDomain, sizes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Packet sizes that add up to the samples that are there, or none."""
+    """Return packet sizes that add up to the present samples, or none."""
     if sizes.size == 0:
         return sizes
     if not np.all((sizes >= 0) & (sizes < 1e7) & (sizes == np.floor(sizes))):
@@ -194,13 +194,13 @@ def _usable(ticks_ms: NDArray[np.float64]) -> bool:
 
 
 def unrolled(ticks_ms: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Ticks that run on where the counter began anew."""
+    """Extend ticks so that they continue where the counter restarted."""
     turns = np.concatenate(([0], np.cumsum(np.diff(ticks_ms) < -TURN_MS / 2)))
     return ticks_ms + TURN_MS * turns
 
 
 def _not_repeated(ticks_ms: NDArray[np.float64], sequences: NDArray[np.float64], data: TimeDomain) -> NDArray[np.bool_]:
-    """Packets that are no repetition of the one before: same tick and same sequence number."""
+    """Mark packets that do not repeat the one before: same tick and same sequence number."""
     keep = np.ones(ticks_ms.size, dtype=bool)
     if sequences.size == ticks_ms.size:
         keep[1:] = (np.diff(ticks_ms) != 0) | (np.diff(sequences) != 0)
@@ -247,7 +247,7 @@ def _pieces(data: TimeDomain, first: NDArray[np.int64], counts: NDArray[np.int64
 
 
 def device_powers(value: Any) -> list[DevicePower]:
-    """All runs of the device's own power that hold values."""
+    """Read all runs of the device's own power that have values."""
     out = []
     for entry in entries(value):
         rows = entries(entry.get("LfpData"))
@@ -282,7 +282,8 @@ def device_powers(value: Any) -> list[DevicePower]:
 
 
 def _interval_ms(rate_hz: float | None, ticks_ms: NDArray[np.float64]) -> tuple[float, str | None]:
-    """What one value of the power stands for, ms, and a sentence where the stated rate is not that of the ticks: then the ticks count."""
+    """Compute the time that one value of the power covers, ms. Add a sentence where the stated rate is not that of the ticks, which count
+    then."""
     stated = 1000.0 / (rate_hz if rate_hz is not None and 0.01 <= rate_hz <= 1000 else DEFAULT_LFP_RATE_HZ)
     if ticks_ms.size < LEAST_PACKETS:
         return stated, None
@@ -293,7 +294,7 @@ def _interval_ms(rate_hz: float | None, ticks_ms: NDArray[np.float64]) -> tuple[
 
 
 def _column(rows: list[dict[str, Any]], side: Side, key: str) -> NDArray[np.float64]:
-    """One side's values, NaN where there is none or it cannot be: power and current are 0 or more."""
+    """Read one side's values, NaN where there is none or it is impossible: power and current are 0 or more."""
     values = samples([inside(row, side.capitalize(), key) for row in rows])
     values[~(values >= 0)] = np.nan
     if key == "mA":

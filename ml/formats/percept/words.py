@@ -1,7 +1,6 @@
 """Closed vocabulary of Percept reports: names of keys, and what a person may have typed, are kept where they are made of these words alone.
 
-What a report calls a field that nobody here knows may as well be a person's name. Of such a name the words of this list are shown, others
-as `…`.
+A field with an unknown name may have a person's name. Of such a name the words of this list are shown, others as `…`.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ EVENT_WORDS = (
     "on",
     "off",
 )
-"""Names of patient events that are kept; any other name may say who somebody is, and is shown as its number."""
+"""Names of patient events that stay; any other name may identify a person, and is shown as its number."""
 
 SYMPTOMS = frozenset({w for name in EVENT_WORDS for w in name.split()} - {"on", "off", "took", "feeling", "good"})
 """Words that name a symptom or an activity by themselves."""
@@ -67,18 +66,18 @@ NAMING = frozenset(
         """,
     )
 )
-"""Words that a key may be made of beside those of known keys."""
+"""Further words of keys, in addition to those of known keys."""
 
 KEY_WORDS = frozenset(part.lower() for key in KEYS | SECTIONS for part in _PART.findall(key)) | NAMING | SYMPTOMS
 
 
 def parts(key: str) -> list[str]:
-    """The words of a key in small letters: `SymptomRatings` and `symptom_ratings` are both `symptom`, `ratings`."""
+    """Split a key into words in small letters: `SymptomRatings` and `symptom_ratings` are both `symptom`, `ratings`."""
     return [part.lower() for part in _PART.findall(key[:200])]
 
 
 def cleaned(key: str) -> str:
-    """A key as it may be shown: its words as far as they are technical, `…` for the others."""
+    """Clean a key so that it may be shown: technical words stay, others become `…`."""
     out: list[str] = []
     for part in parts(key)[:_MOST_PARTS]:
         said = part if part in KEY_WORDS else "…"
@@ -88,7 +87,7 @@ def cleaned(key: str) -> str:
 
 
 def typed(text: str) -> str | None:
-    """A text that a person may have typed, in small letters, where every word of it is known; None otherwise."""
+    """Return a text that a person may have typed, in small letters, where every word of it is known; None otherwise."""
     words = text.strip().lower().split() if len(text) <= 120 else []
     plain = [w.strip(".,;:!?()") for w in words]
     return " ".join(plain) if plain and all(w in TYPED for w in plain) else None

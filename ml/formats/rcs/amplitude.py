@@ -34,7 +34,7 @@ class AmplitudeSteps:
 
 
 def delivered(therapy: Therapy) -> tuple[float, float, float, float]:
-    """Amplitude of the four programs under these settings, mA; NaN where unknown.
+    """Compute the amplitude of the four programs under these settings, mA; NaN where unknown.
 
     Without settings that say which programs are enabled, the first one is taken to be.
     """
@@ -50,7 +50,7 @@ def delivered(therapy: Therapy) -> tuple[float, float, float, float]:
 
 
 def stimulating(therapy: Therapy) -> tuple[int, ...]:
-    """Enabled programs of the active group; the first one when no settings tell."""
+    """List the enabled programs of the active group; the first one where the settings name none."""
     enabled = [p.enabled for p in therapy.programs]
     if enabled and all(value is None for value in enabled):
         return (0,)
@@ -58,7 +58,7 @@ def stimulating(therapy: Therapy) -> tuple[int, ...]:
 
 
 def amplitude_steps(settings: Settings, adaptive: Adaptive | None, times: PacketTimes | None) -> AmplitudeSteps:
-    """The amplitude timeline of the whole recording."""
+    """Build the amplitude timeline of the whole recording."""
     states = settings.therapy.states
     base_t = np.array(settings.therapy.times_ms, dtype=np.float64)
     base_v = np.array([delivered(state) for state in states], dtype=np.float64).reshape(-1, 4)
@@ -80,7 +80,7 @@ def amplitude_steps(settings: Settings, adaptive: Adaptive | None, times: Packet
 
 
 def _masked(values: NDArray[np.float64], t_ms: NDArray[np.float64], settings: Settings) -> NDArray[np.float64]:
-    """Adaptive amplitudes with programs that do not stimulate, and times with therapy off, at 0."""
+    """Set adaptive amplitudes to 0 for programs that do not stimulate, and at times with therapy off."""
     out = values.copy()
     out[(out < 0) | (out >= UPPER_PLAUSIBLE_MA)] = np.nan
     for i, time in enumerate(t_ms):

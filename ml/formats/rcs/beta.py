@@ -23,14 +23,15 @@ ROWS_AT_ONCE = 300
 SAMPLES_AT_ONCE = 1_000_000
 
 MARGIN_CYCLES = 40.0
-"""What is filtered on either side of a block of rows, in cycles of the band's width: by then the filter has forgotten where it began."""
+"""Signal that is filtered on either side of a block of rows, in cycles of the band's width. By then the filter has forgotten where it
+began."""
 
 Stretch = tuple[float, float, NDArray[np.float64]]
 """Time of the first sample in PC ms, rate in Hz, samples in mV."""
 
 
 def time_domain_stretches(data: TimeDomain, times: PacketTimes, settings: Settings) -> dict[str, list[Stretch]]:
-    """Gap-free stretches by channel and contact pair, e.g. `key 0 +2-0`, in the order of the file.
+    """List gap-free stretches by channel and contact pair, e.g. `key 0 +2-0`, in the order of the file.
 
     Samples that are not strictly later than those before them are dropped, so overlapping packets count once; those that no electrode gives
     are gaps.
@@ -46,7 +47,7 @@ def time_domain_stretches(data: TimeDomain, times: PacketTimes, settings: Settin
 
 
 def _channels(key: int, t_ms: NDArray[np.float64], settings: Settings) -> tuple[list[str], NDArray[np.int64]]:
-    """Names that a key has in the course of the settings, and which of them is in force at each time, [n]."""
+    """List the names that a key has in the course of the settings, and which of them is in force at each time, [n]."""
     states: list[Sensing] = settings.sensing.states or [Sensing()]
     of_state = [f"key {key} {state.contacts[key]}".strip() for state in states]
     names = list(dict.fromkeys(of_state))
@@ -56,7 +57,7 @@ def _channels(key: int, t_ms: NDArray[np.float64], settings: Settings) -> tuple[
 
 
 def _pieces(data: TimeDomain, times: PacketTimes, key: int, packets: NDArray[np.int64]) -> Iterator[Stretch]:
-    """Runs of packets that follow each other within a chunk, cut where a sample is missing and where they overlap what came before."""
+    """Yield runs of packets that follow each other within a chunk, cut where a sample is missing and where they overlap earlier ones."""
     if packets.size == 0:
         return
     count, rate, begin = data.headers.samples[packets], data.headers.rate_hz[packets], data.offsets[key][packets]
@@ -74,7 +75,7 @@ def _pieces(data: TimeDomain, times: PacketTimes, key: int, packets: NDArray[np.
 
 
 def impossible_samples(data: TimeDomain) -> int:
-    """How many samples no electrode gives, of all channels."""
+    """Count the samples of all channels that no electrode gives."""
     return sum(int(np.sum(np.abs(x) > LARGEST_UV / UV_PER_MV)) for x in data.samples)
 
 
@@ -87,7 +88,7 @@ def _true_runs(x: NDArray[np.float64]) -> Iterator[tuple[int, int]]:
 
 
 def _join(pieces: Iterator[Stretch]) -> Iterator[Stretch]:
-    """Pieces that follow each other without a missing sample become one."""
+    """Join pieces that follow each other without a missing sample."""
     run: list[Stretch] = []
     due_ms = 0.0
     for piece in pieces:
@@ -107,7 +108,7 @@ def _joined(pieces: list[Stretch]) -> Stretch:
 
 
 def beta_traces(channels: dict[str, list[Stretch]], grid: Grid, notes: list[str]) -> list[TraceLog]:
-    """RMS amplitude (uV) and power (uV^2) of the beta band per channel and contact pair; the participant's measure is `beta`.
+    """Compute RMS amplitude (uV) and power (uV^2) of the beta band per channel and contact pair; the participant's measure is `beta`.
 
     Where rows are not whole, `beta_error` is the standard error of `beta`.
     """
@@ -132,7 +133,7 @@ def beta_traces(channels: dict[str, list[Stretch]], grid: Grid, notes: list[str]
 
 
 def time_domain_samples(channels: dict[str, list[Stretch]], grid: Grid) -> list[SampleLog]:
-    """The samples of each channel in uV, with the times of the recording's clock."""
+    """Collect the samples of each channel in uV, with the times of the recording's clock."""
     return [
         SampleLog.of(channel, "uV", [((start - grid.start_ms) / 1000.0, rate, UV_PER_MV * x) for start, rate, x in pieces])
         for channel, pieces in channels.items()
@@ -140,7 +141,7 @@ def time_domain_samples(channels: dict[str, list[Stretch]], grid: Grid) -> list[
 
 
 def band_rows_in_blocks(stretches: list[Stretch], grid: Grid) -> BandRows:
-    """`ml.signals.band_rows` of samples in uV, a block of rows at a time.
+    """Compute `ml.signals.band_rows` of samples in uV, a block of rows at a time.
 
     Amplitudes equal those of the whole, for one model of the whole fills the gaps; the standard errors rest on the block's own
     autocorrelation.
@@ -172,7 +173,8 @@ def band_rows_in_blocks(stretches: list[Stretch], grid: Grid) -> BandRows:
 
 
 def time_domain_spectra(channels: dict[str, list[Stretch]]) -> list[SpectrumLog]:
-    """Welch spectrum up to 100 Hz in bins of 1 Hz per channel, gaps left out; channels without a whole second of signal have none."""
+    """Estimate the Welch spectrum up to 100 Hz in bins of 1 Hz per channel, without gaps; channels without a whole second of signal have
+    none."""
     out = []
     for channel, pieces in channels.items():
         hz, density, seconds = spectrum(pieces)
@@ -182,7 +184,7 @@ def time_domain_spectra(channels: dict[str, list[Stretch]]) -> list[SpectrumLog]
 
 
 def flat_share(samples: NDArray[np.float64]) -> float:
-    """Share of samples equal to the one before: near 0 for a living channel, near 1 for one at its rail."""
+    """Compute the share of samples equal to the one before: near 0 for a living channel, near 1 for one at its rail."""
     if samples.size < 2:
         return 0.0
     blocks = (samples[i : i + SAMPLES_AT_ONCE + 1] for i in range(0, samples.size - 1, SAMPLES_AT_ONCE))

@@ -1,4 +1,4 @@
-"""What happened during an RC+S recording: stimulation steps, changes of the adaptive state, operator's notes and where they disagree."""
+"""Events of an RC+S recording: stimulation steps, changes of the adaptive state, operator's notes and where they disagree."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CASE = 16
 
 
 def stimulation_events(settings: Settings, grid: Grid) -> list[EventLog]:
-    """Every state of the stimulation log that differs from the one before: therapy on or off, amplitude, rate, pulse width."""
+    """List every state of the stimulation log that differs from the one before: therapy on or off, amplitude, rate, pulse width."""
     out = []
     for t_ms, state in zip(settings.therapy.times_ms, settings.therapy.states, strict=True):
         programs = []
@@ -51,7 +51,7 @@ def stimulation_events(settings: Settings, grid: Grid) -> list[EventLog]:
 
 
 def _contacts(settings: Settings, group: int | None, program: int) -> str:
-    """Stimulating contacts with their signs, such as `-2 +C` (C: the case); empty where the settings do not tell."""
+    """List stimulating contacts with their signs, such as `-2 +C` (C: the case); empty where the settings lack them."""
     electrodes = get(settings.merged, f"TherapyConfigGroup{group}", "programs", program, "electrodes", "electrodes")
     signs = {0: "-", 1: "+"}
     used = [
@@ -63,7 +63,7 @@ def _contacts(settings: Settings, group: int | None, program: int) -> str:
 
 
 def adaptive_events(data: Adaptive, times: PacketTimes, grid: Grid) -> list[EventLog]:
-    """Changes of the adaptive state; the first state is the first event."""
+    """List changes of the adaptive state; the first state is the first event."""
     placed = np.flatnonzero(np.isfinite(times.last_ms))
     states = data.state[placed]
     changed = placed[np.flatnonzero(np.diff(states, prepend=states[0] - 1 if states.size else 0))]
@@ -76,7 +76,7 @@ def adaptive_events(data: Adaptive, times: PacketTimes, grid: Grid) -> list[Even
 def note_events(
     records: list[Any], steps: AmplitudeSteps, grid: Grid, of_pc_ms: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> list[EventLog]:
-    """Operator's notes by the grammar of labels. `conflict` is true where the noted amplitude is not the device's at that time.
+    """List operator's notes by the grammar of labels. `conflict` is true where the noted amplitude is not the device's at that time.
 
     `of_pc_ms` brings the notes' PC times onto the recording's timeline.
     """
@@ -97,7 +97,7 @@ def note_events(
 
 
 def _amplitude_at(steps: AmplitudeSteps, t_ms: float) -> float | None:
-    """Amplitude of the program that stimulates, mA; the largest when there are several, None when unknown."""
+    """Find the amplitude of the program that stimulates, mA; the largest when there are several, None when unknown."""
     i = int(np.searchsorted(steps.t_ms, t_ms, side="right")) - 1
     if i < 0 or not steps.programs:
         return None

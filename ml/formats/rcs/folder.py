@@ -57,7 +57,7 @@ class SessionFiles:
     reports: dict[str, FileReport] = field(default_factory=dict)
 
     def report(self, stem: str) -> FileReport:
-        """The report of one of the folder's files; its name never shows the folder, which may hold a serial number."""
+        """Return the report of one of the folder's files; its name never shows the folder, which may contain a serial number."""
         return self.reports.setdefault(stem, FileReport(f"{self.label}{stem}.json"))
 
 
@@ -95,7 +95,7 @@ def decode_files(files: Files, options: DecodeOptions, name: str) -> DecodedFile
 
 
 def find_sessions(files: Files, report: FileReport) -> list[SessionFiles]:
-    """Known files by folder, and within a folder by the implant and the session that they name: two recordings are never mixed.
+    """Group known files by folder, and within a folder by the implant and the session that they name: two recordings are never mixed.
 
     A file is known by its name, else by its content. The others are counted in the report, without their names, which may identify a
     person.
@@ -118,7 +118,7 @@ def find_sessions(files: Files, report: FileReport) -> list[SessionFiles]:
 
 
 def _opening(files: Files, name: str) -> Opening:
-    """The begin of a file; one that cannot be unpacked says nothing here and is reported when it is read."""
+    """Read the beginning of a file; one that cannot be unpacked gives nothing here and is reported when it is read."""
     try:
         with files.open(name) as stream:
             return read_opening(stream.read(HEAD))
@@ -127,7 +127,7 @@ def _opening(files: Files, name: str) -> Opening:
 
 
 def _apart(listed: Sequence[tuple[str, str, Opening]], report: FileReport) -> list[dict[str, str]]:
-    """The files of one folder as one or more recordings, each from stem to name; what is left out is said."""
+    """Split the files of one folder into one or more recordings, each from stem to name; ignored files are reported."""
     groups = group([opening for _, _, opening in listed])
     if len(groups.recordings) > 1:
         report.flagged.append(MIXED.format(len(groups.recordings)))
@@ -155,7 +155,7 @@ def decode_session(session: SessionFiles, files: Files, options: DecodeOptions) 
 
 
 def read_streams(session: SessionFiles, files: Files) -> Streams:
-    """Everything in one device folder, not yet placed in time; what is defect stands in the reports."""
+    """Read everything in one device folder, not yet placed in time; the reports list the defects."""
     infos: list[dict[str, Any]] = []
     records = {stem: _records(session, files, stem, infos) for stem in ("DeviceSettings", "StimLog", "EventLog")}
     settings = follow(records["DeviceSettings"], records["StimLog"])
@@ -183,7 +183,8 @@ def _interval_at(settings: Settings) -> Interval:
 
 
 def _elements(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]]) -> Iterator[Any]:
-    """Records of one file, or its packets, in runs where they are plain; its report is complete when the iterator is exhausted."""
+    """Yield the records of one file, or its packets, in runs where they are plain; its report is complete when the iterator is
+    exhausted."""
     report = session.report(stem)
     notes = JsonNotes()
     wanted = KEY_OF.get(stem)
@@ -206,7 +207,7 @@ def _elements(session: SessionFiles, files: Files, stem: str, infos: list[dict[s
 
 
 def _limited(elements: Iterable[Any], report: FileReport) -> Iterator[Any]:
-    """Elements up to what one file may ask of the memory; what is beyond is counted in the report."""
+    """Yield elements up to the memory limit of one file; the report counts those beyond."""
     packets = numbers = beyond = 0
     for element in elements:
         size, many = (element.size, element.pool.size) if isinstance(element, Batch) else (1, 0)
@@ -220,7 +221,7 @@ def _limited(elements: Iterable[Any], report: FileReport) -> Iterator[Any]:
 
 
 def _batches(elements: Iterable[Any]) -> Iterator[Batch]:
-    """Packets in the order of the file, whichever way they were read."""
+    """Yield packets in the order of the file, whichever way they were read."""
     others: list[Any] = []
     for element in elements:
         plain = isinstance(element, Batch)
@@ -236,7 +237,7 @@ def _batches(elements: Iterable[Any]) -> Iterator[Batch]:
 
 
 def _records(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]]) -> list[Any]:
-    """Records of a record file, reduced to the parts that are used."""
+    """Read the records of a record file, reduced to the parts that are used."""
     if stem not in session.members:
         return []
     out: list[Any] = []
@@ -255,7 +256,7 @@ def _records(session: SessionFiles, files: Files, stem: str, infos: list[dict[st
 
 
 def _stream(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]], read: Callable[[Iterator[Any]], T]) -> T | None:
-    """A stream file read by `read`; None where the file is missing."""
+    """Read a stream file by `read`; None where the file is missing."""
     if stem not in session.members:
         return None
     report = session.report(stem)

@@ -1,4 +1,4 @@
-"""Keys that the files of an RC+S session are known to have; what stands under any other key is not stored.
+"""Keys that the files of an RC+S session are known to have; values of any other key are not stored.
 
 They are those of the format notes and of real recordings. Keys that name a person or a device are not among them: `redact` treats
 them first.

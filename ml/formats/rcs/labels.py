@@ -19,9 +19,9 @@ NO_LABEL = "note"
 
 
 def parse(*texts: object) -> dict[str, Any]:
-    """What the texts say of stimulation: any of `verb`, `amplitude_ma`, `rate_hz`, `pulse_width_us`, `group`, `config`.
+    """Parse what the texts state about stimulation: any of `verb`, `amplitude_ma`, `rate_hz`, `pulse_width_us`, `group`, `config`.
 
-    A quantity named with two different values is left out: the note cannot be compared with the device.
+    A quantity named with two different values is ignored: the note cannot be compared with the device.
     """
     found: dict[str, Any] = {}
     whole = [text[:2000] for text in texts if isinstance(text, str)]
@@ -42,7 +42,7 @@ def parse(*texts: object) -> dict[str, Any]:
 
 
 def render(found: dict[str, Any]) -> str:
-    """The label in one fixed spelling; `note` when nothing of it is known."""
+    """Write the label in one fixed spelling; `note` when nothing of it is known."""
     parts = [found["verb"]] if "verb" in found else []
     for name, text in (
         ("amplitude_ma", "{:g} mA"),

@@ -1,8 +1,8 @@
-"""Which side and target the leads of an RC+S recording are in: the one fact of SubjectInfo that is kept, through a closed grammar.
+"""Side and target of the leads of an RC+S recording: the one fact of SubjectInfo that is stored, through a closed grammar.
 
-`LeadTargets` names the target of each of four leads, with or without a side ("STN", "Left STN", "R GPi"); `LeadLocation` gives the side as
-a code. 2 is the right side (recordings with that code call their programs "R STN" and "R GPi"), 1 the left. Leads 0 and 1 belong to the
-first bore (time-domain keys 0 and 1, contacts 0 to 7), leads 2 and 3 to the second.
+`LeadTargets` names the target of each of four leads, with or without a side ("STN", "Left STN", "R GPi"). `LeadLocation` gives the side as
+a code: 1 is left, 2 is right (recordings with code 2 call their programs "R STN" and "R GPi"). Leads 0 and 1 belong to the first bore
+(time-domain keys 0 and 1, contacts 0 to 7), leads 2 and 3 to the second.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _WORDS = re.compile(r"[a-z0-9/]+", re.IGNORECASE)
 
 
 def clean_leads(subject: Any) -> dict[str, Any]:
-    """SubjectInfo reduced to side and target per lead, in the same spelling whatever went in; empty where neither is known.
+    """Reduce SubjectInfo to side and target per lead, always in the same spelling; empty where neither is known.
 
     A text with any word outside the grammar says nothing: what remains can be no name.
     """
@@ -35,7 +35,7 @@ def clean_leads(subject: Any) -> dict[str, Any]:
 
 
 def _target(text: Any) -> str:
-    """`right STN`, `STN`, `right` or nothing."""
+    """Extract `right STN`, `STN`, `right` or nothing."""
     if not isinstance(text, str) or len(text) > 40:
         return ""
     words = [word.lower() for word in _WORDS.findall(text)]
@@ -47,13 +47,13 @@ def _target(text: Any) -> str:
 
 
 def leads_only(record: dict[str, Any]) -> dict[str, Any]:
-    """The `SubjectInfo` entry of a settings record with its leads alone, empty where it names none."""
+    """Reduce the `SubjectInfo` entry of a settings record to its leads, empty where it names none."""
     found = clean_leads(record["SubjectInfo"]) if "SubjectInfo" in record else {}
     return {"SubjectInfo": found} if found else {}
 
 
 def sides(subject: Any) -> tuple[Hemisphere | None, ...]:
-    """Side of each lead, from its name and its code; None where neither says, they differ, or no lead is there."""
+    """Find the side of each lead, from its name and its code; None where both are silent, they differ, or no lead is there."""
     found = clean_leads(subject)
     out: list[Hemisphere | None] = []
     for i in range(LEADS):
@@ -65,7 +65,8 @@ def sides(subject: Any) -> tuple[Hemisphere | None, ...]:
 
 
 def hemisphere(subject: Any, keys: Iterable[int]) -> Hemisphere | None:
-    """The side that all leads behind the given time-domain keys share; all leads where no key is given. None when they do not agree."""
+    """Find the side that all leads behind the given time-domain keys share; all leads where no key is given. None when they do not
+    agree."""
     bores = {key // 2 for key in keys} or {0, 1}
     found, targets = sides(subject), get(clean_leads(subject), "LeadTargets") or [""] * LEADS
     there = {found[i] for bore in bores for i in (2 * bore, 2 * bore + 1) if targets[i]}
@@ -73,7 +74,7 @@ def hemisphere(subject: Any, keys: Iterable[int]) -> Hemisphere | None:
 
 
 def described(subject: Any) -> list[str]:
-    """Leads in words for the recording's settings, such as `right STN`; empty where there is none."""
+    """Describe leads in words for the recording's settings, such as `right STN`; empty where there is none."""
     targets = get(clean_leads(subject), "LeadTargets") or [""] * LEADS
     return [
         " ".join([side, *(w for w in target.split() if w not in _SIDES)]) if side else target

@@ -1,7 +1,7 @@
-"""What the first bytes of an RC+S file tell: which file of a session it is, and of which implant and session.
+"""Opening of an RC+S file: its first bytes show which file of a session it is, and of which implant and session.
 
-Names of files are changed on the way (`RawDataTD (1).json`), and files of two implants come to lie in one folder. `RecordInfo` heads every
-record, so the content tells both.
+Names of files are changed on the way (`RawDataTD (1).json`), and files of two implants may be in one folder. `RecordInfo` heads every
+record, so the content identifies both.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Opening:
     """The begin of a file.
 
     Attributes:
-        stem: which file of a session it is, such as `RawDataTD`; None where its content does not tell.
+        stem: which file of a session it is, such as `RawDataTD`; None where its content does not show it.
         device, session: of its first RecordInfo, in one spelling; None where there is none.
         empty: whether it holds no record at all, as the device writes what it did not record.
     """
@@ -58,7 +58,7 @@ class Opening:
 
     @property
     def nameless(self) -> bool:
-        """Whether it says neither its implant nor its session."""
+        """True where it names neither its implant nor its session."""
         return self.device is None and self.session is None
 
 
@@ -75,7 +75,7 @@ class Groups:
 
 
 def read_opening(head: bytes) -> Opening:
-    """What the first `HEAD` bytes of a file tell; nothing where they are no JSON with a RecordInfo."""
+    """Read the first `HEAD` bytes of a file; nothing where they are no JSON with a RecordInfo."""
     text = head.decode("utf-8-sig", "replace")
     if text.strip(" \r\n\t\ufeff\0") in ("", "[]", "[{}]"):
         return Opening(empty=True)
@@ -89,7 +89,7 @@ def read_opening(head: bytes) -> Opening:
 
 
 def stem_in_name(name: str) -> str | None:
-    """The file of a session that a changed name begins with, such as `rawdatatd (1)`."""
+    """Find the file of a session that a changed name begins with, such as `rawdatatd (1)`."""
     match = _NAME.match(name)
     return next(n for n in _NAMES if n.lower() == match[1].lower()) if match else None
 
@@ -97,8 +97,8 @@ def stem_in_name(name: str) -> str | None:
 def group(openings: Sequence[Opening]) -> Groups:
     """Put together what names the same implant and session; two are never mixed.
 
-    A file that names only one of them, or neither, goes to the only recording that it fits to. Where it fits to several it stands alone,
-    or is homeless when it is empty.
+    A file that names only one of them, or neither, goes to the only recording that it fits to. Where it fits to several it is a group of
+    its own, or is homeless when it is empty.
     """
     named = [i for i, o in enumerate(openings) if not o.nameless]
     keys = sorted({(openings[i].device, openings[i].session) for i in named}, key=lambda k: (k[0] or "", k[1] or ""))
@@ -119,7 +119,7 @@ def group(openings: Sequence[Opening]) -> Groups:
 
 
 def _merges(key: tuple[str | None, str | None], keys: Sequence[tuple[str | None, str | None]]) -> bool:
-    """Whether a key that leaves something open fits to exactly one that says more."""
+    """Decide whether a key that leaves something open fits to exactly one that is more specific."""
     return sum(_fits(key, other) and other != key for other in keys) == 1
 
 

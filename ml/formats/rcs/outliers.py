@@ -1,9 +1,9 @@
 """Spikes in the device's band power that no brain makes: transients of the amplifier around a change of stimulation.
 
-In a recording with amplitude steps the band power jumps by up to four decades for two to three seconds at every step: the step's
-transient, seen for as long as it is within the FFT window. The device does not mark it (`IsPowerChannelOverrange` stays false), and the log
-of the step may be more than a second late, so the power itself is asked: a packet is a spike where log power leaves its running median by
-far, for no longer than a transient can last. Longer plateaus move the median and are signal.
+In a recording with amplitude steps the band power jumps by up to four decades for two to three seconds at every step. This is the step's
+transient, seen for as long as it is within the FFT window. The device does not mark it (`IsPowerChannelOverrange` stays false). The log of
+the step may be more than a second late, so the power itself decides. A packet is a spike where log power leaves its running median by far,
+for no longer than a transient can last. Longer plateaus move the median and are signal.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ SHOULDER_MADS: Final = 2.0
 """Down to this the packets right before and after a spike count as its shoulders."""
 
 LEAST_FACTOR: Final = 10.0
-"""A spike is at least this factor above the running median, however quiet the recording: power of one bin is exponentially distributed,
-and passes 10 times its median once in a thousand independent windows."""
+"""Least factor of a spike over the running median, however quiet the recording. Power of one bin is exponentially distributed, and passes
+10 times its median once in a thousand independent windows."""
 
 TRANSIENT_S: Final = 1.0
 """How long the amplifier takes to settle; the FFT window is added to it."""
@@ -32,7 +32,7 @@ MEDIAN_SPANS: Final = 4.0
 
 
 def _running_median(x: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Median of the odd number of values around each, [n]; near an end that of the first or last whole window."""
+    """Compute the median of the odd number of values around each, [n]; near an end that of the first or last whole window."""
     out = np.asarray(scipy.ndimage.median_filter(x, size=width, mode="nearest"), dtype=np.float64)
     half = width // 2
     out[:half], out[x.size - half :] = out[half], out[x.size - 1 - half]
@@ -40,7 +40,7 @@ def _running_median(x: NDArray[np.float64], width: int) -> NDArray[np.float64]:
 
 
 def power_spikes(power: NDArray[np.float64], interval_s: float, window_s: float) -> NDArray[np.bool_]:
-    """Which packets are spikes.
+    """Mark packets that are spikes.
 
     Args:
         power: one band in device units, [n], in time order; NaN where there is no value.

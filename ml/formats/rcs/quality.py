@@ -1,4 +1,4 @@
-"""How whole an RC+S recording is: packets, loss, chunks and clocks per stream, also as sentences in the reports."""
+"""Quality of an RC+S recording: packets, loss, chunks and clocks per stream, also as sentences in the reports."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ REJECTED_WORDS = {
     Rejected.CLOCKS_DISAGREE: "device and PC clock disagree by more than 2 s",
     Rejected.STEPS_BACK: "PacketGenTime steps back",
 }
-"""Why packets were left out, in words; the last three are of decode versions up to 4."""
+"""Reasons why packets were ignored, in words; the last three are of decode versions up to 4."""
 
 SENSING_BITS = {"time_domain": 1, "fft": 2, "power": 4}
 """Bits of the sensing state with which a stream is on; the others run while any is set."""
@@ -61,11 +61,11 @@ def describe_quality(
     counts: Mapping[str, int],
     report: Callable[[str], FileReport],
 ) -> dict[str, Any]:
-    """Packets, loss and chunks per stream that was placed in time, and what else says how far the recording can be trusted.
+    """Describe packets, loss and chunks per stream that was placed in time, and what else shows how far the recording can be trusted.
 
     Args:
         streams: by name. times: of the streams with packets, by name.
-        settings: on the timeline; they tell when sensing was off.
+        settings: on the timeline; they show when sensing was off.
         counts: records of the error and diagnostics logs.
         report: of a file, by its name without ending; sentences are added to it.
     """
@@ -95,7 +95,7 @@ def describe_quality(
 
 
 def _switched_off(name: str, settings: Settings) -> list[Interval]:
-    """When the settings say that a stream was off, ms of the timeline; nothing where they do not tell."""
+    """Find when the settings show that a stream was off, ms of the timeline; nothing where they are silent."""
     bits = SENSING_BITS.get(name, 255)
     begins = settings.sensing.times_ms
     states = zip(begins, [*begins, np.inf][1:], settings.sensing.states, strict=True)
@@ -103,7 +103,7 @@ def _switched_off(name: str, settings: Settings) -> list[Interval]:
 
 
 def _packets(data: _Stream, t: PacketTimes, off: list[Interval], said: FileReport) -> dict[str, Any]:
-    """What came of one stream and what did not. What is lost is flagged; repaired is only what was put right without losing anything."""
+    """Describe the received and the lost packets of one stream. Losses are flagged; repaired is only what was corrected without loss."""
     lost = loss_of(t.gaps, t.received_ms, off)
     if lost.missing_s > 0:
         said.flagged.append(
@@ -151,17 +151,17 @@ def _left_out(count: int) -> str:
 
 
 def _latency_ms(sync: TimeSync) -> float | None:
-    """Median latency of the clock exchanges, ms."""
+    """Compute the median latency of the clock exchanges, ms."""
     latency = sync.latency_ms[np.isfinite(sync.latency_ms)]
     return round(float(np.median(latency)), 3) if latency.size else None
 
 
 def describe_clock(timeline: RecordingTimes, start_ms: float, report: Callable[[str], FileReport]) -> dict[str, Any]:
-    """The PC's clock against the implant's ticks: drift, steps of either, and the residuals of PacketGenTime, for the session's page.
+    """Compare the PC's clock with the implant's ticks for the session's page: drift, steps of either, and the residuals of PacketGenTime.
 
     Args:
         timeline: of all streams. start_ms: where the recording begins on it.
-        report: of a file, by its name without ending; steps are told in that of the stream with the most packets.
+        report: of a file, by its name without ending; steps are reported in that of the stream with the most packets.
     """
     clock, streams = timeline.clock, timeline.streams
     main = max(streams, key=lambda name: streams[name].last_ms.size)
@@ -188,7 +188,7 @@ def describe_clock(timeline: RecordingTimes, start_ms: float, report: Callable[[
 
 
 def _extremes(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Places of the smallest and the largest value in each of `RESIDUALS / 2` pieces; all where there are few."""
+    """Find the places of the smallest and the largest value in each of `RESIDUALS / 2` pieces; all where there are few."""
     if values.size <= RESIDUALS:
         return np.arange(values.size)
     pieces = np.array_split(np.arange(values.size), RESIDUALS // 2)

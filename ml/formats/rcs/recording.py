@@ -51,22 +51,22 @@ class Streams:
     counts: dict[str, int]
 
     def data(self) -> dict[str, Stream]:
-        """The streams whose file is there, by name."""
+        """Return the streams whose file is there, by name."""
         named: dict[str, Stream | None] = {name: getattr(self, name) for name in STEMS}
         return {name: data for name, data in named.items() if data is not None}
 
     def placed(self) -> tuple[RecordingTimes, Settings]:
-        """All packets on one timeline, and the settings' PC times brought onto it."""
+        """Place all packets on one timeline, and bring the settings' PC times onto it."""
         times = reconstruct_all(self.headers(), {name: data.same for name, data in self.data().items()}, PRIMARY)
         return times, self.settings.at_times(times.clock.of_pc_ms)
 
     def headers(self) -> dict[str, PacketHeaders]:
-        """Headers of the streams that hold packets."""
+        """Collect the headers of the streams that have packets."""
         return {name: data.headers for name, data in self.data().items() if data.headers.size}
 
 
 def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) -> RecordingLog:
-    """Put a recording together; what is left out is said in the report of the file it comes from."""
+    """Put a recording together; ignored parts are named in the report of the file they come from."""
     timeline, settings = streams.placed()
     times = timeline.streams
     spans = _spans(streams.headers(), times, report, options)
@@ -114,7 +114,7 @@ def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) 
 
 
 def _hemisphere(streams: Streams, report: ReportOf) -> Hemisphere | None:
-    """The side that the leads behind the sensed channels share, where the settings tell."""
+    """Find the side that the leads behind the sensed channels share, where the settings name it."""
     subject = get(streams.settings.merged, "SubjectInfo")
     keys: set[int] = set()
     if streams.time_domain is not None:
@@ -132,7 +132,7 @@ def _hemisphere(streams: Streams, report: ReportOf) -> Hemisphere | None:
 def _spans(
     headers: dict[str, PacketHeaders], times: dict[str, PacketTimes], report: ReportOf, options: DecodeOptions
 ) -> dict[str, tuple[float, float]]:
-    """Begin and end of each stream, PC ms; a stream that lies impossibly far from the longest one is left out and said."""
+    """Find the beginning and end of each stream, PC ms; a stream impossibly far from the longest one is ignored and reported."""
     spans: dict[str, tuple[float, float]] = {}
     limit_ms = 1000.0 * MAX_ROWS * options.period_s
     for name, head in headers.items():
@@ -191,7 +191,7 @@ def _traces(
 
 
 def _limits(settings: Settings) -> dict[str, Any]:
-    """Clinician's amplitude limits of enabled programs, mA, by group and program."""
+    """List the clinician's amplitude limits of enabled programs, mA, by group and program."""
     limits: dict[str, Any] = {}
     for group in range(4):
         for p in range(4):
@@ -205,7 +205,7 @@ def _limits(settings: Settings) -> dict[str, Any]:
 
 
 def _summary(settings: Settings, grid: Grid) -> dict[str, Any]:
-    """What sensing and detection were set to, in plain values."""
+    """Summarise what sensing and detection were set to, in plain values."""
     sensing = [
         {
             "from_s": round((t - grid.start_ms) / 1000.0, 3),
@@ -230,7 +230,7 @@ def _summary(settings: Settings, grid: Grid) -> dict[str, Any]:
 
 
 def _battery(settings: Settings) -> dict[str, float]:
-    """Charge of the stimulator's battery in percent and its voltage in V, as its last settings of the recording told them."""
+    """Read the charge of the stimulator's battery in percent and its voltage in V, from its last settings of the recording."""
     state = get(settings.merged, "BatteryStatus")
     percent, millivolts = number(get(state, "batteryLevelPercent")), number(get(state, "batteryVoltage"))
     found = {"percent": percent, "voltage_v": None if millivolts is None else millivolts / 1000.0}
@@ -243,7 +243,8 @@ def _text(infos: list[dict[str, Any]], key: str) -> str | None:
 
 
 def _fingerprint(streams: Streams) -> str:
-    """Over packets, settings times and stimulation; not over the device's name, nor anything that redaction changes."""
+    """Compute the fingerprint of packets, settings times and stimulation; without the device's name and anything else that redaction
+    changes."""
     parts: list[str | bytes | NDArray[Any]] = []
     headers = streams.headers()
     primary = {name: head for name, head in headers.items() if name in PRIMARY} or headers

@@ -1,7 +1,7 @@
 """Take identity out of an RC+S archive before it is stored: names, serial numbers, dates of birth, free text, folder names.
 
-What stays is listed, not what goes: a field is kept only where its key is known (`keys.py`), and a text only where its key is known to
-hold a technical word of a known shape. The result decodes to the same recording, apart from the device's name, which becomes a keyed
+The lists name what stays, not what goes. A field stays only where its key is known (`keys.py`). A text stays only where its key is known
+for technical words of a known shape. The result decodes to the same recording, apart from the device's name, which becomes a keyed
 pseudonym.
 """
 
@@ -91,7 +91,7 @@ def redact_rcs_zip(source: Source, target: Path, key: bytes, limits: ArchiveLimi
 
 
 def _plan(sessions: list[SessionFiles], files: ZipFiles, scrub: _Scrubber, taken: set[str]) -> Iterator[tuple[str, str, str, str]]:
-    """(new name, stem, label, old name) of every member to write."""
+    """Yield (new name, stem, label, old name) of every member to write."""
     for session in sessions:
         folder = _folder(session, files, scrub)
         number = 2
@@ -105,7 +105,7 @@ def _plan(sessions: list[SessionFiles], files: ZipFiles, scrub: _Scrubber, taken
 
 
 def _folder(session: SessionFiles, files: ZipFiles, scrub: _Scrubber) -> str:
-    """Folder name of a session, from what its files say of themselves."""
+    """Name the folder of a session, from the content of its files."""
     path = PurePosixPath(next(iter(session.members.values())))
     serial = next((part[6:] for part in path.parts[::-1] if part.lower().startswith("device") and len(part) > 6), None)
     started = next((part[7:] for part in path.parts if re.fullmatch(r"session\d{13}", part, re.IGNORECASE)), None)
@@ -132,7 +132,7 @@ def _first_info(files: ZipFiles, name: str) -> dict[str, Any] | None:
 
 
 def _write_member(archive: zipfile.ZipFile, name: str, shown: str, files: ZipFiles, origin: str, scrub: _Scrubber, done: Redaction) -> None:
-    """Copy one file's elements, scrubbed; a file without a readable start is left out and named."""
+    """Copy one file's elements, scrubbed; a file without a readable start is ignored and named."""
     notes = JsonNotes()
     info = zipfile.ZipInfo(name, EPOCH)
     info.compress_type = zipfile.ZIP_DEFLATED
@@ -183,7 +183,7 @@ class _Scrubber:
         pseudonym("check of the key", key)
 
     def device(self, serial: str) -> str:
-        """Pseudonym of a device."""
+        """Replace the name of a device by its pseudonym."""
         if not PSEUDONYM.fullmatch(serial):
             self._gone["device"] += 1
         return pseudonym(serial, self._key)
@@ -193,7 +193,7 @@ class _Scrubber:
         self._gone["key"] += count
 
     def text(self, value: Any, text: str) -> str:
-        """Clean JSON text of one element, or of a run; packets that hold nothing but known words are copied as they stand."""
+        """Clean JSON text of one element, or of a run; packets with nothing but known words are copied unchanged."""
         if isinstance(value, Batch):
             return text
         if "\\" not in text and PACKET_WORDS.issuperset(_QUOTED.findall(text)):
@@ -201,7 +201,7 @@ class _Scrubber:
         return _dump(self.clean(value))
 
     def clean(self, node: Any, key: str = "") -> Any:
-        """The value without identity."""
+        """Remove identity from a value."""
         if isinstance(node, dict):
             if key == "Event":
                 return self._event(node)
@@ -234,7 +234,7 @@ class _Scrubber:
         return ""
 
     def _event(self, event: dict[str, Any]) -> dict[str, Any]:
-        """An event reduced to its times and its label by the grammar."""
+        """Reduce an event to its times and its label by the grammar."""
         texts = [event.get(name) for name in ("EventType", "EventSubType", "EventName")]
         label = render(parse(*texts))
         self._gone["note"] += 1
@@ -242,7 +242,7 @@ class _Scrubber:
         return {"EventName": "", "EventType": "" if label == NO_LABEL else label, "EventSubType": "", **times}
 
     def sentences(self) -> list[str]:
-        """What was taken out, without showing any of it."""
+        """List what was removed, without showing any of it."""
         said = {
             "SubjectInfo": "subject's details (SubjectInfo: identifier, dates, sex, diagnosis, notes, program names): "
             "side and target of the leads stay",

@@ -17,13 +17,13 @@ ADAPTIVE_BIT = 128
 GROUPS = "ABCD"
 SENSING_SECTIONS = frozenset({"SensingConfig", "SenseState"})
 THERAPY_SECTIONS = frozenset({"GeneralData", "therapyStatusData"})
-"""Sections that sensing and stimulation are read from, beside the therapy groups; a record without them changes neither."""
+"""Sections that sensing and stimulation are read from, in addition to the therapy groups; a record without them changes neither."""
 
 T = TypeVar("T")
 
 
 def get(node: Any, *path: str | int) -> Any:
-    """The value below a path of keys and indices; None where the path ends early."""
+    """Return the value below a path of keys and indices; None where the path ends early."""
     for step in path:
         if isinstance(node, dict) and isinstance(step, str):
             node = node.get(step)
@@ -35,20 +35,21 @@ def get(node: Any, *path: str | int) -> Any:
 
 
 def number(value: Any) -> float | None:
-    """A finite number, or None for anything else (text, truth values, NaN)."""
+    """Read a finite number, or None for anything else (text, truth values, NaN)."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not -1e300 < value < 1e300:
         return None
     return None if math.isnan(value) else float(value)
 
 
 def integer(value: Any, bits: int = 62) -> int | None:
-    """A whole number of at most so many bits, or None for anything else."""
+    """Read a whole number of at most so many bits, or None for anything else."""
     found = number(value)
     return int(found) if found is not None and found == int(found) and abs(found) < 2**bits else None
 
 
 def merge(old: Any, new: Any) -> Any:
-    """The running state after a delta: objects merge key by key, lists of objects of equal length item by item, all else is replaced."""
+    """Merge a delta into the running state: objects merge key by key, lists of objects of equal length item by item. All else is
+    replaced."""
     if isinstance(old, dict) and isinstance(new, dict):
         return {**old, **{key: merge(old.get(key), value) for key, value in new.items()}}
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new) and all(isinstance(item, dict) for item in new):
@@ -116,14 +117,14 @@ class Timeline(Generic[T]):
             self.states.append(state)
 
     def at(self, time_ms: float) -> T | None:
-        """The state in force; the first one for times before it."""
+        """Find the state in force; the first one for times before it."""
         if not self.states:
             return None
         return self.states[max(0, bisect.bisect_right(self.times_ms, time_ms) - 1)]
 
 
 def sensing_of(state: dict[str, Any]) -> Sensing:
-    """Sensing as a merged settings state has it."""
+    """Read sensing from a merged settings state."""
     config = get(state, "SensingConfig")
     rates = tuple(
         RATE_HZ.get(integer(get(config, "timeDomainChannels", k, "sampleRate")) or 0) if _has_rate(config, k) else None for k in range(4)
@@ -146,7 +147,7 @@ def _has_rate(config: Any, key: int) -> bool:
 
 
 def _contacts(config: Any, key: int) -> str:
-    """Contact pair such as `+2-0`; one-hot masks, contacts of the second bore counted from 8; empty when unknown."""
+    """Read the contact pair, such as `+2-0`; one-hot masks, contacts of the second bore counted from 8; empty when unknown."""
 
     def contact(field_name: str) -> str:
         mask = integer(get(config, "timeDomainChannels", key, field_name))
@@ -160,7 +161,7 @@ def _contacts(config: Any, key: int) -> str:
 
 
 def _band(config: Any, index: int, rate_hz: float | None, size: int | None) -> Band | None:
-    """Edges in Hz: bin k is centred on k * width, so a band runs half a bin beyond its first and last bin."""
+    """Compute the edges in Hz: bin k is centred on k * width, so a band runs half a bin beyond its first and last bin."""
     start = integer(get(config, "powerChannels", index // 2, f"band{index % 2}Start"))
     stop = integer(get(config, "powerChannels", index // 2, f"band{index % 2}Stop"))
     if start is None or stop is None or rate_hz is None or size is None:
@@ -170,7 +171,7 @@ def _band(config: Any, index: int, rate_hz: float | None, size: int | None) -> B
 
 
 def therapy_of(state: dict[str, Any], stim: dict[str, Any] | None) -> Therapy:
-    """Stimulation as set: from the stimulation log's state where there is one, enabled programs always from the settings."""
+    """Read stimulation as set: from the stimulation log's state where there is one, enabled programs always from the settings."""
     status = merge(get(state, "GeneralData", "therapyStatusData") or {}, get(stim, "therapyStatusData") or {})
     group = integer(get(status, "activeGroup"))
     on = integer(get(status, "therapyStatus"))
@@ -194,7 +195,7 @@ def therapy_of(state: dict[str, Any], stim: dict[str, Any] | None) -> Therapy:
 
 
 def host_ms(record: Any) -> float | None:
-    """PC time of a record, ms."""
+    """Read the PC time of a record, ms."""
     time_ms = number(get(record, "RecordInfo", "HostUnixTime"))
     return time_ms if time_ms is not None and 0 < time_ms < 2.5e14 else None
 
@@ -210,7 +211,7 @@ class Settings:
     record_times_ms: list[float] = field(default_factory=list)
 
     def at_times(self, of_pc_ms: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Settings:
-        """The same settings with their PC times brought onto a recording's timeline."""
+        """Move the settings' PC times onto a recording's timeline."""
 
         def moved(times_ms: list[float]) -> list[float]:
             times: list[float] = of_pc_ms(np.array(times_ms, dtype=np.float64)).tolist()
@@ -254,7 +255,7 @@ def _tells_therapy(delta: dict[str, Any]) -> bool:
 
 
 def _therapy_from_settings(out: Settings, moves: list[tuple[float, int, int, Any]]) -> None:
-    """Without a stimulation log the settings' own therapy groups have to do."""
+    """Read stimulation from the settings' own therapy groups, where there is no stimulation log."""
     state: dict[str, Any] = {}
     for time_ms, _, _, record in sorted(moves, key=lambda move: move[:3]):
         delta = {key: value for key, value in record.items() if key != "RecordInfo"}

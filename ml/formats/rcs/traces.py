@@ -38,7 +38,7 @@ class Grid:
     options: DecodeOptions
 
     def seconds(self, t_ms: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Times after the start, s."""
+        """Convert times to seconds after the start."""
         return (t_ms - self.start_ms) / 1000.0
 
     def trace(
@@ -49,7 +49,7 @@ class Grid:
         covered: NDArray[np.float64],
         details: Mapping[str, Any],
     ) -> TraceLog:
-        """A trace of (stream, channel, unit); rows covered too little, or without a number, are invalid and NaN."""
+        """Make a trace of (stream, channel, unit); rows with too little coverage, or without a number, are invalid and NaN."""
         valid = (covered >= self.options.min_valid_fraction - 1e-9) & np.isfinite(values)
         stored = np.where(valid, values, np.nan).astype(np.float32)
         period = self.options.period_s
@@ -57,10 +57,10 @@ class Grid:
 
 
 def power_traces(data: Power, times: PacketTimes, settings: Settings, grid: Grid, notes: list[str]) -> list[TraceLog]:
-    """On-device band power (`band_power`, device units) per band and band edges in force, without spikes.
+    """Make traces of on-device band power (`band_power`, device units) per band and band edges in force, without spikes.
 
-    A spike in one band counts in all: the amplifier's transient is broad, and a band of a single bin varies too much to show it.
-    `details` counts the packets left out as spikes and lists the rows they were in; such a row is invalid when too little of it is left.
+    A spike in one band counts in all: the amplifier's transient is broad. A band of a single bin varies too much to show it. `details`
+    counts the packets excluded as spikes and lists the rows they were in. Such a row is invalid when too little of it remains.
     """
     t_s = grid.seconds(times.last_ms)
     interval = 1.0 / data.headers.rate_hz
@@ -100,7 +100,7 @@ Edges = tuple[float | None, float | None]
 def _channels(
     data: Power, times: PacketTimes, settings: Settings, usable: NDArray[np.bool_]
 ) -> dict[str, tuple[int, Edges, NDArray[np.float64]]]:
-    """Band index, edges in Hz and power in usable packets, [n] with NaN elsewhere, of every channel name that a band ever has."""
+    """Collect, for every channel name that a band ever has, band index, edges in Hz and power in usable packets, [n] with NaN elsewhere."""
     out: dict[str, tuple[int, Edges, NDArray[np.float64]]] = {}
     for i in range(8):
         if np.any(np.isfinite(data.bands[:, i])):
@@ -112,7 +112,7 @@ def _channels(
 
 
 def _spikes(values: NDArray[np.float64], t_s: NDArray[np.float64], data: Power) -> NDArray[np.bool_]:
-    """Spikes of one band, [n]; each FFT interval and size by itself."""
+    """Mark spikes of one band, [n]; each FFT interval and size on its own."""
     out = np.zeros(values.size, dtype=bool)
     windows = window_s(data)
     for rate, window in sorted(set(zip(data.headers.rate_hz.tolist(), windows.tolist(), strict=True))):
@@ -123,13 +123,13 @@ def _spikes(values: NDArray[np.float64], t_s: NDArray[np.float64], data: Power) 
 
 
 def window_s(data: Power | Fft) -> NDArray[np.float64]:
-    """Length of each packet's FFT window, s, [n]; 0 where size or rate are not known."""
+    """Compute the length of each packet's FFT window, s, [n]; 0 where size or rate are unknown."""
     sizes = np.array([FFT_SIZE.get(code, 0) for code in data.fft_size.tolist()], dtype=np.float64)
     return np.where(np.isfinite(data.td_rate_hz), sizes / np.nan_to_num(data.td_rate_hz, nan=1.0), 0.0)
 
 
 def settling_packets(data: Power, times: PacketTimes, settings: Settings) -> NDArray[np.bool_]:
-    """Packets whose FFT window reaches back to the amplifier's step after power sensing was switched on, [n]."""
+    """Mark packets whose FFT window reaches back to the amplifier's step after power sensing was switched on, [n]."""
     out = np.zeros(data.headers.size, dtype=bool)
     on_before: bool | None = None
     for time_ms, state in zip(settings.sensing.times_ms, settings.sensing.states, strict=True):
@@ -142,7 +142,7 @@ def settling_packets(data: Power, times: PacketTimes, settings: Settings) -> NDA
 
 
 def _band_names(index: int, data: Power, times: PacketTimes, settings: Settings) -> tuple[list[str], dict[str, tuple[float, float]]]:
-    """Channel name of each packet's band under the settings in force then, and the edges of each name in Hz."""
+    """Name each packet's band under the settings in force then, and list the edges of each name in Hz."""
     names: list[str] = []
     edges: dict[str, tuple[float, float]] = {}
     for t in times.last_ms:
@@ -155,7 +155,8 @@ def _band_names(index: int, data: Power, times: PacketTimes, settings: Settings)
 
 
 def amplitude_traces(steps: AmplitudeSteps, grid: Grid) -> list[TraceLog]:
-    """Delivered amplitude (`amplitude`, mA) per program that stimulates at any time of the recording, time-weighted per step."""
+    """Make traces of delivered amplitude (`amplitude`, mA) per program that stimulates at any time of the recording, time-weighted per
+    step."""
     t_s = grid.seconds(steps.t_ms)
     out = []
     for p in steps.programs:
@@ -166,7 +167,7 @@ def amplitude_traces(steps: AmplitudeSteps, grid: Grid) -> list[TraceLog]:
 
 
 def accel_traces(data: Accel, times: PacketTimes, grid: Grid) -> list[TraceLog]:
-    """Root mean square acceleration per row (`acceleration`, centiG), over the three axes, each freed of its mean in the row.
+    """Compute root mean square acceleration per row (`acceleration`, centiG), over the three axes, each freed of its mean in the row.
 
     The mean is gravity (about 100 centiG along the vertical) and the sensor's offset.
     """
@@ -189,10 +190,10 @@ def accel_traces(data: Accel, times: PacketTimes, grid: Grid) -> list[TraceLog]:
 
 
 def fft_results(data: Fft, times: PacketTimes, settings: Settings, grid: Grid) -> tuple[list[TraceLog], list[SpectrumLog]]:
-    """On-device spectra as a trace of the amplitude within the beta band (`band_amplitude`, uV rms) and as a mean spectrum per channel.
+    """Make a trace of the on-device amplitude within the beta band (`band_amplitude`, uV rms), and a mean spectrum per channel.
 
-    The device streams the amplitude F of a sine in each bin: F = 4 |FFT| / N with a Hann window over n of N samples (notes, A.11), so that
-    the one-sided density is F^2 N^2 / (3 n rate) and the rms within the band the root of its integral.
+    The device streams the amplitude F of a sine in each bin: F = 4 |FFT| / N with a Hann window over n of N samples (notes, A.11). So the
+    one-sided density is F^2 N^2 / (3 n rate), and the rms within the band is the root of its integral.
     """
     traces, spectra = [], []
     placed = np.isfinite(times.last_ms)

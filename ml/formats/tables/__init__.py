@@ -37,7 +37,7 @@ def decode_table(path: Path, kind: TableKind, options: DecodeOptions, name: str 
 
 
 def kind_of_text(path: Source) -> TableKind:
-    """Which table a text is, by its first line or its headers."""
+    """Detect the kind of a text table, by its first line or its headers."""
     if is_log(path):
         return "control_log"
     try:

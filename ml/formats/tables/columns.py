@@ -63,12 +63,12 @@ class Columns:
     notes: list[str] = field(default_factory=list)
 
     def label(self, role: str) -> str:
-        """The column as a stored file or report may call it: its role and the unit in brackets."""
+        """Name the column as a stored file or report may: its role and the unit in brackets."""
         unit = self.units[role]
         return f"{role} [{unit}]" if unit else role
 
     def error(self, what: str, role: str, hint: str, row: int | None = None, stored: str | None = None) -> UndecodableFile:
-        """An error at a column, and at the line of a row; `stored` is the text without the file's own words."""
+        """Make an error at a column, and at the line of a row; `stored` is the text without the file's own words."""
         line = "" if row is None else f"line {self.lines[row]}, "
         return UndecodableFile(what, f"{line}column {self.names[role]}", hint, stored, f"{line}column {role}")
 
@@ -100,7 +100,7 @@ def check_reach(t_s: NDArray[np.float64], columns: Columns) -> None:
 
 
 def match_columns(headers: Sequence[str]) -> tuple[dict[str, int], dict[str, str | None], list[str], list[str]]:
-    """Which header is which: role -> index, role -> unit, the headers of no use, and sentences about what was adapted.
+    """Match headers to roles: role -> index, role -> unit, the headers of no use, and sentences about what was adapted.
 
     Raises:
         UndecodableFile: a needed column is missing, named twice or in an unknown unit.
@@ -125,7 +125,7 @@ def match_columns(headers: Sequence[str]) -> tuple[dict[str, int], dict[str, str
 
 
 def _refuse_log(headers: Sequence[str]) -> None:
-    """Raise for a controller's log without its kind line: read as a table of steps, every amplitude would stand one step too early."""
+    """Raise for a controller's log without its kind line: read as a table of steps, every amplitude would be one step too early."""
     if len(LOG_COLUMNS & {column_name(h)[0] for h in headers}) >= 2:
         raise UndecodableFile(
             "this looks like the log of a controller without its first line, which says so: each of its rows has the beta of the step that "
@@ -175,17 +175,17 @@ def _is_lfp(key: str) -> bool:
 
 
 def _lfp_suffix(key: str) -> str | None:
-    """The unit that a name like `lfp_uv` ends with."""
+    """Find the unit that a name like `lfp_uv` ends with."""
     return next((unit for unit in LFP_SCALE if key == f"lfp_{unit.lower()}"), None)
 
 
 def is_lfp(headers: Sequence[str]) -> bool:
-    """Whether a table with these headers holds raw LFP."""
+    """Decide whether a table with these headers has raw LFP."""
     return any(_is_lfp(column_name(header)[0]) for header in headers)
 
 
 def _header_unit(role: str, unit: str | None, header: str, notes: list[str]) -> str | None:
-    """The unit of a column in its one spelling. Raises UndecodableFile for a unit that its numbers cannot be converted from."""
+    """Read the unit of a column in its one spelling. Raises UndecodableFile for a unit that its numbers cannot be converted from."""
     if unit is None:
         return "ms" if column_name(header)[0] in MILLISECOND_NAMES else _lfp_suffix(column_name(header)[0])
     if role == "lfp":
@@ -219,7 +219,7 @@ def _unknown_unit(role: str, unit: str, header: str) -> UndecodableFile:
 
 
 def read_csv(path: Source, options: DecodeOptions) -> Columns:
-    """Cells of a text table; see `decode_csv`."""
+    """Read the cells of a text table; see `decode_csv`."""
     head = read_head(path, NEEDED)
     found, units, unused, notes = match_columns(head.headers)
     names = {role: head.headers[index].strip() for role, index in found.items()}
@@ -247,7 +247,8 @@ def read_csv(path: Source, options: DecodeOptions) -> Columns:
 
 
 def _dates(table: TextTable, column: int, first_s: float) -> NDArray[np.float64] | None:
-    """A column of ISO 8601 dates as seconds, [rows], of which the first is `first_s`; NaN for empty cells, None where it holds no dates."""
+    """Read a column of ISO 8601 dates as seconds, [rows], of which the first is `first_s`. NaN for empty cells, None where it has no
+    dates."""
     first = next((row[column] for row in table.rows if row[column].strip().lower() not in MISSING), "")
     if iso_time(first) is None:
         return None
@@ -268,7 +269,7 @@ def _dates(table: TextTable, column: int, first_s: float) -> NDArray[np.float64]
 
 
 def _refuse_changed_clock(unix_s: NDArray[np.float64], table: TextTable, column: int) -> None:
-    """Raise where dates go back by about an hour: the clocks were changed, and a date without its zone stands for two moments."""
+    """Raise where dates go back by about an hour: the clocks were changed, and a date without its zone means two moments."""
     back = np.flatnonzero(np.abs(np.diff(unix_s) + 3600.0) <= CLOCK_CHANGE_SPREAD_S)
     if back.size:
         line = f"line {table.lines[int(back[0]) + 1]}"
@@ -280,7 +281,7 @@ def _refuse_changed_clock(unix_s: NDArray[np.float64], table: TextTable, column:
 
 
 def read_parquet(path: Source, options: DecodeOptions) -> Columns:
-    """Columns of a Parquet table; see `decode_parquet`."""
+    """Read the columns of a Parquet table; see `decode_parquet`."""
     with path.open("rb") as stream:
         return _parquet_columns(stream, options)
 
@@ -315,7 +316,7 @@ def _parquet_columns(stream: BinaryIO, options: DecodeOptions) -> Columns:
 
 
 def _with_unit(column: Any) -> str:
-    """A Parquet column's header, with the unit of its metadata in brackets where the header itself states none."""
+    """Return a Parquet column's header, with the unit of its metadata in brackets where the header itself states none."""
     header = str(column.name)
     unit = (column.metadata or {}).get(b"unit", b"").decode("utf-8", "replace").strip()
     if not unit or column_name(header)[1] is not None or set(unit) & set("()[]"):
@@ -333,7 +334,7 @@ def _arrow_floats(column: object) -> NDArray[np.float64]:
 
 
 def checked_amplitude(role: str, columns: Columns, report: FileReport) -> NDArray[np.float64]:
-    """An amplitude column's numbers [rows] in mA or as a fraction, NaN where there is none.
+    """Check an amplitude column's numbers [rows] in mA or as a fraction, NaN where there is none.
 
     Raises:
         UndecodableFile: an amplitude that no stimulator gives; names line and column.

@@ -1,7 +1,7 @@
 """The controller's own log, as `betaloop control --log` and the runner of a bundle write it.
 
-A row holds the beta amplitude of the period that ended at `due_s`, and the amplitude decided for the time from `t_s` to the next row's. In
-a table of steps both belong to two rows: here each beta stands beside the amplitude that was in force while it was measured.
+A row has the beta amplitude of the period that ended at `due_s`. Its amplitude applies from `t_s` to the next row's. In a table of steps
+both belong to two rows: here each beta has the amplitude that was in force while it was measured.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ Floats = NDArray[np.float64]
 class Log:
     """The rows of a log: decided at `t_s`, for the period that ended at `due_s`; beta (NaN: none) in `unit` from `source`; amplitude.
 
-    `ran` is None for logs of version 1, which do not tell. Of the rest, only logs from version 3 on know: `followed`, whether policy or
-    schedule was followed; `hold` and `log_density`, of the drawn amplitude (-1 and NaN: none); `battery_percent` of the tablet; `ended`.
+    `ran` is None for logs of version 1, which lack it. The rest is in logs from version 3 on. `followed`: whether policy or schedule was
+    followed. `hold` and `log_density`: of the drawn amplitude (-1 and NaN: none). `battery_percent` of the tablet; `ended`.
     """
 
     ran: Ran | None
@@ -66,15 +66,15 @@ class Log:
 
     @property
     def zero_s(self) -> float:
-        """Where the session begins on the log's clock: at 0, but where a device side was connected with the first decision that followed
-        policy or schedule; what comes before is the window before the session."""
+        """Start of the session on the log's clock, normally 0. With a device side connected, it is the first decision that followed policy
+        or schedule; what comes before is the window before the session."""
         if self.ran is None or not self.ran.counts_from_take_over or not self.followed.any():
             return 0.0
         return float(self.due_s[int(np.argmax(self.followed))])
 
 
 def is_log(path: Source) -> bool:
-    """Whether a file says in its first line that it is a controller's log."""
+    """Decide whether the first line of a file names it a controller's log."""
     with path.open("rb") as stream:
         return stream.read(200).removeprefix(b"\xef\xbb\xbf").startswith(MARK)
 
@@ -111,7 +111,7 @@ def decode_log(path: Source, options: DecodeOptions, name: str | None = None) ->
 
 
 def _of_rows(log: Log) -> dict[str, Any]:
-    """What the rows of a log of version 3 say of the whole session: how it ended, what was drawn and delivered, the tablet's battery."""
+    """Summarise the rows of a log of version 3 for the whole session: its end, what was drawn and delivered, the tablet's battery."""
     known = np.flatnonzero(np.isfinite(log.battery_percent))
     charge = log.battery_percent[known[[0, -1]]].tolist() if known.size else None
     minutes = float(log.t_s[known[-1]] - log.t_s[known[0]]) / 60 if known.size else None
@@ -119,10 +119,10 @@ def _of_rows(log: Log) -> dict[str, Any]:
 
 
 def delivered_holds(log: Log) -> list[dict[str, Any]]:
-    """Drawn amplitudes as they were delivered, `start`, `steps`, `amplitude` (fraction) and `log_density`, without gaps from step 0.
+    """List drawn amplitudes as they were delivered, `start`, `steps`, `amplitude` (fraction) and `log_density`, without gaps from step 0.
 
-    A stretch on which cDBS stood in for the schedule, or that is missing in the log, has no density, and cuts the hold that it interrupts.
-    Empty where nothing was drawn or held.
+    A stretch on which cDBS replaced the schedule, or that is missing in the log, has no density. It cuts the hold that it interrupts. Empty
+    where nothing was drawn or sustained.
     """
     if log.ran is None or log.ran.design is None or not log.followed.any():
         return []
@@ -144,12 +144,13 @@ def delivered_holds(log: Log) -> list[dict[str, Any]]:
 
 
 def in_force(log: Log) -> Floats:
-    """Mean amplitude in force over the period that ends at each row, mA, [n]; NaN before the first decision and where rows are missing."""
+    """Average the amplitude in force over the period that ends at each row, mA, [n]; NaN before the first decision and where rows are
+    missing."""
     t, period = log.t_s, log.period_s
     sums = np.concatenate([[0.0], np.cumsum(log.amplitude_ma[:-1] * np.diff(t))])
 
     def delivered(until: Floats) -> Floats:
-        """mA s since the first decision."""
+        """Integrate the amplitude since the first decision, mA s."""
         j = np.maximum(np.searchsorted(t, until, side="right") - 1, 0)
         return np.asarray(sums[j] + log.amplitude_ma[j] * (until - t[j]), dtype=np.float64)
 
@@ -291,7 +292,7 @@ def _row(row: list[str], at: dict[str, int], line: int, nonce: str | None) -> _C
 
 
 def _one(texts: list[str], what: str) -> str:
-    """The one unit or source that all rows with beta name. Raises UndecodableFile for several, or for a unit that is none."""
+    """Find the one unit or source that all rows with beta name. Raises UndecodableFile for several, or for a unit that is none."""
     named = {t for t in texts if t}
     if what == "unit":
         named = {known_unit(t) or "" for t in named}

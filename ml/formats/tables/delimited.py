@@ -1,7 +1,7 @@
 """Text tables as people save them.
 
-Cells lie between commas, semicolons, tabs or pipes, with decimal points or commas; the text is UTF-8, UTF-16 (with or without a byte-order
-mark) or Latin-1. Titles may stand above the header, and a row of units below it.
+Commas, semicolons, tabs or pipes separate cells, with decimal points or commas. The text is UTF-8, UTF-16 (with or without a byte-order
+mark) or Latin-1. Titles may come above the header, and a row of units below it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MOSTLY = 0.9
 """Share of the letters of a table that are Latin."""
 
 MOST_TITLES = 20
-"""Lines that may stand above the header."""
+"""Lines that may come above the header."""
 
 TIME_HINT = "Give every time in seconds from the session's start, or as an ISO 8601 date and time with its zone."
 
@@ -39,7 +39,7 @@ class TextTable:
     """Header and rows of a text table.
 
     Attributes:
-        headers: as they stand in the file.
+        headers: as in the file.
         lines: line number of each row.
         rows: cells, each row as long as the header.
         delimiter: what separates the cells.
@@ -53,7 +53,7 @@ class TextTable:
     notes: list[str]
 
     def decimal_mark(self, columns: Sequence[int]) -> str:
-        """The decimal mark used throughout these columns. Raises UndecodableFile where both are."""
+        """Find the decimal mark used throughout these columns. Raises UndecodableFile where both are."""
         comma = self._first_with(",", columns)
         if comma is None:
             return "."
@@ -64,14 +64,14 @@ class TextTable:
         return "." if point is not None else ","
 
     def _first_with(self, mark: str, columns: Sequence[int]) -> int | None:
-        """Line of the first cell with this mark, formulas aside."""
+        """Find the line of the first cell with this mark, formulas aside."""
         for line, row in zip(self.lines, self.rows, strict=True):
             if any(mark in row[i] and row[i].strip()[:1] not in "=@" for i in columns):
                 return line
         return None
 
     def numbers(self, column: int, decimal: str, role: str | None = None) -> NDArray[np.float64]:
-        """A column as numbers [rows], NaN for cells without one.
+        """Read a column as numbers [rows], NaN for cells without one.
 
         `role` is what the column is called in a stored report, which must not repeat the file's own header.
 
@@ -95,10 +95,10 @@ class TextTable:
 
 @dataclass(frozen=True, slots=True)
 class TableHead:
-    """What stands above the rows of a text table.
+    """Head of a text table, above its rows.
 
     Attributes:
-        headers: as they stand in the file, with the unit of a row of units in brackets behind them.
+        headers: as in the file, with the unit of a row of units in brackets behind them.
         delimiter: what separates the cells.
         lines: how many lines to pass over before the first row.
         encoding: of the text.
@@ -131,7 +131,7 @@ def read_delimited(path: Source, max_rows: int | Callable[[Sequence[str]], int],
 
 
 def read_head(path: Source, needed: str) -> TableHead:
-    """The headers of a text table and how it is written. Raises UndecodableFile for an empty or a binary file."""
+    """Read the headers of a text table and how it is written. Raises UndecodableFile for an empty or a binary file."""
     notes: list[str] = []
     encoding = _encoding(path, notes, needed)
     with path.open("rb") as raw, io.TextIOWrapper(raw, encoding=encoding, errors="replace", newline=None) as stream:
@@ -160,7 +160,7 @@ def read_head(path: Source, needed: str) -> TableHead:
 
 @contextmanager
 def rows_behind(path: Source, head: TableHead) -> Iterator[Iterator[str]]:
-    """The lines below the head of a table."""
+    """Yield the lines below the head of a table."""
     with path.open("rb") as raw, io.TextIOWrapper(raw, encoding=head.encoding, errors="replace", newline=None) as stream:
         lines = _lines(stream)
         for _ in islice(lines, head.lines):
@@ -170,14 +170,14 @@ def rows_behind(path: Source, head: TableHead) -> Iterator[Iterator[str]]:
 
 @contextmanager
 def text_lines(path: Source, needed: str) -> Iterator[Iterator[str]]:
-    """The lines of a text table from its first one. Raises UndecodableFile for an empty or a binary file."""
+    """Yield the lines of a text table from its first one. Raises UndecodableFile for an empty or a binary file."""
     encoding = _encoding(path, [], needed)
     with path.open("rb") as raw, io.TextIOWrapper(raw, encoding=encoding, errors="replace", newline=None) as stream:
         yield _lines(stream)
 
 
 def _header_line(top: list[str], begin: int, separator: str | None) -> int:
-    """Place of the first line that names a column of times; the first line where none of the top does."""
+    """Find the first line that names a column of times; the first line where none of the top does."""
     for i, line in enumerate(top[begin : begin + MOST_TITLES + 1], start=begin):
         try:
             cells = next(csv.reader([line], delimiter=separator or _delimiter(line)), [])
@@ -189,7 +189,7 @@ def _header_line(top: list[str], begin: int, separator: str | None) -> int:
 
 
 def split_line(line: str, delimiter: str) -> list[str]:
-    """Cells of one line, without line end or blanks around them; empty for a line that is no row of a table."""
+    """Split one line into cells, without line end or blanks around them; empty for a line that is no row of a table."""
     try:
         return [cell.strip() for cell in next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter), [])]
     except csv.Error:
@@ -204,7 +204,7 @@ def _split(line: str, delimiter: str, number: int) -> list[str]:
 
 
 def _units(line: str, delimiter: str, width: int) -> list[str] | None:
-    """Units of a row below the header that holds nothing else; None for every other row."""
+    """Read the units of a row below the header that has nothing else; None for every other row."""
     try:
         cells = [cell.strip().strip("[]()").strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
     except csv.Error:
@@ -216,7 +216,7 @@ def _units(line: str, delimiter: str, width: int) -> list[str] | None:
 
 
 def _encoding(path: Source, notes: list[str], needed: str) -> str:
-    """How the text is encoded, by its first bytes. Raises UndecodableFile for what is no text."""
+    """Detect the encoding of the text by its first bytes. Raises UndecodableFile for what is no text."""
     with path.open("rb") as stream:
         head = stream.read(4096)
     if not head:
@@ -238,7 +238,7 @@ def _encoding(path: Source, notes: list[str], needed: str) -> str:
 
 
 def utf16_without_mark(head: bytes) -> str | None:
-    """The encoding of a text in UTF-16 that does not begin with a mark: of Latin letters every other byte is 0. None for anything else."""
+    """Detect UTF-16 in a text that does not begin with a mark: of Latin letters every other byte is 0. None for anything else."""
     for encoding, zeros, letters in (("utf-16-le", head[1::2], head[0::2]), ("utf-16-be", head[0::2], head[1::2])):
         if zeros and zeros.count(0) >= MOSTLY * len(zeros) and 0 not in letters:
             return encoding
@@ -246,7 +246,7 @@ def utf16_without_mark(head: bytes) -> str | None:
 
 
 def _lines(stream: io.TextIOWrapper) -> Iterator[str]:
-    """Lines of the text; raises on one too long to be a row."""
+    """Yield lines of the text; raises on one too long to be a row."""
     number = 0
     while line := stream.readline(MAX_LINE):
         number += 1
@@ -261,7 +261,7 @@ def _delimiter(header: str) -> str:
 
 
 def rows_of(source: Iterator[str], delimiter: str, width: int, offset: int, max_rows: int) -> tuple[list[int], list[list[str]]]:
-    """Line numbers and cells of every row that is not blank, of lines of which the first has the number `offset` + 1.
+    """Read line numbers and cells of every row that is not blank, of lines of which the first has the number `offset` + 1.
 
     Raises:
         UndecodableFile: a row of another width, more than `max_rows`, no table; names the line.
@@ -290,5 +290,5 @@ def rows_of(source: Iterator[str], delimiter: str, width: int, offset: int, max_
 
 
 def read_headers(path: Source) -> list[str]:
-    """The headers of a text table, nothing else of it; empty where there are none. Raises UndecodableFile for what is no text."""
+    """Read the headers of a text table, nothing else of it; empty where there are none. Raises UndecodableFile for what is no text."""
     return read_head(path, "t_s").headers

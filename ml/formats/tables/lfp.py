@@ -31,7 +31,7 @@ MOST_SAMPLES = 64_000_000
 
 
 def decode_lfp(columns: Columns, options: DecodeOptions, report: FileReport) -> DecodedFile:
-    """A recording out of the columns of raw LFP.
+    """Decode a recording from the columns of raw LFP.
 
     Raises:
         UndecodableFile: no unit, times that do not increase or are not even, a rate too low for the band, impossible values.
@@ -85,7 +85,7 @@ def decode_lfp(columns: Columns, options: DecodeOptions, report: FileReport) -> 
 
 
 def _times(columns: Columns) -> NDArray[np.float64]:
-    """Times in s, there and increasing."""
+    """Read times in s, checked to be there and to increase."""
     t_s = columns.values["t_s"] * TIME_SCALE[columns.units["t_s"]]
     if t_s.size < MIN_ROWS:
         raise UndecodableFile(f"{t_s.size} rows are no signal", "after line 1", "Add one row per sample.")
@@ -102,7 +102,7 @@ def _times(columns: Columns) -> NDArray[np.float64]:
 
 
 def _rate(t_s: NDArray[np.float64], columns: Columns, report: FileReport) -> tuple[float, NDArray[np.int64]]:
-    """Samples per second, and the rows before which a gap ends. Says gaps and jitter; raises where the times are not even."""
+    """Compute samples per second, and the rows before which a gap ends. Reports gaps and jitter; raises where the times are not even."""
     steps = np.diff(t_s)
     usual = float(np.median(steps))
     inside = steps <= GAP * usual
@@ -134,7 +134,7 @@ def _rate(t_s: NDArray[np.float64], columns: Columns, report: FileReport) -> tup
 
 
 def _stretches(t_s: NDArray[np.float64], lfp: NDArray[np.float64], rate: float, cuts: NDArray[np.int64]) -> list[Stretch]:
-    """Gap-free pieces; rows without a number are gaps too."""
+    """List gap-free pieces; rows without a number are gaps too."""
     good = np.isfinite(lfp)
     edges = np.concatenate(([0], cuts, np.flatnonzero(np.diff(good.astype(np.int8))) + 1, [lfp.size]))
     edges = np.unique(edges)
@@ -145,7 +145,7 @@ def _stretches(t_s: NDArray[np.float64], lfp: NDArray[np.float64], rate: float, 
 def _amplitude(
     columns: Columns, t_s: NDArray[np.float64], rate: float, rows: int, t0_s: float, options: DecodeOptions, report: FileReport
 ) -> list[TraceLog]:  # fmt: skip
-    """The amplitude column as means per step."""
+    """Average the amplitude column per step."""
     given = {role: checked_amplitude(role, columns, report) for role in columns.values if role.startswith("amplitude")}
     if len(given) == 2:
         compare_amplitudes(given["amplitude_ma"], given.pop("amplitude_fraction"), report)

@@ -1,6 +1,7 @@
-"""What the first lines of a controller's log say: version, period, and what ran for whom, in which slot of which signed plan.
+"""Head of a controller's log: version, period, and what ran for whom, in which slot of which signed plan.
 
-Version 1 tells its period alone, version 2 policy, network, side and limits in the same line, version 3 all of it as JSON in a second line.
+Version 1 has its period alone. Version 2 adds policy, network, side and limits in the same line; version 3 has all of it as JSON in a
+second line.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _LONGEST = 8000
 
 @dataclass(frozen=True, kw_only=True)
 class Ran:
-    """What the head of a log says of the controller.
+    """Description of the controller in the head of a log.
 
     Attributes:
         policy_id, network_sha256: the policy, by number and by the SHA-256 of its network; None where a schedule ran. side: hemisphere.
@@ -86,12 +87,12 @@ class Ran:
 
     @property
     def counts_from_take_over(self) -> bool:
-        """Whether a device side was connected, so that the session begins when the controller takes over."""
+        """True where a device side was connected, so that the session begins when the controller takes over."""
         return self.purpose in ("session", "bench")
 
 
 def read_head(lines: Iterator[str], options: DecodeOptions) -> tuple[float, Ran | None, str, str | None]:
-    """The period, s, what ran, the head as it may be stored, and the nonce of a blinded log, from the lines of a file.
+    """Read the head of a file from its lines: the period, s, what ran, the head as it may be stored, and the nonce of a blinded log.
 
     Raises:
         UndecodableFile: the head is cut, or of another version or period.
@@ -127,8 +128,8 @@ def _cut(where: str) -> UndecodableFile:
 
 
 def _described(line: str) -> tuple[Ran, str | None]:
-    """The JSON line of version 3, entry by entry: what is not of its kind is no entry of a log that a runner wrote. And the nonce of a
-    blinded one."""
+    """Parse the JSON line of version 3, entry by entry, and the nonce of a blinded log. An entry of the wrong kind is ignored: no runner
+    wrote it."""
     try:
         said = json.loads(line.removeprefix("# ")) if line.startswith("# ") and len(line) <= _LONGEST else None
     except ValueError:

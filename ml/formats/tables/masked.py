@@ -13,7 +13,7 @@ _ROW = struct.Struct(">id")
 
 
 def facts_of(text: str) -> tuple[str, dict[str, Any]]:
-    """The nonce of a log, and the facts in its head. Raises ValueError for another text."""
+    """Read the nonce of a log, and the facts in its head. Raises ValueError for another text."""
     nonce, masked = text[:_NONCE_DIGITS], bytes.fromhex(text[_NONCE_DIGITS:])
     facts = json.loads(_unmask(masked, nonce, "facts"))
     if not isinstance(facts, dict):
@@ -22,7 +22,7 @@ def facts_of(text: str) -> tuple[str, dict[str, Any]]:
 
 
 def row_of(text: str, nonce: str) -> tuple[int, float]:
-    """Hold and log density of a row, -1 and NaN where nothing was drawn. Raises ValueError for another text."""
+    """Read hold and log density of a row, -1 and NaN where nothing was drawn. Raises ValueError for another text."""
     number, _, masked = text.partition(":")
     try:
         hold, density = _ROW.unpack(_unmask(bytes.fromhex(masked), nonce, f"row {int(number)}"))

@@ -50,7 +50,7 @@ class NotANumber(ValueError):
 
 
 def parse_number(cell: str, decimal: str = ".") -> float | None:
-    """The number in a cell; None where the cell is empty, NaN or infinite.
+    """Parse the number in a cell; None where the cell is empty, NaN or infinite.
 
     Raises:
         NotANumber: anything else, formulas and thousands separators included.
@@ -66,7 +66,7 @@ def parse_number(cell: str, decimal: str = ".") -> float | None:
 
 
 def iso_time(cell: str) -> float | None:
-    """Unix time of an ISO 8601 date and time, s; one without a zone counts as UTC. None for anything else."""
+    """Parse an ISO 8601 date and time to Unix time, s; one without a zone counts as UTC. None for anything else."""
     text = cell.strip()
     if _DATE.match(text) is None:
         return None
@@ -78,7 +78,7 @@ def iso_time(cell: str) -> float | None:
 
 
 def column_name(header: str) -> tuple[str, str | None]:
-    """Normalised column name and the unit in brackets, if any: `Amplitude (mA)` is (`amplitude`, `mA`)."""
+    """Split a header into its normalised name and the unit in brackets, if any: `Amplitude (mA)` is (`amplitude`, `mA`)."""
     text = header.strip()
     unit: str | None = None
     if (match := _COLUMN.match(text)) is not None:
@@ -87,14 +87,15 @@ def column_name(header: str) -> tuple[str, str | None]:
 
 
 def unit_name(text: str) -> str:
-    """One spelling per unit: micro signs are `u`, squares `2`, so that `\u00b5V\u00b2` is `uV2`; an unknown unit stays as it is written."""
+    """Normalise a unit to one spelling: micro signs are `u`, squares `2`, so that `\u00b5V\u00b2` is `uV2`. An unknown unit stays as it is
+    written."""
     plain = " ".join(text.translate(_SPELLING).split())
     known = _known_unit(plain)
     return plain if known is None else known
 
 
 def known_unit(text: str) -> str | None:
-    """The unit's one spelling; None for a text that is no unit of a trace. What stands in a header may as well be a person's name."""
+    """Find the unit's one spelling; None for a text that is no unit of a trace. A text in a header may as well be a person's name."""
     return _known_unit(" ".join(text.translate(_SPELLING).split()))
 
 
@@ -106,5 +107,5 @@ def _known_unit(plain: str) -> str | None:
 
 
 def shown(cell: str, limit: int = 40) -> str:
-    """A cell as it may stand in a message: quoted, control characters escaped, cut."""
+    """Format a cell for a message: quoted, control characters escaped, cut."""
     return repr(cell if len(cell) <= limit else cell[: limit - 1] + "…")

@@ -21,7 +21,7 @@ _NUMBER = r"(?:[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[nN]a[nN])?
 def read_plain(
     lines: Iterator[str], delimiter: str, width: int, used: Sequence[int], max_rows: int
 ) -> dict[int, NDArray[np.float64]] | None:
-    """Numbers of the used columns by index, [rows] each, NaN for empty cells; None where a line is not plain or there are too many.
+    """Read numbers of the used columns by index, [rows] each, NaN for empty cells; None where a line is not plain or there are too many.
 
     Args:
         lines: the lines behind the header.

@@ -1,4 +1,4 @@
-"""What kinds of columns were removed from a table: told by what they are called like, never by what they are called."""
+"""Kinds of columns that were removed from a table: named by what their names resemble, never by the names."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LIKE = (
 
 
 def removed_columns(headers: Iterable[str]) -> list[str]:
-    """A sentence on columns that are not carried over, with how many of them are called like what; none where there are none."""
+    """Describe columns that are not carried over, with how many of them are called like what; empty where there are none."""
     kinds = Counter(_kind(header) for header in headers)
     if not kinds:
         return []
@@ -37,7 +37,7 @@ PERSONAL = ("a date", "a note", "an identifier")
 
 
 def is_personal(header: str) -> bool:
-    """Whether a column is called like one that says who somebody is."""
+    """Decide whether a column is called like one that identifies a person."""
     return _kind(header) in PERSONAL
 
 

@@ -42,7 +42,7 @@ def decode_parquet(path: Path, options: DecodeOptions, name: str | None = None) 
 
 
 def decode_columns(columns: Columns, options: DecodeOptions, name: str) -> DecodedFile:
-    """A recording out of the columns. Raises UndecodableFile naming line and column."""
+    """Decode a recording from the columns. Raises UndecodableFile naming line and column."""
     report = FileReport(name)
     report.repaired.extend(columns.notes)
     if columns.ignored:
@@ -61,7 +61,7 @@ def decode_columns(columns: Columns, options: DecodeOptions, name: str) -> Decod
 
 
 def _times(columns: Columns, options: DecodeOptions) -> NDArray[np.float64]:
-    """t_s in seconds, checked to be there, to increase and to reach beyond 0."""
+    """Read t_s in seconds, checked to be there, to increase and to reach beyond 0."""
     t_s = columns.values["t_s"] * TIME_SCALE[columns.units["t_s"]]
     if t_s.size == 0:
         raise UndecodableFile("the table has a header but no rows", "after line 1", "Add one row per step.")
@@ -80,7 +80,7 @@ def _times(columns: Columns, options: DecodeOptions) -> NDArray[np.float64]:
 
 
 def _grid(t_s: NDArray[np.float64], columns: Columns, options: DecodeOptions) -> tuple[NDArray[np.int64], float]:
-    """Row of the common grid for each line, and the end of the first row; raises where the spacing is another."""
+    """Find the row of the common grid for each line, and the end of the first row; raises where the spacing is another."""
     period = options.period_s
     steps = np.rint(t_s / period)
     if steps[-1] - steps[0] >= options.max_table_rows:
@@ -101,7 +101,7 @@ def _grid(t_s: NDArray[np.float64], columns: Columns, options: DecodeOptions) ->
 
 
 def _checked(role: str, columns: Columns, report: FileReport) -> NDArray[np.float64]:
-    """A column's numbers [rows] in mA, as a fraction, or beta as it is; NaN where there is none or it cannot be true."""
+    """Check a column's numbers [rows] in mA, as a fraction, or beta as it is; NaN where there is none or it cannot be true."""
     if role != "beta":
         return checked_amplitude(role, columns, report)
     values = columns.values[role]

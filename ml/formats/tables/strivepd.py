@@ -32,7 +32,7 @@ LATEST_UNIX_S = 1e10
 TIME_NAMES = ("time", "minute_start", "start_utc", "minute_start_utc", "start", "start_time", "timestamp", "start_date", "startdate")
 END_NAMES = ("enddate", "end_date", "end", "end_time", "end_utc")
 LONGEST_S = 3600.0
-"""A watch tells of minutes; an interval longer than this is no measurement."""
+"""Longest interval of a watch, which measures minutes; a longer one is no measurement."""
 
 CLASS_NAMES = ("class", "tremor_class", "tremor")
 KNOWN = frozenset(
@@ -50,7 +50,7 @@ def looks_like_tremor(headers: Sequence[str]) -> bool:
 
 
 def _key(header: str) -> str:
-    """A column's name; that of its class where it is called like Apple's `percentMild`, or `mild_percent`."""
+    """Name a column; by its class where it is called like Apple's `percentMild`, or `mild_percent`."""
     key = column_name(header)[0]
     plain = _SHARE.sub("", key).strip("_")
     return plain if plain in TREMOR_CLASSES else key
@@ -59,7 +59,7 @@ def _key(header: str) -> str:
 def decode_strivepd(path: Source, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
     """Decode minutes of tremor in any of three layouts, recognised by their columns.
 
-    Times are ISO 8601 or Unix time; a time without a zone is read as UTC, and that is said.
+    Times are ISO 8601 or Unix time; a time without a zone is read as UTC, and reported.
 
     Raises:
         UndecodableFile: none of the layouts, text for a number, an unreadable time; names line and column.
@@ -115,7 +115,7 @@ def _wide(table: TextTable, columns: dict[str, int], time: int, report: FileRepo
 
 
 def _lengths(table: TextTable, columns: dict[str, int], start: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Length of each row's minute, s: stated, or up to its end; 60 where the table does not tell."""
+    """Compute the length of each row's minute, s: stated, or up to its end; 60 where the table lacks it."""
     end = next((columns[key] for key in END_NAMES if key in columns), None)
     if "duration_s" not in columns and end is not None:
         ends = np.array([_unix_s(row[end], line)[0] for row, line in zip(table.rows, table.lines, strict=True)], dtype=np.float64)
@@ -148,7 +148,7 @@ def _by_class(table: TextTable, columns: dict[str, int], time: int, of_class: in
 
 
 def _long(table: TextTable, columns: dict[str, int], time: int, report: FileReport) -> TremorLog:
-    """Rows of seconds per severity, gathered by minute; rows of percentages say the same again and are left out."""
+    """Gather rows of seconds per severity by minute; rows of percentages repeat them and are ignored."""
     seconds: dict[float, dict[str, float]] = defaultdict(dict)
     lengths: dict[float, float] = {}
     durations = table.numbers(columns["duration"], table.decimal_mark([columns["duration"]]), "duration")
@@ -194,7 +194,7 @@ def _is_tremor_duration(row: list[str], columns: dict[str, int]) -> bool:
 
 
 def _starts(table: TextTable, time: int, report: FileReport) -> NDArray[np.float64]:
-    """Unix times of the rows, [n]; says where a zone had to be assumed."""
+    """Read Unix times of the rows, [n]; reports where a zone had to be assumed."""
     zoneless = 0
     out = np.empty(len(table.rows))
     for i, (row, line) in enumerate(zip(table.rows, table.lines, strict=True)):
@@ -206,7 +206,7 @@ def _starts(table: TextTable, time: int, report: FileReport) -> NDArray[np.float
 
 
 def _unix_s(cell: str, line: int) -> tuple[float, bool]:
-    """Unix time of an ISO date, or of a number in s, ms, us or ns; and whether its zone was assumed."""
+    """Parse the Unix time of an ISO date, or of a number in s, ms, us or ns; and whether its zone was assumed."""
     where, hint = f"line {line}, column time", "Give the time as ISO 8601 with its zone, or as Unix time."
     try:
         value = parse_number(cell)

@@ -15,7 +15,7 @@ from ml.formats.rcs.packets.scan import ARRAYS, SCALARS
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_PACKET, _HEADER, _TIMESTAMP, _CHANNEL, _CHANNELS = range(5)  # where in a packet a name stands
+_PACKET, _HEADER, _TIMESTAMP, _CHANNEL, _CHANNELS = range(5)  # place of a name in a packet
 _NUMBER, _FLAG, _OBJECT, _ARRAY, _LIST, _TEXT = range(6)  # what kind of value belongs to it
 
 _WORDS: Final = ("millivolts", "centiG")
@@ -64,10 +64,10 @@ _POWERS = np.array([10.0**k for k in range(23)])
 
 
 def compiled(function: F) -> F:
-    """Numba's `njit` without the interpreter's lock, under the function's own type; kept on disk where there is a folder to keep it in."""
+    """Apply numba's `njit` without the interpreter's lock, under the function's own type; cached on disk where a folder can be written."""
     try:
         return cast(F, njit(cache=True, nogil=True, error_model="numpy")(function))
-    except RuntimeError:  # neither the package's folder nor the user's cache can be written: compiled anew in every process
+    except RuntimeError:  # neither the package's folder nor the user's cache can be written: every process compiles
         return cast(F, njit(nogil=True, error_model="numpy")(function))
 
 
@@ -84,7 +84,7 @@ def copy_runs(pool: Any, starts: Any, lengths: Any, out: Any) -> None:
 def read_packets(
     text: Any, at: int, end: int, scalars: Any, starts: Any, lengths: Any, pool: Any, hard: Any
 ) -> tuple[int, int, int, int, int]:
-    """Returns packets read, numbers in pool and `hard`, end of the last packet, and where reading failed (-1: it only stopped)."""
+    """Return packets read, numbers in pool and `hard`, end of the last packet, and where reading failed (-1: it only stopped)."""
     count, used, difficult, stop = 0, 0, 0, at
     while count < scalars.shape[0]:
         i, fresh, more = _packet(text, at, count, scalars, starts[count], lengths[count], pool, used, hard, difficult)
@@ -106,7 +106,8 @@ def read_packets(
 def _packet(
     text: Any, i: int, row: int, scalars: Any, starts: Any, lengths: Any, pool: Any, used: int, hard: Any, difficult: int
 ) -> tuple[int, int, int]:
-    """One packet from its `{` on. Returns where it ends, or minus the place of the failure, and the numbers then in pool and `hard`."""
+    """Read one packet from its `{` on. Returns where it ends, or minus the place of the failure, and the numbers then in pool and
+    `hard`."""
     place, wanted, guess = _PACKET, 0, 0  # wanted: 0 after `{` or `[`, 1 after a value, 2 after a comma
     seen = np.zeros(_COUNT, dtype=np.bool_)
     key, begin, size = -1.0, 0, -1
@@ -194,7 +195,7 @@ def _packet(
 
 @compiled
 def _blank(text: Any, i: int) -> int:
-    """The next place that holds no blank of JSON."""
+    """Find the next place that has no blank of JSON."""
     while text[i] == 32 or 9 <= text[i] <= 10 or text[i] == 13:
         i += 1
     return i
@@ -202,7 +203,7 @@ def _blank(text: Any, i: int) -> int:
 
 @compiled
 def _field(text: Any, i: int, place: int, guess: int) -> int:
-    """Number of the field whose name and closing quote stand here, -1 for a name not known at this place; `guess` is tried first."""
+    """Find the number of the field with this name and closing quote, -1 for a name not known at this place; `guess` is tried first."""
     for k in range(_COUNT):
         f = (guess + k) % _COUNT
         if _PLACES[f] == place and text[i + _SIZES[f]] == 34:
@@ -218,7 +219,8 @@ def _field(text: Any, i: int, place: int, guess: int) -> int:
 
 @compiled
 def _number(text: Any, i: int) -> tuple[int, float]:
-    """A JSON number. Returns the place behind it, or minus the place of the failure, and its value, NaN for one that `float` must read."""
+    """Read a JSON number. Returns the place behind it, or minus the place of the failure, and its value, NaN for one that `float` must
+    read."""
     negative = int(text[i] == 45)
     i += negative
     first = i
@@ -266,7 +268,7 @@ def _number(text: Any, i: int) -> tuple[int, float]:
 
 @compiled
 def _array(text: Any, i: int, pool: Any, used: int, hard: Any, difficult: int) -> tuple[int, int, int]:
-    """A list of numbers. Returns the place behind it, or minus the place of the failure, and the numbers in pool and `hard`."""
+    """Read a list of numbers. Returns the place behind it, or minus the place of the failure, and the numbers in pool and `hard`."""
     if text[i] != 91:
         return -i, used, difficult
     i = _blank(text, i + 1)
@@ -295,7 +297,7 @@ def _array(text: Any, i: int, pool: Any, used: int, hard: Any, difficult: int) -
 
 @compiled
 def _flag(text: Any, i: int) -> tuple[int, float]:
-    """`true` or `false`. Returns the place behind it, or minus the place of the failure, and 1 or 0."""
+    """Read `true` or `false`. Returns the place behind it, or minus the place of the failure, and 1 or 0."""
     if text[i] == 116 and text[i + 1] == 114 and text[i + 2] == 117 and text[i + 3] == 101:
         return i + 4, 1.0
     if text[i] == 102 and text[i + 1] == 97 and text[i + 2] == 108 and text[i + 3] == 115 and text[i + 4] == 101:
@@ -305,7 +307,7 @@ def _flag(text: Any, i: int) -> tuple[int, float]:
 
 @compiled
 def _word(text: Any, i: int) -> int:
-    """One of the known words in quotes. Returns the place behind it, or minus the place of the failure."""
+    """Read one of the known words in quotes. Returns the place behind it, or minus the place of the failure."""
     if text[i] == 34:
         for w in range(_WORD_SIZES.size):
             same = True

@@ -1,4 +1,4 @@
-"""The PC's clock against the implant's ticks: where it lies, how it drifts, where one of the two was set.
+"""The PC's clock against the implant's ticks: its offset, its drift, and the moments when one of the two was set.
 
 PacketGenTime is the PC's estimate of when a packet was made. It wanders by some 30 ms about a straight line over the ticks (format notes,
 A.2), and jumps where the PC's clock is set. Line and jumps are fitted here by medians; what is left of each packet are the residuals.
@@ -45,20 +45,20 @@ class Levels:
     bounds: NDArray[np.int64]
 
     def pieces(self) -> list[slice]:
-        """The packets between steps, as slices of the device order."""
+        """Slice the packets, in the device order, into those between steps."""
         return [slice(a, b) for a, b in zip(self.bounds[:-1].tolist(), self.bounds[1:].tolist(), strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
 class PcClock:
-    """What the PC's clock shows at a device time, and when on the recording's timeline a PC time was.
+    """The PC's clock as a function of device time, and its inverse on the recording's timeline.
 
-    The timeline runs with the implant's ticks and shows the PC's time where the recording begins; of several pieces between steps of the
-    PC's clock it goes by the one with the most packets.
+    The timeline runs with the implant's ticks and shows the PC's time at the beginning of the recording. Of several pieces between steps of
+    the PC's clock, the one with the most packets counts.
 
     Attributes:
         slope: gain of the PC's clock on the implant's, relative.
-        drift: how fast the implant's clock runs against the PC's, relative; None where the recording is too short to tell.
+        drift: how fast the implant's clock runs against the PC's, relative; None where the recording is too short to estimate it.
         steps_at_ms: device times at which the PC's clock was set, [k]. offsets_ms: PC time minus device time at device time 0, [k + 1].
         shift_ms: timeline minus device time.
     """
@@ -70,7 +70,7 @@ class PcClock:
     shift_ms: float
 
     def pc_ms(self, device_ms: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the PC's clock shows, [n]."""
+        """Compute what the PC's clock shows, [n]."""
         piece = np.searchsorted(self.steps_at_ms, device_ms, side="right")
         return np.asarray(device_ms * (1.0 + self.slope) + self.offsets_ms[piece])
 
@@ -79,9 +79,9 @@ class PcClock:
         return np.asarray(device_ms + self.shift_ms)
 
     def of_pc_ms(self, pc_ms: NDArray[np.float64]) -> NDArray[np.float64]:
-        """When on the timeline the PC's clock showed this, [n].
+        """Compute when on the timeline the PC's clock showed this, [n].
 
-        A time that a step forwards left out is that of the step; of a time that a step backwards showed twice the first counts.
+        A time that a step forwards skipped is that of the step; of a time that a step backwards showed twice the first counts.
         """
         ends = self.pc_ms(np.nextafter(self.steps_at_ms, -np.inf))
         piece = np.searchsorted(np.maximum.accumulate(ends), pc_ms, side="right")
@@ -91,12 +91,12 @@ class PcClock:
 
     @property
     def steps_ms(self) -> NDArray[np.float64]:
-        """How far the PC's clock was set at each step, [k]."""
+        """Size of the change of the PC's clock at each step, [k]."""
         return np.diff(self.offsets_ms)
 
 
 def levels(at_ms: NDArray[np.float64], value_ms: NDArray[np.float64], step_ms: float) -> Levels:
-    """Where a quantity, [n] in rising order of `at_ms` [n], steps by more than `step_ms` and stays there."""
+    """Find where a quantity, [n] in rising order of `at_ms` [n], steps by more than `step_ms` and stays there."""
     bins, centre = _binned(at_ms, value_ms)
     before, after = _around(centre)
     pause = np.diff(at_ms[bins[:-1]], prepend=at_ms[0]) if at_ms.size else np.empty(0)
@@ -117,7 +117,7 @@ def levels(at_ms: NDArray[np.float64], value_ms: NDArray[np.float64], step_ms: f
 
 
 def _binned(at_ms: NDArray[np.float64], value_ms: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Begin of every second that holds packets, and the end, [m + 1]; the median of each, [m]."""
+    """Find the beginning of every second with packets, and the end, [m + 1]; the median of each, [m]."""
     if at_ms.size == 0:
         return np.zeros(1, dtype=np.int64), np.empty(0)
     second = np.floor(at_ms / BIN_MS)
@@ -128,7 +128,7 @@ def _binned(at_ms: NDArray[np.float64], value_ms: NDArray[np.float64]) -> tuple[
 
 
 def _around(centre: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Median of the seconds before each and of those from it on, [m] each; the first has none before it and steps nowhere."""
+    """Compute the median of the seconds before each and of those from it on, [m] each; the first has none before it and steps nowhere."""
     padded = np.concatenate((np.full(BINS_AROUND, np.nan), centre, np.full(BINS_AROUND, np.nan)))
     if centre.size == 0:
         return centre, centre
@@ -139,7 +139,7 @@ def _around(centre: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def _split(value_ms: NDArray[np.float64], bins: NDArray[np.int64], b: int, before: float, after: float) -> int:
-    """The packet at which the value goes over from one level to the other, near the begin of second b."""
+    """Find the packet at which the value goes over from one level to the other, near the beginning of second b."""
     low, high = int(bins[max(0, b - 2)]), int(bins[min(bins.size - 1, b + 2)])
     near = value_ms[low:high]
     cost = np.concatenate(([0.0], np.cumsum(np.abs(near - before)))) + np.concatenate((np.cumsum(np.abs(near - after)[::-1])[::-1], [0.0]))
@@ -147,7 +147,7 @@ def _split(value_ms: NDArray[np.float64], bins: NDArray[np.int64], b: int, befor
 
 
 def fit_clock(device_ms: NDArray[np.float64], pc_ms: NDArray[np.float64]) -> PcClock:
-    """The PC's clock from packets whose PC time is known, both [n] in any order; PC and device time are the same where none is."""
+    """Fit the PC's clock to packets whose PC time is known, both [n] in any order; PC and device time are the same where none is."""
     known = np.flatnonzero(np.isfinite(pc_ms))
     known = known[np.argsort(device_ms[known], kind="stable")]
     if known.size == 0:
@@ -165,7 +165,8 @@ def fit_clock(device_ms: NDArray[np.float64], pc_ms: NDArray[np.float64]) -> PcC
 
 
 def _gain(at_ms: NDArray[np.float64], ahead_ms: NDArray[np.float64], pieces: list[slice]) -> float | None:
-    """Median slope between seconds half a piece apart (the line of Theil and Sen on few pairs); None where no piece is long enough."""
+    """Compute the median slope between seconds half a piece apart (the line of Theil and Sen on few pairs). None where no piece is long
+    enough."""
     slopes: list[NDArray[np.float64]] = []
     for piece in pieces:
         at, ahead = at_ms[piece], ahead_ms[piece]

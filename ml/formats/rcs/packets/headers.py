@@ -20,7 +20,7 @@ class PacketHeaders:
 
     Attributes:
         seconds: the implant's clock at the last sample, whole seconds.
-        tick: the implant's counter of 100 us at the last sample; it begins anew every 6.5536 s.
+        tick: the implant's counter of 100 us at the last sample; it restarts every 6.5536 s.
         gen_ms: PacketGenTime, when the PC takes the packet to have been made, ms; 0, negative or NaN where it does not know.
         rx_ms: when it arrived, ms in the PC clock.
         sequence: 8-bit counter of the stream's packets. samples: per channel. rate_hz: samples per second.
@@ -51,11 +51,11 @@ class PacketHeaders:
 
     @property
     def length_ms(self) -> NDArray[np.float64]:
-        """How long each packet's signal lasts, [n]."""
+        """Duration of each packet's signal, [n]."""
         return np.asarray(1000.0 * self.samples / self.rate_hz)
 
     def take(self, index: NDArray[np.int64]) -> PacketHeaders:
-        """Some of the packets."""
+        """Select some of the packets."""
         return PacketHeaders(*(getattr(self, name)[index] for name in PacketHeaders.__slots__))
 
 

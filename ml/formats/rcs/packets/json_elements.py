@@ -3,7 +3,7 @@
 Real files hold bare NaN, `INF` and cut ends (see the format notes, A.10). The reader looks for elements of the innermost list of
 interest: packets under a stream key, or whole records. It holds one chunk of text, never the file.
 
-Where a scanner is given, runs of plain packets go through it and come out as one batch; the reader steps in for every other packet.
+With a scanner, runs of plain packets go through it and come out as one batch. The reader steps in for every other packet.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ _NEXT = {"packets": re.compile(r'\{\s*"Header"'), "records": re.compile(r'\{\s*"
 
 @dataclass(slots=True)
 class JsonNotes:
-    """What was met while reading one file. The reader fills it in; it is complete when the reader is exhausted.
+    """Findings while one file is read. The reader fills it in; it is complete when the reader is exhausted.
 
     Attributes:
-        unread_fields: fields of stream objects beside `RecordInfo` and the packets; they are stepped over.
+        unread_fields: fields of stream objects other than `RecordInfo` and the packets; they are stepped over.
     """
 
     defects: list[str] = field(default_factory=list)
@@ -92,13 +92,13 @@ class _Text:
         return not self.ended
 
     def plain(self) -> bytes | None:
-        """The text as padded bytes; None where bytes and characters do not count the same."""
+        """Encode the text as padded bytes; None where bytes and characters do not count the same."""
         if self._plain[0] is not self.text:
             self._plain = (self.text, self.text.encode() + PADDING if self.text.isascii() else b"")
         return self._plain[1] or None
 
     def mend_inf(self, at: int) -> bool:
-        """Where an INF token stands at `at`, spell it the way the parser knows, here and in all that follows; True when that was so."""
+        """Spell an INF token at `at` the way the parser knows, here and in all that follows; True when there was one."""
         if self.mending_inf or _INF.search(self.text, max(self.at, at - 2), at + 12) is None:
             return False
         self.mending_inf = True
@@ -117,7 +117,7 @@ class _Text:
 
 
 def read_elements(stream: IO[bytes], notes: JsonNotes, scanner: Scanner | None = None) -> Iterator[tuple[Any, str]]:
-    """Packets of a stream file, or records of a record file, each with its text as it stood in the file.
+    """Read packets of a stream file, or records of a record file, each with its original text.
 
     Args:
         stream: the file's bytes.
@@ -152,7 +152,7 @@ def read_elements(stream: IO[bytes], notes: JsonNotes, scanner: Scanner | None =
 
 
 def _enter_stream(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) -> str | None:
-    """If a stream object `{RecordInfo, <Key>: [` begins here, step into its list and return the key."""
+    """Enter the list of a stream object `{RecordInfo, <Key>: [`, if one begins here, and return the key."""
     if window.skip_space() != "{":
         return None
     while len(window.text) - window.at < 4096 and window.more():
@@ -175,7 +175,7 @@ def _enter_stream(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) ->
 
 
 def _leave_stream(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) -> bool:
-    """Step over what closes a stream object, fields behind its packets included; True when the outer list is closed too."""
+    """Skip what closes a stream object, fields behind its packets included; True when the outer list is closed too."""
     if window.skip_space() == "]":
         window.at += 1
     while window.skip_space() == '"' and _skip_field(window, notes, decoder):
@@ -186,7 +186,7 @@ def _leave_stream(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) ->
 
 
 def _skip_field(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) -> bool:
-    """Step over one `"key": value`; False, and not moved, where it is damaged, cut, or longer than an element may be."""
+    """Skip one `"key": value`; False, and not moved, where it is damaged, cut, or longer than an element may be."""
     while True:
         try:
             key, end = decoder.raw_decode(window.text, window.at)
@@ -209,7 +209,7 @@ def _skip_field(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) -> b
 def _read_list(
     window: _Text, notes: JsonNotes, decoder: json.JSONDecoder, kind: str, scanner: Scanner | None = None
 ) -> Generator[tuple[Any, str], None, bool]:
-    """Elements until the list closes; returns True when it does."""
+    """Yield elements until the list closes; returns True when it does."""
     while True:
         mark = window.skip_space()
         if scanner is not None and mark == "{":
@@ -236,7 +236,7 @@ def _read_list(
 
 
 def _scan(window: _Text, notes: JsonNotes, scanner: Scanner) -> Iterator[tuple[Batch, str]]:
-    """The plain packets from here on; afterwards the window stands before something else."""
+    """Yield the plain packets from here on; afterwards the window is at something else."""
     while window.skip_space() == "{" and (raw := window.plain()) is not None:
         batch, end, cut = scanner(raw, window.at)
         if batch.size:
@@ -249,7 +249,7 @@ def _scan(window: _Text, notes: JsonNotes, scanner: Scanner) -> Iterator[tuple[B
 
 
 def _element(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) -> tuple[Any, str] | None:
-    """The object that begins here, or None when it is damaged."""
+    """Parse the object that begins here, or return None when it is damaged."""
     while True:
         try:
             value, end = decoder.raw_decode(window.text, window.at)
@@ -273,7 +273,7 @@ def _element(window: _Text, notes: JsonNotes, decoder: json.JSONDecoder) -> tupl
 
 
 def _deeper(value: Any, levels: int) -> bool:
-    """Whether objects and lists are nested deeper than so many levels."""
+    """Decide whether objects and lists are nested deeper than so many levels."""
     layer = [value]
     for _ in range(levels):
         inner = [item.values() if isinstance(item, dict) else item for item in layer]
@@ -284,7 +284,7 @@ def _deeper(value: Any, levels: int) -> bool:
 
 
 def _resync(window: _Text, notes: JsonNotes, kind: str) -> bool:
-    """Go to the next packet or record after a damaged one; False when there is none."""
+    """Find the next packet or record after a damaged one; False when there is none."""
     window.at += 1
     notes.damaged += 1
     if notes.damaged > MAX_DAMAGED:

@@ -1,7 +1,7 @@
-"""What is missing of a stream's signal, and how many packets that were.
+"""Loss of a stream: the missing signal, and the number of missing packets.
 
-Loss is missing signal: the time between the first and the last sample that no packet holds, over that time. Where the settings say that
-sensing was off, nothing is missing. Numbers of packets are told beside it; they are less, for what comes after a lost packet is cut short.
+Loss is missing signal: the share of the time between the first and the last sample that no packet covers. Where the settings show that
+sensing was off, nothing is missing. Numbers of packets are reported too. They are lower, since the packet after a lost one is cut short.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 from ml.formats.rcs.packets.headers import PacketHeaders
 
 GAP = 0.5
-"""Signal is missing where a packet lies by more than this share of its length further than its samples reach."""
+"""Share of a packet's length; signal is missing where a packet is further than that beyond the samples before it."""
 
 AGREE = 0.8
-"""The 8-bit counter of packets starts anew at times; it counts where it differs by less than this share from what the clock says."""
+"""Largest relative difference from the clock at which the 8-bit counter of packets counts; it restarts at times."""
 
 Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Gaps:
-    """Where a stream's signal is missing, [g] each.
+    """Gaps of a stream's signal, [g] each.
 
     Attributes:
         after: the packet, in device order, after which it is missing.
@@ -42,7 +42,7 @@ class Gaps:
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """What a stream lost.
+    """Amount that a stream lost.
 
     Attributes:
         packets: lost ones, by their counter where it can be believed.
@@ -57,7 +57,7 @@ class Loss:
 
 
 def find_gaps(at_ms: NDArray[np.float64], kept: PacketHeaders, shift_ms: float) -> Gaps:
-    """Gaps of packets in device order, with their device times [n]; `shift_ms` is the timeline minus device time.
+    """Find gaps of packets in device order, with their device times [n]; `shift_ms` is the timeline minus device time.
 
     A change of the rate begins a new stretch too, with nothing missing where the ticks say so.
     """
@@ -81,7 +81,7 @@ def find_gaps(at_ms: NDArray[np.float64], kept: PacketHeaders, shift_ms: float) 
 
 
 def loss_of(gaps: Gaps, received_ms: float, off: Sequence[Interval]) -> Loss:
-    """What is missing without the times in which sensing was off; `off` are intervals of the timeline in ms."""
+    """Compute what is missing without the times in which sensing was off; `off` are intervals of the timeline in ms."""
     span = gaps.end_ms - gaps.begin_ms
     paused = np.zeros(gaps.after.size)
     for begin, end in off:

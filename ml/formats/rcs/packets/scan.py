@@ -1,9 +1,10 @@
 """Compiled reading of plain RC+S stream packets: bytes in, float arrays out, no Python object per number.
 
-A packet is plain when it is strict JSON and holds nothing but the fields of format notes A.2 to A.4 with values of the right kind, each
-once. Everything else, damage included, is left to the tolerant reader of `json_elements`; `batch_of` gives its packets the same shape.
+A packet is plain when it is strict JSON with nothing but the fields of format notes A.2 to A.4. Each field comes once, with a value of the
+right kind. Everything else, damage included, is left to the tolerant reader of `json_elements`; `batch_of` gives its packets the same
+shape.
 
-A number whose digits fit 53 bits and whose decimal shift is at most 22 is one correctly rounded operation on exact doubles; the others,
+A number whose digits fit 53 bits and whose decimal shift is at most 22 is one correctly rounded operation on exact doubles. The others,
 such as 0.040411999999999997, are left to `float`, so that every value is the one that any JSON parser gives.
 """
 
@@ -50,7 +51,7 @@ class Batch:
 
     Attributes:
         scalars: shape [n, len(SCALARS)]; NaN where the packet has no such number; flags are 0 or 1.
-        starts, lengths: where each of ARRAYS lies in `pool`, shape [n, len(ARRAYS)]; length -1 where the packet has none.
+        starts, lengths: place of each of ARRAYS in `pool`, shape [n, len(ARRAYS)]; length -1 where the packet has none.
         pool: the arrays' numbers one after another, shape [m]; NaN for what is no finite number.
     """
 
@@ -65,7 +66,7 @@ class Batch:
         return int(self.scalars.shape[0])
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """One of SCALARS, shape [n]."""
+        """Return one of SCALARS, shape [n]."""
         return self.scalars[:, SCALARS.index(name)]
 
 
@@ -98,7 +99,7 @@ def scan(text: bytes, at: int) -> tuple[Batch, int, bool]:
 
 
 def batch_of(packets: Iterable[Any]) -> Batch:
-    """The same from parsed JSON values of whatever shape: the definition of what `scan` reads."""
+    """Build a batch from parsed JSON values of whatever shape: the definition of what `scan` reads."""
     scalars: list[list[float]] = []
     starts: list[NDArray[np.int64]] = []
     lengths: list[list[int]] = []
@@ -132,7 +133,7 @@ def _scalar(packet: Any, name: str) -> float:
 
 
 def _arrays(packet: Any) -> Iterable[tuple[int, Any]]:
-    """(slot, values) of the arrays of a packet."""
+    """Yield (slot, values) of the arrays of a packet."""
     listed = get(packet, "ChannelSamples")
     for channel in listed if isinstance(listed, list) else ():
         key = number(get(channel, "Key"))
@@ -143,7 +144,7 @@ def _arrays(packet: Any) -> Iterable[tuple[int, Any]]:
 
 
 def join(batch: Batch, name: str, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """One array of the given packets, one after another, shape [sum of lengths]; packets without it add nothing."""
+    """Join one array of the given packets, one after another, shape [sum of lengths]; packets without it add nothing."""
     from ml.formats.rcs.packets._scan_kernel import copy_runs
 
     slot = ARRAYS.index(name)

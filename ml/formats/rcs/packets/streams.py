@@ -1,6 +1,6 @@
 """Packets of an RC+S session as arrays. Source: format notes, A.2 to A.4, A.7.
 
-Each reader takes packets in batches and keeps numbers only; a packet with a field of the wrong kind is left out and counted.
+Each reader takes packets in batches and keeps numbers only; a packet with a field of the wrong kind is ignored and counted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ml.formats.rcs.settings import RATE_HZ, get, integer, number
 ACCEL_RATE_HZ = {0: 65.104, 1: 32.552, 2: 16.276, 3: 8.138, 4: 4.069}
 AXES = ("XSamples", "YSamples", "ZSamples")
 Interval = Callable[[float], float | None]
-"""A packet's PC time in ms (NaN when unknown) to the FFT interval in force then, s; None where no settings tell."""
+"""A function from a packet's PC time in ms (NaN when unknown) to the FFT interval in force, s. None where the settings lack it."""
 
 DEFAULT_INTERVAL_S = 0.1
 
@@ -33,7 +33,7 @@ class TimeDomain:
         headers: of the packets, [n].
         samples: per key 0..3 the samples of all packets one after another, mV; NaN where no finite number stood.
         offsets: per key where each packet's samples begin in `samples`, [n]; -1 where the packet has none of that key.
-        unusable: packets left out.
+        unusable: ignored packets.
     """
 
     headers: PacketHeaders
@@ -42,7 +42,7 @@ class TimeDomain:
     unusable: int
 
     def same(self, i: int, j: int) -> bool:
-        """Whether two packets hold the same samples."""
+        """Compare the samples of two packets."""
         return all(_same(x, at, self.headers.samples, i, j) for x, at in zip(self.samples, self.offsets, strict=True))
 
 
@@ -58,7 +58,7 @@ class Power:
     over_range: int
 
     def same(self, i: int, j: int) -> bool:
-        """Whether two packets hold the same powers."""
+        """Compare the powers of two packets."""
         return bool(np.array_equal(self.bands[i], self.bands[j], equal_nan=True))
 
 
@@ -72,7 +72,7 @@ class Accel:
     unusable: int
 
     def same(self, i: int, j: int) -> bool:
-        """Whether two packets hold the same samples."""
+        """Compare the samples of two packets."""
         return _same(self.samples, self.offsets, self.headers.samples, i, j)
 
 
@@ -88,7 +88,7 @@ class Fft:
     unusable: int
 
     def same(self, i: int, j: int) -> bool:
-        """Whether two packets hold the same spectrum of the same channel."""
+        """Compare the channels and spectra of two packets."""
         return self.channel[i] == self.channel[j] and bool(np.array_equal(self.amplitude_mv[i], self.amplitude_mv[j], equal_nan=True))
 
 
@@ -101,7 +101,7 @@ class TimeSync:
     unusable: int
 
     def same(self, i: int, j: int) -> bool:
-        """Whether two packets hold the same latency."""
+        """Compare the latencies of two packets."""
         return bool(np.array_equal(self.latency_ms[i], self.latency_ms[j], equal_nan=True))
 
 
@@ -118,7 +118,7 @@ class Adaptive:
     unusable: int
 
     def same(self, i: int, j: int) -> bool:
-        """Whether two updates hold the same amplitudes, state and detector."""
+        """Compare the amplitudes, states and detectors of two updates."""
         columns = (self.amplitude_ma, self.ld0_output, self.ld0_inputs)
         return self.state[i] == self.state[j] and all(np.array_equal(x[i], x[j], equal_nan=True) for x in columns)
 
@@ -143,16 +143,16 @@ class _Table:
         return rows
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """One of the collected columns, [n]."""
+        """Return one of the collected columns, [n]."""
         pieces = self._columns.get(name)
         return np.concatenate(pieces) if pieces else np.empty(0)
 
     def codes(self, name: str) -> NDArray[np.int64]:
-        """A column of codes, [n]; -1 where it holds no whole number."""
+        """Return a column of codes, [n]; -1 where it has no whole number."""
         return _codes(self.column(name))
 
     def headers(self, samples: NDArray[np.float64] | None = None, rate_hz: NDArray[np.float64] | None = None) -> PacketHeaders:
-        """The collected headers, [n]; one sample a packet where `samples` are not given."""
+        """Return the collected headers, [n]; one sample a packet where `samples` are not given."""
         seconds, tick, sequence = (self.column(name).astype(np.int64) for name in ("seconds", "systemTick", "dataTypeSequence"))
         many = np.ones(seconds.size) if samples is None else samples
         rate = self.column("rate") if rate_hz is None else rate_hz
@@ -160,12 +160,12 @@ class _Table:
         return PacketHeaders(seconds, tick, gen, rx, sequence, many.astype(np.int64), rate)
 
     def pc_ms(self) -> NDArray[np.float64]:
-        """PC time of every packet, ms: when it was generated, else when it arrived; NaN when neither is known."""
+        """Compute the PC time of every packet, ms: when it was generated, else when it arrived; NaN when neither is known."""
         gen, rx = self.column("PacketGenTime"), self.column("PacketRxUnixTime")
         return np.where(gen > 0, gen, np.where(rx > 0, rx, np.nan))
 
     def rate_of(self, interval_at: Interval) -> NDArray[np.float64]:
-        """Packets per second under the FFT interval in force at each packet, [n]."""
+        """Compute packets per second under the FFT interval in force at each packet, [n]."""
         values = [interval_at(t) for t in self.pc_ms().tolist()]
         return _rate(np.array([np.nan if value is None else value for value in values], dtype=np.float64), self.column("systemTick"))
 
@@ -174,14 +174,14 @@ _KEPT = ("seconds", "systemTick", "dataTypeSequence", "PacketGenTime", "PacketRx
 
 
 def _same(x: NDArray[np.float64], offsets: NDArray[np.int64], count: NDArray[np.int64], i: int, j: int) -> bool:
-    """Whether packets i and j hold equal samples of x; both may have none."""
+    """Compare samples of x of packets i and j; both may have none."""
     if offsets[i] < 0 or offsets[j] < 0:
         return bool(offsets[i] == offsets[j])
     return bool(np.array_equal(x[offsets[i] : offsets[i] + count[i]], x[offsets[j] : offsets[j] + count[j]], equal_nan=True))
 
 
 def _rate(interval_s: NDArray[np.float64], tick: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Packets per second, [n]; where the settings do not tell the interval, from the median step of the device's clock."""
+    """Compute packets per second, [n]; where the settings lack the interval, from the median step of the device's clock."""
     steps = np.diff(tick) % ROLLOVER / TICKS_PER_S
     usual = float(np.median(steps)) if steps.size else 0.0
     return np.asarray(1.0 / np.where(np.isfinite(interval_s), interval_s, usual if usual > 0 else DEFAULT_INTERVAL_S))
@@ -305,7 +305,8 @@ def read_adaptive(records: Iterable[Any], interval_at: Interval) -> Adaptive:
 
 
 def _adaptive_rows(records: Iterable[Any], interval_at: Interval) -> Iterator[array[float] | None]:
-    """Of each record 3 numbers of the header, 2 times, interval, 4 amplitudes, state, output, 4 inputs, status bits; None when unusable."""
+    """Yield for each record 3 numbers of the header, 2 times, interval, 4 amplitudes, state, output, 4 inputs, status bits; None when
+    unusable."""
     for record in records:
         update = get(record, "AdaptiveUpdate")
         delivered = get(update, "CurrentProgramAmplitudesInMilliamps")

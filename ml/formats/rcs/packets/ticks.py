@@ -1,9 +1,9 @@
 """The implant's ticks made continuous: how much time passed between packets, whatever happened to the clocks meanwhile.
 
-A tick counts 100 us and begins anew every 6.5536 s, so two packets lie a known time apart but for whole turns. Four witnesses say how many
-turns: the implant's `timestamp`, PacketGenTime, the time of arrival, and the 8-bit counter of packets. Where the implant's and the PC's
-clock say the same, it holds. Where they differ, one of them was set or one packet's field is wrong, and the number of turns with which most
-agree holds. So a step of either clock moves no packet.
+A tick counts 100 us and the counter restarts every 6.5536 s. So two packets are a known time apart but for whole turns. Four witnesses show
+how many turns: the implant's `timestamp`, PacketGenTime, the time of arrival, and the 8-bit counter of packets. Where the implant's and the
+PC's clock agree, their number counts. Where they differ, one of them was set or one packet's field is wrong. Then the number of turns with
+which most agree counts. So a step of either clock moves no packet.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LATE_PACKETS: Final = 64
 
 
 def device_ms(headers: PacketHeaders) -> NDArray[np.float64]:
-    """Time of every packet after the first one of the file, ms of the implant's ticks, [n]; negative steps are packets that came late."""
+    """Compute the time of every packet after the first one of the file, ms of the implant's ticks, [n]; negative steps are late packets."""
     if headers.size == 0:
         return np.empty(0)
     ticks = (np.diff(headers.tick) % ROLLOVER) * (1000.0 / TICKS_PER_S)
@@ -56,7 +56,8 @@ def device_ms(headers: PacketHeaders) -> NDArray[np.float64]:
 
 
 def _counter_agrees(steps_ms: NDArray[np.float64], counted: NDArray[np.int64], usual_ms: float) -> NDArray[np.bool_]:
-    """Whether steps, [candidates, m], are what so many packets last: lost ones may have been four times as long as usual, or a quarter."""
+    """Decide whether steps, [candidates, m], are what so many packets last: lost ones may have been four times as long as usual, or a
+    quarter."""
     ahead = (steps_ms >= 0.25 * counted * usual_ms - 150.0) & (steps_ms <= 4.0 * counted * usual_ms + 500.0)
     late = 256 - counted
     behind = (steps_ms <= 150.0 - 0.25 * late * usual_ms) & (steps_ms >= -4.0 * late * usual_ms - 500.0)
@@ -64,10 +65,10 @@ def _counter_agrees(steps_ms: NDArray[np.float64], counted: NDArray[np.int64], u
 
 
 def between_streams(one: PacketHeaders, one_ms: NDArray[np.float64], other: PacketHeaders, other_ms: NDArray[np.float64]) -> float:
-    """What to add to the other stream's device times so that both streams count from the same moment, ms.
+    """Compute what to add to the other stream's device times so that both streams count from the same moment, ms.
 
-    Every packet of the other stream is compared with the one of the first that was made nearest to it: ticks say how far they lie apart,
-    but for whole turns, which the clock tells that both share. The median over all packets counts, so that a step of it says nothing.
+    Every packet of the other stream is compared with the one of the first that was made nearest to it. Ticks give their distance but for
+    whole turns, which the clock that both share gives. The median over all packets counts, so that a step of it has no effect.
     """
     for name in ("made_ms", "arrived_ms", "seconds"):
         a, b = (np.asarray(getattr(x, name), dtype=np.float64) * (1000.0 if name == "seconds" else 1.0) for x in (one, other))

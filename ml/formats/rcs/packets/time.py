@@ -1,7 +1,7 @@
-"""When each RC+S packet was measured: one timeline for all streams of a recording. Source: the format notes, A.2 and A.9.
+"""Times of RC+S packets: one timeline for all streams of a recording. Source: the format notes, A.2 and A.9.
 
-The timeline runs with the implant's ticks (`packets/ticks.py`); PacketGenTime says where on the PC's clock it lies, how the two drift, and
-where a clock was set (`packets/clock.py`), and moves no packet against another. Samples are equidistant as far as no signal is missing.
+The timeline runs with the implant's ticks (`packets/ticks.py`). PacketGenTime gives its place on the PC's clock, the drift between both,
+and where a clock was set (`packets/clock.py`). It moves no packet against another. Samples are equidistant as far as no signal is missing.
 
 Differences from the public toolbox, which places every stretch without loss by its own PacketGenTimes, are in `docs/ingest.md`.
 """
@@ -39,7 +39,7 @@ Same = Callable[[int, int], bool]
 
 
 class Rejected(StrEnum):
-    """Why a packet was left out. The last three are of decode versions up to 4, whose recordings are shown as they were stored."""
+    """Reason why a packet was ignored. The last three are of decode versions up to 4, whose recordings are shown as they were stored."""
 
     DUPLICATE = "duplicate"
     UNPLACEABLE = "unplaceable"
@@ -160,7 +160,7 @@ def _place(
     same: Same | None,
     device_clock: bool,
 ) -> PacketTimes:
-    """Times of one stream from its device times, [n] in file order."""
+    """Compute the times of one stream from its device times, [n] in file order."""
     rejected: dict[Rejected, int] = {}
     order = np.argsort(elapsed, kind="stable")
     reordered = int(np.sum(elapsed < np.maximum.accumulate(elapsed)))
@@ -193,7 +193,7 @@ def _sorted(
 
 
 def _repeats(headers: PacketHeaders, elapsed: NDArray[np.float64], order: NDArray[np.int64], same: Same | None) -> NDArray[np.bool_]:
-    """Which packets, in device order, hold what an earlier one of the same clock and number holds: headers alone prove nothing."""
+    """Mark packets, in device order, with the content of an earlier one of the same clock and number: headers alone prove nothing."""
     hit = np.zeros(order.size, dtype=bool)
     for i in np.flatnonzero(np.diff(elapsed[order]) == 0).tolist():
         here = int(order[i + 1])
@@ -215,7 +215,7 @@ def _astray(
     residual: NDArray[np.float64],
     implant_off: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Which packets, in device order, have ticks that both clocks contradict and that join no neighbour: nobody knows where they belong."""
+    """Mark packets, in device order, whose ticks both clocks contradict and that join no neighbour: their place is unknown."""
     doubtful = (np.abs(implant_off[order]) > SECONDS_STEP_MS) & ~(np.abs(residual[order]) <= ASTRAY_MS)
     if not doubtful.any():
         return doubtful
@@ -225,10 +225,10 @@ def _astray(
 
 
 def _untangled(at: NDArray[np.float64], kept: PacketHeaders) -> tuple[NDArray[np.float64], int]:
-    """Device times, [n] in rising order, where packets that carry the tick of the packet after them are put back, and how many those are.
+    """Correct device times, [n] in rising order, where packets carry the tick of the packet after them; also return how many those are.
 
-    Now and then the recording program writes a packet under the header of the next one: two packets then share a tick and a hole of one
-    packet's length lies before them. Signal cannot overlap, so the earlier one of the file belongs before the other.
+    Now and then the recording program writes a packet under the header of the next one. Two packets then share a tick, and a gap of one
+    packet's length comes before them. Signal cannot overlap, so the earlier one of the file belongs before the other.
     """
     length = kept.length_ms
     signal = kept.samples > 1
@@ -249,10 +249,10 @@ def _untangled(at: NDArray[np.float64], kept: PacketHeaders) -> tuple[NDArray[np
 
 
 def _equidistant(at_ms: NDArray[np.float64], kept: PacketHeaders, gaps: Gaps) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Time of each packet's last sample and its chunk, both [n] in device order.
+    """Compute the time of each packet's last sample and its chunk, both [n] in device order.
 
-    Packets of one value stand at their ticks. Samples of a chunk are equidistant: it lies at the median of what its packets' ticks say, on
-    the sampling grid of the first chunk.
+    Packets of one value are at their ticks. Samples of a chunk are equidistant, on the sampling grid of the first chunk. The chunk is
+    placed at the median of its packets' ticks.
     """
     number = np.zeros(at_ms.size, dtype=np.int64)
     number[gaps.after + 1] = 1
@@ -269,7 +269,7 @@ def _equidistant(at_ms: NDArray[np.float64], kept: PacketHeaders, gaps: Gaps) ->
 
 
 def _leveled(ahead_ms: NDArray[np.float64], number: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Chunks cut where ticks and samples part by more than `OFF_LATTICE_MS`, and the median of each chunk, both [n]."""
+    """Cut chunks where ticks and samples part by more than `OFF_LATTICE_MS`; also compute the median of each chunk, both [n]."""
     level = np.empty(ahead_ms.size)
     cuts = np.zeros(ahead_ms.size, dtype=np.int64)
     todo = np.split(np.arange(ahead_ms.size), np.flatnonzero(np.diff(number)) + 1)

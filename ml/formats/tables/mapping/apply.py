@@ -1,4 +1,4 @@
-"""Read a table by a column mapping and write what may be stored of it: named columns alone, as numbers.
+"""Reading of a table by a column mapping, and writing of what may be stored of it: named columns alone, as numbers.
 
 Steps and LFP are written as a table of their own kind (`stored`), tremor and grasps as those that every decoder of theirs reads.
 """
@@ -27,7 +27,7 @@ from ml.formats.tables.removed import removed_columns
 
 
 def find_mapping(path: Source, mappings: Sequence[TableMapping], key: bytes) -> int | None:
-    """Place of the mapping that was made for this table's header; None where there is none.
+    """Find the mapping that was made for this table's header, by its place; None where there is none.
 
     Args:
         path: the uploaded bytes.
@@ -85,7 +85,7 @@ def redact_mapped(source: Source, target: Path, mapping: TableMapping, key: byte
 
 
 def _check_passed_over(top: Top, names: int, mapping: TableMapping) -> None:
-    """Raises UndecodableFile where the line of names or a line of units is a row, which would be lost without a word."""
+    """Raise UndecodableFile where the line of names or a line of units is a row, which would be lost without a word."""
     for number, cells in top.lines:
         if names <= number <= names + mapping.unit_lines and is_row(cells, mapping.width):
             what = f"holds measurements, and the column mapping takes it for a line of {'names' if number == names else 'units'}"
@@ -94,7 +94,7 @@ def _check_passed_over(top: Top, names: int, mapping: TableMapping) -> None:
 
 
 def _signals(table: TextTable, mapping: TableMapping, options: DecodeOptions) -> MappedTable:
-    """Numbers of the named columns, and times in seconds from the start of the session."""
+    """Read numbers of the named columns, and times in seconds from the start of the session."""
     (time,) = mapping.of_role("time")
     t_s = read_times(table, time.number - 1, mapping)
     columns = mapping.of_role(*SIGNALS, *AMPLITUDES)
@@ -115,7 +115,7 @@ def _signals(table: TextTable, mapping: TableMapping, options: DecodeOptions) ->
 
 
 def _outcomes(table: TextTable, mapping: TableMapping) -> str:
-    """A table of tremor or grasps with the names that its decoder knows, each row on the line where it stood."""
+    """Write a table of tremor or grasps with the names that its decoder knows, each row on its original line."""
     (time,) = mapping.of_role("time")
     t_s = read_times(table, time.number - 1, mapping)
     if mapping.kind == "grasp":
@@ -141,7 +141,7 @@ def _outcomes(table: TextTable, mapping: TableMapping) -> str:
 
 
 def _from_first(t_s: NDArray[np.float64], mapping: TableMapping) -> NDArray[np.float64]:
-    """Times of open fists as seconds; moments count from the first."""
+    """Convert times of open fists to seconds; moments count from the first."""
     known = t_s[np.isfinite(t_s)]
     return t_s - known[0] if is_absolute(mapping.time_format) and known.size else t_s
 

@@ -1,4 +1,4 @@
-"""Tables whose columns nobody knows yet, as lines of cells: text as it stands, Parquet with its names as the first line."""
+"""Tables with unknown columns, as lines of cells: text unchanged, Parquet with its names as the first line."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ _PARQUET = b"PAR1"
 
 @dataclass(frozen=True, slots=True)
 class Top:
-    """The first lines of a table: (line number, cells), blank ones left out; `delimiter` is None for Parquet."""
+    """The first lines of a table: (line number, cells), without blank ones; `delimiter` is None for Parquet."""
 
     lines: list[tuple[int, list[str]]]
     delimiter: str | None
 
     @property
     def is_log(self) -> bool:
-        """Whether it looks like a controller's log without its first line: no mapping may put its amplitudes to the wrong steps."""
+        """True where it looks like a controller's log without its first line: no mapping may put its amplitudes to the wrong steps."""
         return any(len(LOG_COLUMNS & {column_name(cell)[0] for cell in cells}) >= 2 for _, cells in self.lines)
 
 
 def read_top(path: Source) -> Top:
-    """The first lines of a table. Raises UndecodableFile for what is no text and no Parquet."""
+    """Read the first lines of a table. Raises UndecodableFile for what is no text and no Parquet."""
     if _is_parquet(path):
         with _parquet(path) as file:
             names = [str(n) for n in file.schema_arrow.names]
@@ -52,7 +52,7 @@ def read_top(path: Source) -> Top:
 
 
 def read_rows(path: Source, top: Top, below: int, width: int, used: Sequence[int], most: int) -> tuple[list[int], list[list[str]]]:
-    """Line numbers and cells of the rows below a line; cells of unused columns may be empty.
+    """Read line numbers and cells of the rows below a line; cells of unused columns may be empty.
 
     Args:
         top: of the same table.
@@ -77,7 +77,7 @@ def read_rows(path: Source, top: Top, below: int, width: int, used: Sequence[int
 
 
 def _delimiter(lines: Sequence[str]) -> str:
-    """What stands equally often in most of the lines: the mark between cells, not the decimal comma."""
+    """Find the mark that occurs equally often in most of the lines: the mark between cells, not the decimal comma."""
 
     def agreeing(mark: str) -> int:
         counts = Counter(n for line in lines if (n := line.count(mark)))
@@ -105,7 +105,7 @@ def _parquet(path: Source) -> Iterator[Any]:
 
 
 def _texts(batch: Any, used: Sequence[int]) -> list[list[str]]:
-    """Cells of a batch of a Parquet table as text; empty in columns that are not used."""
+    """Convert cells of a batch of a Parquet table to text; empty in columns that are not used."""
     wanted = set(used)
     columns = [[_text(v) for v in batch.column(i).to_pylist()] if i in wanted else [""] * batch.num_rows for i in range(batch.num_columns)]
     return [list(row) for row in zip(*columns, strict=True)]

@@ -1,4 +1,4 @@
-"""What a column mapping says: which line of a table names its columns, what each column holds, and how times are written."""
+"""Model of a column mapping: which line of a table names its columns, what each column has, and how times are written."""
 
 from __future__ import annotations
 
@@ -54,17 +54,17 @@ class MappedColumn:
 
 @dataclass(frozen=True, slots=True)
 class TableMapping:
-    """How tables with one header are read.
+    """Reading of tables with one header.
 
     Attributes:
-        header: keyed hash of the line that names the columns (`header_hash`); the line is found by it wherever it stands.
+        header: keyed hash of the line that names the columns (`header_hash`); the line is found by it wherever it is.
         width: cells of that line.
         unit_lines: lines right below it that are no rows.
         holds: what the table holds.
         time_format: how times are written.
         zone: IANA name of the zone of written times; None for all others.
         rate_hz: samples a second, where times are numbers of samples.
-        row_begins: whether the time of a step stands at its begin, not at its end.
+        row_begins: whether the time of a step is that of its begin, not of its end.
         columns: those that are used.
     """
 
@@ -79,17 +79,17 @@ class TableMapping:
     columns: tuple[MappedColumn, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """As plain JSON."""
+        """Convert the mapping to plain JSON."""
         return asdict(self)
 
     @staticmethod
     def from_json(stored: Mapping[str, Any]) -> TableMapping:
-        """From what `to_json` gave."""
+        """Read what `to_json` gave."""
         known = {f.name: stored[f.name] for f in fields(TableMapping)}
         return TableMapping(**{**known, "columns": tuple(MappedColumn(**c) for c in stored["columns"])})
 
     def of_role(self, *roles: str) -> list[MappedColumn]:
-        """Columns that hold one of these, in the file's order."""
+        """List the columns with one of these roles, in the file's order."""
         return sorted((c for c in self.columns if c.role in roles), key=lambda c: c.number)
 
     @property
@@ -99,7 +99,7 @@ class TableMapping:
 
 
 def header_hash(cells: Sequence[str], key: bytes) -> str:
-    """Keyed hash of a line of names, without regard to case, blanks and hyphens; the names may be those of people, and stay unknown.
+    """Hash a line of names with a key, without regard to case, blanks and hyphens. The names may be those of people, and stay unknown.
 
     Args:
         cells: of the line.

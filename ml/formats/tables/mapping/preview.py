@@ -1,4 +1,5 @@
-"""The first lines of a table that could not be read, as much of them as may be shown and stored: enough to say which column is which.
+"""Preview of a table that could not be read: as much of its first lines as may be shown and stored. It is enough to say which column is
+which.
 
 Words stay where they are words of the field, numbers where they are measurements; of everything else the shape is left.
 """
@@ -44,7 +45,7 @@ _WORD = re.compile(r"[^\W\d_]+")
 
 
 def preview_of(path: Source, key: bytes) -> dict[str, Any] | None:
-    """What may be shown of a table, as plain JSON; None for what is no table that a mapping could read.
+    """Show of a table what may be shown, as plain JSON; None for what is no table that a mapping could read.
 
     Args:
         path: the uploaded bytes.
@@ -80,7 +81,8 @@ def preview_of(path: Source, key: bytes) -> dict[str, Any] | None:
 
 
 def is_row(cells: list[str], width: int) -> bool:
-    """Whether a line is one of measurements: it has all its cells, and at least half of those that are not empty are numbers or times."""
+    """Decide whether a line is one of measurements. Such a line has all its cells, and at least half of the non-empty ones are numbers or
+    times."""
     filled = [cell for cell in cells if cell.lower() not in MISSING]
     telling = [cell for cell in filled if _number(cell) is not None or _has_date(cell)]
     return len(cells) == width and bool(telling) and 2 * len(telling) >= len(filled)
@@ -105,7 +107,7 @@ def _number(cell: str) -> float | None:
 
 
 def _numbers_shown(top: Top, column: int, first: int, name: str) -> bool:
-    """Whether the numbers of a column are measurements, and none that may name a person.
+    """Decide whether the numbers of a column are measurements, and none that may name a person.
 
     Those are whole numbers from 100 on: all one, or in a column whose name has no word of the field.
     """
@@ -120,7 +122,7 @@ def _numbers_shown(top: Top, column: int, first: int, name: str) -> bool:
 
 
 def _cell(cell: str, names: bool, measured: bool) -> str:
-    """A cell as it may be shown: words of the field where it `names` columns, numbers where they were `measured`, else its shape."""
+    """Clean a cell for display: words of the field where it `names` columns, numbers where they were `measured`, else its shape."""
     text = cell.strip()[: 4 * LONGEST_CELL]
     if text.lower() in MISSING | ROW_WORDS:
         return text.lower()
@@ -134,23 +136,24 @@ def _cell(cell: str, names: bool, measured: bool) -> str:
 
 
 def _words(text: str) -> str:
-    """Words of the field and marks; other words as `…`, digits as `#` but single ones, such as those of contacts, beside such a word."""
+    """Clean words: known words and marks stay; other words become `…`, digits `#`. A single digit, such as of a contact, stays with a known
+    word."""
     out = re.sub(_WORD, lambda w: w[0] if w[0].lower() in WORDS or known_unit(w[0]) else HIDDEN, _apart(text))
     single = _has_known_word(text) and not re.search(r"\d{2}|\d[./-]\d[./-]\d", out)
     return _tidy(out if single else re.sub(r"\d", "#", out))
 
 
 def _has_known_word(text: str) -> bool:
-    """Whether a text has a word of the field of two letters or more."""
+    """Decide whether a text has a word of the field of two letters or more."""
     return any(len(w) > 1 and w.lower() in WORDS for w in _WORD.findall(_apart(text)))
 
 
 def _apart(text: str) -> str:
-    """A text with a blank between the words of `likeThis`."""
+    """Insert a blank between the words of `likeThis`."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", text)
 
 
 def _tidy(text: str) -> str:
-    """A text in which several hidden words are one, without what a terminal or page would act on."""
+    """Join several hidden words into one, and remove what a terminal or page would act on."""
     plain = "".join(mark for mark in text if mark.isprintable())
     return re.sub(r"…[\s…]*…", HIDDEN, plain)[:LONGEST_CELL]

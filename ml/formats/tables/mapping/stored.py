@@ -1,4 +1,5 @@
-"""The stored form of a table of steps or LFP that a column mapping read, and its decoder: one recording per side, all channels of it.
+"""The stored form of a table of steps or LFP that a column mapping read, and its decoder. It gives one recording per side, with all its
+channels.
 
 Two lines say what follows: the kind with its version, and as JSON the start and what each column holds. Then come a line of names and the
 rows, each with the number of the line that it had in the file which was sent.
@@ -69,7 +70,7 @@ def write(table: MappedTable, target: Path) -> None:
 
 
 def read(path: Path, options: DecodeOptions) -> MappedTable:
-    """The table of a stored file. Raises UndecodableFile for one that was changed since."""
+    """Read the table of a stored file. Raises UndecodableFile for one that was changed since."""
     hint = "Restore the stored files from a backup."
     with path.open(encoding="utf-8") as stream:
         top = [line.rstrip("\n") for line in islice(stream, HEAD_LINES)]
@@ -91,7 +92,7 @@ def decode_mapped(path: Path, options: DecodeOptions, name: str | None = None) -
 
 
 def decode_table_of(table: MappedTable, options: DecodeOptions, name: str) -> DecodedFile:
-    """Recordings out of a table. Raises UndecodableFile naming line and column."""
+    """Decode recordings from a table. Raises UndecodableFile naming line and column."""
     report = FileReport(name)
     sides = list(dict.fromkeys(c.side for c in table.columns))
     recordings = tuple(_side(side, table, options, report) for side in sides)
@@ -101,7 +102,7 @@ def decode_table_of(table: MappedTable, options: DecodeOptions, name: str) -> De
 
 
 def _side(side: Hemisphere | None, table: MappedTable, options: DecodeOptions, report: FileReport) -> RecordingLog:
-    """One side: its amplitude, and every channel's own traces."""
+    """Decode one side: its amplitude, and every channel's own traces."""
     mine = [(c, v) for c, v in zip(table.columns, table.values, strict=True) if c.side == side]
     amplitudes = [(c, v) for c, v in mine if c.role in AMPLITUDES]
     signals = [(c, v) for c, v in mine if c.role in SIGNALS]
@@ -136,7 +137,7 @@ def _side(side: Hemisphere | None, table: MappedTable, options: DecodeOptions, r
 
 
 def _unnamed(signals: Sequence[tuple[MappedColumn, Floats]], i: int) -> str | None:
-    """What a channel is called that nobody named: as in tables of one channel, else by its column."""
+    """Name a channel without a stated name: as in tables of one channel, else by its column."""
     return None if len(signals) == 1 else f"column {signals[i][0].number}"
 
 
@@ -155,7 +156,7 @@ def _decoded(
     side: Hemisphere | None,
     first: bool,
 ) -> RecordingLog:
-    """A recording of one signal, and of the amplitudes beside it."""
+    """Decode a recording of one signal, and of the amplitudes with it."""
     roles = {"beta_power": "beta"}
     units: dict[str, str | None] = {"t_s": None, **{roles.get(c.role, c.role): c.unit for c, _ in given}}
     columns = Columns(

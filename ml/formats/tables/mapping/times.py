@@ -20,16 +20,15 @@ EXAMPLES = {"iso": "2026-03-02 10:00:00", "dmy": "02.03.2026 10:00:00", "mdy": "
 
 
 def is_absolute(time_format: TimeFormat) -> bool:
-    """Whether times of a format are moments, not seconds from the session's start."""
+    """Decide whether times of a format are moments, not seconds from the session's start."""
     return time_format in UNIX or time_format in WRITTEN
 
 
 def read_times(table: TextTable, column: int, mapping: TableMapping) -> NDArray[np.float64]:
-    """A column of times, [rows]: Unix time in s where they are moments, else seconds from the session's start; NaN for empty cells.
+    """Read a column of times, [rows]: Unix time in s where they are moments, else seconds from the session's start; NaN for empty cells.
 
     Raises:
-        UndecodableFile: a cell that is not written so, a moment that no clock of a study shows, or one that its zone has twice or never;
-            names the line.
+        UndecodableFile: a cell of another format, a moment outside any study, or one that its zone has twice or never. It names the line.
     """
     if mapping.time_format in WRITTEN:
         out = np.array([_moment(row[column], table, i, column, mapping) for i, row in enumerate(table.rows)], dtype=np.float64)
@@ -71,7 +70,7 @@ def _changed_clocks(text: str, line: int, column: int, zone: str) -> Undecodable
 
 
 def _day_or_month_first(text: str, which: str) -> datetime:
-    """A date with the year last. Raises ValueError."""
+    """Parse a date with the year last. Raises ValueError."""
     match = _WRITTEN.fullmatch(text)
     if match is None:
         raise ValueError("no date of this format")
