@@ -13,6 +13,7 @@ import secrets
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,7 +37,7 @@ from app.platform.start import require_data_folder, require_free
 from app.platform.web.numbers import time_left
 from app.settings import get_settings, private_folder, written_once
 from app.simulation.demo_study import DemoVisit, demo_visits, participant_body
-from app.simulation.keeper import ENDED_BY_ITSELF, ENDING, become_keeper, interrupt, stop
+from app.simulation.keeper import ENDED_BY_ITSELF, ENDING, become_keeper, stop
 
 ACCOUNTS = {"admin@demo.example": Role.ADMIN, "clinician@demo.example": Role.CLINICIAN, "engineer@demo.example": Role.ENGINEER}
 PARTICIPANTS = ("P1", "P2", "P3", "P4")
@@ -126,7 +127,7 @@ def _children(logs: Path, host: str, port: int) -> Iterator[list[subprocess.Pope
     private_folder(logs)
     commands = {"web": ["serve", "--host", host, "--port", str(port)], "worker": ["worker"]}
     children: list[subprocess.Popen[bytes]] = []
-    previous = [(number, signal.signal(number, interrupt)) for number in ENDING]
+    previous = [(number, signal.signal(number, _interrupt)) for number in ENDING]
     try:
         for name, arguments in commands.items():
             with (logs / f"{name}.log").open("ab") as log:
@@ -141,6 +142,15 @@ def _children(logs: Path, host: str, port: int) -> Iterator[list[subprocess.Pope
         stop(children)
         for number, handler in (*impatient, *previous):
             signal.signal(number, handler)
+
+
+_interrupted = threading.Event()
+
+
+def _interrupt(_number: int, _frame: Any) -> None:
+    """End the demo. The exception is lost where Python calls this within a destructor, so `_check` looks at the flag too."""
+    _interrupted.set()
+    raise KeyboardInterrupt
 
 
 def _wait_until_up(url: str, host: str, port: int, children: list[subprocess.Popen[bytes]]) -> None:
@@ -168,6 +178,8 @@ def _listens(child: subprocess.Popen[bytes], port: int) -> bool:
 
 
 def _check(children: list[subprocess.Popen[bytes]]) -> None:
+    if _interrupted.is_set():
+        raise KeyboardInterrupt
     if any(child.poll() is not None for child in children):
         raise DemoFailed(ENDED_BY_ITSELF, _log_hint())
 

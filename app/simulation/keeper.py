@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
     from typing import Protocol
@@ -71,7 +71,7 @@ def become_keeper(pids: Iterable[int], logs: Path) -> NoReturn:
         pids: the children, in the order of their start.
         logs: folder with their logs, named where one of them ends by itself.
     """
-    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)  # until the keeper can handle them; the new program inherits the mask
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)  # the new program inherits the mask
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, "-m", MODULE, str(logs), *map(str, pids)])  # noqa: S606 - our own words, no shell
@@ -89,32 +89,23 @@ def stop(services: Sequence[Service]) -> None:
             time.sleep(_POLL_S)
 
 
-def interrupt(_number: int, _frame: Any) -> None:
-    """Handle a signal that ends the demo."""
-    raise KeyboardInterrupt
-
-
 def main(arguments: Sequence[str]) -> int:
-    """Wait until a signal comes or a service ends, stop what runs, and return the exit code: 1 where a service ended by itself."""
+    """Wait until a signal comes or a service ends, stop what runs, and return the exit code: 1 where a service ended by itself.
+
+    Signals stay blocked and are asked for. A handler that raises can be lost where Python calls it within a destructor.
+    """
     logs, *pids = arguments
     services = [OwnChild(int(pid)) for pid in pids]
-    code = 0
-    try:
-        for number in ENDING:
-            signal.signal(number, interrupt)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
-        while all(service.poll() is None for service in services):
-            time.sleep(_LOOK_S)
-        sys.stderr.write(f"betaloop: {ENDED_BY_ITSELF} See the files in {logs}.\n")
-        code = 1
-    except KeyboardInterrupt:
-        sys.stdout.write("\n  Stopping …\n")
-        sys.stdout.flush()
-    finally:
-        for number in ENDING:
-            signal.signal(number, signal.SIG_IGN)
-        stop(services)
-    return code
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    while all(service.poll() is None for service in services):
+        if signal.sigtimedwait(ENDING, _LOOK_S) is not None:
+            sys.stdout.write("\n  Stopping …\n")
+            sys.stdout.flush()
+            stop(services)
+            return 0
+    sys.stderr.write(f"betaloop: {ENDED_BY_ITSELF} See the files in {logs}.\n")
+    stop(services)
+    return 1
 
 
 if __name__ == "__main__":
