@@ -54,7 +54,7 @@ lock: ## Pin the installed packages in requirements.lock.
 
 bench: install ## Run every benchmark in its quick form.
 	@for script in benchmarks/*.py; do echo "== $$script"; OMP_NUM_THREADS=1 $(BIN)/python $$script --quick || exit 1; done
-	@for script in benchmarks/development/*.py; do tool=benchmarks.development.$$(basename $$script .py); \
+	@for script in benchmarks/evaluation/*.py; do tool=$$(echo $${script%.py} | tr / .); \
 	  echo "== $$tool"; OMP_NUM_THREADS=1 $(BIN)/python -m $$tool --quick || exit 1; done
 
 soak: install ## Kill every process of an installation at random moments, 50 rounds (about 15 minutes), and look whether anything is lost.

@@ -304,7 +304,7 @@ def test_every_picture_is_shown_by_a_document() -> None:
         ("`ml/mdp.py: no_such_name`", "ml/mdp.py has no no_such_name"),
         ("`ml.nothing.at_all`", "no module ml.nothing.at_all"),
         ("`python benchmarks/ope.py --warp 9`", "benchmarks/ope.py has no --warp"),
-        ("`python -m benchmarks.development.portfolio --warp 9`", "-m benchmarks.development.portfolio has no --warp"),
+        ("`python -m benchmarks.evaluation.portfolio --warp 9`", "-m benchmarks.evaluation.portfolio has no --warp"),
         ("`python -m benchmarks.portfolio`", "no module benchmarks.portfolio"),
         ("`betaloop control` with `--warp`", "no option --warp"),
         ("[x](nothing.md)", "no file nothing.md"),

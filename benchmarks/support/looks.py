@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-FILE = Path(__file__).parents[1] / "looks.json"
+FILE = Path(__file__).with_name("looks.json")
 COUNTED = ("B", "C")
 
 

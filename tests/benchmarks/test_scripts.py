@@ -1,4 +1,4 @@
-"""What `make bench` runs: every file in `benchmarks/` and `benchmarks/development/` is a script that knows `--quick`; what scripts share
+"""What `make bench` runs: every file in `benchmarks/` and `benchmarks/evaluation/` is a script that knows `--quick`; what scripts share
 lies in `benchmarks/support` and `benchmarks/installed`."""
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SCRIPTS = sorted([*(ROOT / "benchmarks").glob("*.py"), *(ROOT / "benchmarks" / "development").glob("*.py")])
+SCRIPTS = sorted([*(ROOT / "benchmarks").glob("*.py"), *(ROOT / "benchmarks" / "evaluation").glob("*.py")])
 
 
 def options(source: str) -> set[str]:
@@ -37,11 +37,11 @@ def test_what_scripts_share_is_no_script() -> None:
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.name)
 def test_a_script_imports_only_what_is_there_when_it_is_called(script: Path) -> None:
-    """A script finds `support` and `installed` beside it; one of `benchmarks.development`, called from the root, finds `benchmarks`."""
+    """A script finds `support` and `installed` beside it; one of `benchmarks.evaluation`, called from the root, finds `benchmarks`."""
     tree = ast.parse(script.read_text())
     modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
     shared = {m for m in modules if m.split(".")[0] in ("support", "installed", "benchmarks")}
-    above = "benchmarks." if script.parent.name == "development" else ""
+    above = "benchmarks." if script.parent.name == "evaluation" else ""
     assert all(m.startswith((f"{above}support.", f"{above}installed.")) for m in shared), shared
     assert all((ROOT / "benchmarks" / f"{m.removeprefix(above).replace('.', '/')}.py").exists() for m in shared)
 
@@ -70,8 +70,8 @@ def test_a_script_finds_what_it_shares_wherever_it_is_called_from(script: str, t
     assert_shows_its_options([str(ROOT / "benchmarks" / f"{script}.py")], tmp_path, str(path))
 
 
-def test_a_tool_of_development_is_a_module_of_the_root() -> None:
-    assert_shows_its_options(["-m", "benchmarks.development.dlsm_selection"], ROOT, "")
+def test_a_benchmark_of_evaluation_is_a_module_of_the_root() -> None:
+    assert_shows_its_options(["-m", "benchmarks.evaluation.verdicts"], ROOT, "")
 
 
 def assert_shows_its_options(called: list[str], folder: Path, path: str) -> None:

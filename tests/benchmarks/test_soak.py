@@ -111,8 +111,12 @@ def test_who_is_not_healthy_within_10_s_is_late_and_the_load_of_others_counts(
 
 
 @pytest.mark.parametrize(("p95", "load", "wrong"), [(0.99, 1.0, 0), (1.01, 1.0, 1), (1.01, 4 * CORES, 0), (4.1, 4 * CORES, 1)])
-def test_answers_that_take_more_than_a_second_fail_a_run_and_the_load_of_others_counts(p95: float, load: float, wrong: int) -> None:
-    loads = importlib.import_module("benchmarks.development.load")
+def test_answers_that_take_more_than_a_second_fail_a_run_and_the_load_of_others_counts(
+    monkeypatch: pytest.MonkeyPatch, p95: float, load: float, wrong: int
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    monkeypatch.syspath_prepend(str(ROOT))
+    loads = importlib.import_module("benchmarks.load")
     found = loads.Found(seconds={"today": [p95] * 20})
     figures = loads.report(found, load)
     assert len(loads.too_slow(figures)) == wrong
@@ -154,7 +158,7 @@ def test_two_webs_and_three_workers_on_debians_postgresql_lose_and_double_nothin
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_under_load_no_request_fails_and_no_write_is_lost() -> None:
-    figures = ran("-m benchmarks.development.load", "--quick")
+    figures = ran("benchmarks/load.py", "--quick")
     assert figures["errors"] == 0
     assert figures["p95_share"] < 1, "of 1 s; beside other work each answer has its share of the cores alone"
     assert figures["acknowledged_writes"] >= 3

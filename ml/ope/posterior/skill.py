@@ -28,7 +28,7 @@ MARGIN = 2.0
 """Squared errors of left-out sessions must fall by more than so many of their standard errors below those of calling all doses equal: of
 the reward by beta, or of one of the outcomes.
 
-From part A of the virtual population (60 worlds of 21 sessions, `benchmarks/development/verdicts.py`): an order is told in 82 % of the
+From part A of the virtual population (60 worlds of 21 sessions, `benchmarks/evaluation/verdicts.py`): an order is told in 82 % of the
 worlds with stratified sessions and 77 % with the paper's, and in 20 and 17 % of the data in which nothing answers to the amplitude. With
 r_end instead of the three outcomes and a margin of 1 for beta, as before, it was told in 65 and 62 %, and in 30 % where nothing answers:
 the noise of one outcome hides in r_end what another tells, and where no outcome counts in r_end nothing of them was asked."""

@@ -1,7 +1,7 @@
 """How far the order of candidates can be told at all from so many visits, by an observer that knows how virtual patients come about.
 
-    python -m benchmarks.development.ideal_observer --quick               one world of part A, few patients
-    python -m benchmarks.development.ideal_observer --every 6 --out FOLDER
+    python -m benchmarks.evaluation.ideal_observer --quick               one world of part A, few patients
+    python -m benchmarks.evaluation.ideal_observer --every 6 --out FOLDER
 
 Of each world the observer knows mechanism, trait, threshold and the distribution of all constants; the constants, the days and the noise it
 must tell apart from the same sessions that a method has (`support/observer.py`). No method may know so much, so what it misses a method

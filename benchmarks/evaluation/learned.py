@@ -1,13 +1,13 @@
 """What three visits teach: six policies by the default sweep on virtual patients, the posterior's first of them, and the best by truth.
 
-    python -m benchmarks.development.learned --worlds 12 --out FOLDER             every fifth world of part A; resumable
-    python -m benchmarks.development.learned --memory                             critics that see past amplitudes, and those that do not
-    python -m benchmarks.development.learned --anchors both,all                   held near two amplitudes, or also near the best constant
-    python -m benchmarks.development.learned --updates 2000 --minutes 20          shorter trainings; no further world after so long
-    python -m benchmarks.development.learned --untrained --every 4 --worlds 15    the dose alone that the anchor `best` holds a policy near
-    python -m benchmarks.development.learned --quick                              one world, few updates and simulated sessions
-    python -m benchmarks.development.learned --designs stratified,paper           data by both designs
-    python -m benchmarks.development.learned --part B                             to report on; each run is counted
+    python -m benchmarks.evaluation.learned --worlds 12 --out FOLDER             every fifth world of part A; resumable
+    python -m benchmarks.evaluation.learned --memory                             critics that see past amplitudes, and those that do not
+    python -m benchmarks.evaluation.learned --anchors both,all                   held near two amplitudes, or also near the best constant
+    python -m benchmarks.evaluation.learned --updates 2000 --minutes 20          shorter trainings; no further world after so long
+    python -m benchmarks.evaluation.learned --untrained --every 4 --worlds 15    the dose alone that the anchor `best` holds a policy near
+    python -m benchmarks.evaluation.learned --quick                              one world, few updates and simulated sessions
+    python -m benchmarks.evaluation.learned --designs stratified,paper           data by both designs
+    python -m benchmarks.evaluation.learned --part B                             to report on; each run is counted
 
 A policy succeeds where all three QoCs are truly within the default margins of cDBS and it saves a fifth of the energy. Told over
 responders, patients in whom some constant or proportional controller does, and others are not trained: the share in which the policy that

@@ -1,8 +1,8 @@
 """What verdicts are worth: how many candidates are told, how often *test* is right, and when an order is refused for want of skill.
 
-    python -m benchmarks.development.verdicts --quick
-    python -m benchmarks.development.verdicts --out FOLDER                   the 60 worlds of part A; resumable
-    python -m benchmarks.development.verdicts --part B --out FOLDER          to report on; each run is counted
+    python -m benchmarks.evaluation.verdicts --quick
+    python -m benchmarks.evaluation.verdicts --out FOLDER                   the 60 worlds of part A; resumable
+    python -m benchmarks.evaluation.verdicts --part B --out FOLDER          to report on; each run is counted
 
 Verdicts are those of the service's defaults after three visits. A candidate is truly worth a test where all three QoCs are within the
 margins of cDBS and it saves energy. *Nothing answers*: the same sessions with beta and QoCs as under cDBS throughout, whatever amplitude

@@ -1,8 +1,8 @@
 """Fifty people at their browsers and ten uploaders at once, while a worker trains: errors, lost writes, and how long answers take.
 
-    python -m benchmarks.development.load                              50 people and 10 uploaders for 5 minutes
-    python -m benchmarks.development.load --minutes 2
-    python -m benchmarks.development.load --quick                      5 people and 2 uploaders for 20 seconds
+    python benchmarks/load.py                              50 people and 10 uploaders for 5 minutes
+    python benchmarks/load.py --minutes 2
+    python benchmarks/load.py --quick                      5 people and 2 uploaders for 20 seconds
 
 Of an installation of its own, in a new folder, with its embedded PostgreSQL, web and worker as processes; the callers are in this
 process, on the same cores. Each person signs in, then opens a page of the study or enters a QoC (one act in five), every 5 s on average,
@@ -25,9 +25,8 @@ from dataclasses import dataclass, field
 
 import httpx2 as httpx
 import numpy as np
-
-from benchmarks.installed.installation import PASSWORD, STARTED_S, Installation, installation, times_slower
-from benchmarks.installed.writers import PEOPLE, Acknowledged, Study, client, make_study, table, what_is_wrong
+from installed.installation import PASSWORD, STARTED_S, Installation, installation, times_slower
+from installed.writers import PEOPLE, Acknowledged, Study, client, make_study, table, what_is_wrong
 
 BETWEEN_PAGES_S, BETWEEN_UPLOADS_S = 5.0, 10.0
 P95_S = 1.0

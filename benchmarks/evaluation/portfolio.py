@@ -1,10 +1,10 @@
 """Which policies three visits find: the portfolio of the posterior against rankings by single methods and against chance.
 
-    python -m benchmarks.development.portfolio --quick                    two worlds of part A
-    python -m benchmarks.development.portfolio --worlds 40 --out FOLDER   40 worlds; resumable
-    python -m benchmarks.development.portfolio --part B ...               patients to report on; each run is counted
-    python -m benchmarks.development.portfolio --dlsm ...                 the order of the paper's DLSM too
-    python -m benchmarks.development.portfolio --named --worlds 30        whether as many sessions as a verdict names do tell
+    python -m benchmarks.evaluation.portfolio --quick                    two worlds of part A
+    python -m benchmarks.evaluation.portfolio --worlds 40 --out FOLDER   40 worlds; resumable
+    python -m benchmarks.evaluation.portfolio --part B ...               patients to report on; each run is counted
+    python -m benchmarks.evaluation.portfolio --dlsm ...                 the order of the paper's DLSM too
+    python -m benchmarks.evaluation.portfolio --named --worlds 30        whether as many sessions as a verdict names do tell
 
 Every virtual patient has three visits of data by the stratified design. Three more visits test up to four policies each: 60 minutes, two
 cDBS sessions and four others of ten minutes. `portfolio` is what the plan's page suggests: verdicts are respected, and tested sessions move
