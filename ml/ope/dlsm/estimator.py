@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from ml.ope.behaviour import controller_key
-from ml.ope.dlsm import pretrained
 from ml.ope.dlsm.batches import Batch, make_batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.dose_answer import Judged, judge
+from ml.ope.dlsm.folds import resampled, usable_folds
 from ml.ope.dlsm.held_out import FreeRuns, shares
 from ml.ope.dlsm.rollout import Rollouts, roll_out
-from ml.ope.dlsm.selection import Selection, SelectionRun, resampled, usable_folds
 from ml.ope.dlsm.training import Member, MemberTraining
 from ml.ope.estimate import LEVEL, Estimate, checked_horizon
 from ml.ope.flags import FEW_END_REWARDS, Flag
@@ -62,7 +61,7 @@ class _Data:
 
 @dataclass(frozen=True)
 class Dlsm:
-    """The estimator; `fit` trains the ensemble, after a choice among `config.candidates()` where the settings ask for one."""
+    """The estimator; `fit` trains the ensemble."""
 
     config: DlsmConfig = field(default_factory=DlsmConfig)
     method: str = "dlsm"
@@ -80,32 +79,24 @@ class Dlsm:
                 discarded for their answer to a lasting dose that no spread is left.
         """
         data = self._prepare(buffer)
-        parts = self.config.members + (1 if self.config.select else 0)
-        selection = self._select(data, part_of(report, 0, parts), checkpoint_dir)
-        c = self._chosen(selection)
-        first = parts - c.members
-        members = tuple(self._train(data, c, k, part_of(report, first + k, parts), checkpoint_dir) for k in range(c.members))
+        c = self.config
+        members = tuple(self._train(data, k, part_of(report, k, c.members), checkpoint_dir) for k in range(c.members))
         judged = judge([m.networks for m in members], data.batch, c.seed) if c.discard else None
         if judged is not None:
             members = tuple(m for k, m in enumerate(members) if k not in judged.discarded)
             if len(members) < min(2, c.members):
                 raise ValueError(judged.sentence())
-        return FittedDlsm(self.method, c, buffer, data.batch, data.scale, members, fit_end_model(buffer), selection, judged)
+        return FittedDlsm(self.method, c, buffer, data.batch, data.scale, members, fit_end_model(buffer), judged)
 
     def fit_member(self, buffer: ReplayBuffer, k: int, report: Report = silent, checkpoint_dir: Path | None = None) -> Member:
         """Train member `k` alone, for ensembles whose members learn side by side: `fit` finds its checkpoint finished.
-
-        With `config.select` the choice among candidates comes first; members that share no checkpoint folder each make it, alike.
 
         Raises:
             ValueError: as `fit`, or no such member.
         """
         if not 0 <= k < self.config.members:
             raise ValueError(f"this ensemble has members 0 to {self.config.members - 1}, not {k}")
-        data = self._prepare(buffer)
-        parts = 2 if self.config.select else 1
-        chosen = self._chosen(self._select(data, part_of(report, 0, parts), checkpoint_dir))
-        return self._train(data, chosen, k, part_of(report, parts - 1, parts), checkpoint_dir)
+        return self._train(self._prepare(buffer), k, report, checkpoint_dir)
 
     def _prepare(self, buffer: ReplayBuffer) -> _Data:
         n, c = sum(bool(s.usable().any()) for s in buffer.sessions), self.config
@@ -113,20 +104,11 @@ class Dlsm:
             raise ValueError(f"the DLSM needs at least {FEWEST_SESSIONS} sessions with usable steps and holds some out; the buffer has {n}")
         scale = learn_scale(buffer)
         folds = usable_folds(buffer, c.held_out, c.seed)
-        start = pretrained.fingerprint() if c.pretrained else ""
-        named = f"{CHECKPOINT}{start}{content_hash(to_parquet(buffer))}{json.dumps(c.to_json(), sort_keys=True)}"
+        named = f"{CHECKPOINT}{content_hash(to_parquet(buffer))}{json.dumps(c.to_json(), sort_keys=True)}"
         return _Data(buffer, make_batch(buffer, scale), scale, folds, hashlib.sha256(named.encode()).hexdigest())
 
-    def _select(self, data: _Data, report: Report, checkpoint_dir: Path | None) -> Selection | None:
-        if not self.config.select:
-            return None
-        run = SelectionRun(data.buffer, data.batch, data.scale, self.config.candidates(), self.config.seed, data.fingerprint)
-        return run.run(checkpoint_dir, report)
-
-    def _chosen(self, selection: Selection | None) -> DlsmConfig:
-        return self.config if selection is None else self.config.candidates()[selection.chosen]
-
-    def _train(self, data: _Data, config: DlsmConfig, k: int, report: Report, checkpoint_dir: Path | None) -> Member:
+    def _train(self, data: _Data, k: int, report: Report, checkpoint_dir: Path | None) -> Member:
+        config = self.config
         held, learnt = data.folds[k % len(data.folds)], None
         if config.bootstrap:
             learnt, held = resampled(data.buffer, config.seed + k)
@@ -136,7 +118,7 @@ class Dlsm:
 
 @dataclass(frozen=True)
 class FittedDlsm:
-    """A trained ensemble and the buffer it came from; `config` is what was chosen where there was a choice.
+    """A trained ensemble and the buffer it came from.
 
     `members` are those that `judged` left in; it is None where the settings ask for no judgement.
     """
@@ -148,7 +130,6 @@ class FittedDlsm:
     scale: Scale
     members: tuple[Member, ...]
     end: EndModel
-    selection: Selection | None = None
     judged: Judged | None = None
 
     @property
@@ -343,14 +324,12 @@ class FittedDlsm:
                 "step_return_head": float(np.mean([run.return_head[i].mean() for run in runs])) if self.config.reward_terms else None,
                 "step_return_known": float(np.mean([run.return_known[i].mean() for run in runs])),
                 "members": [float(v) for v in values[:, i]],
-                "pretrained": all(m.pretrained for m in self.members),
                 "dose_answer": None if self.judged is None else self.judged.to_json(),
                 "level_error": self.level_error(),
                 "coverage": logged.to_json(),
                 "coverage_simulated": simulated.to_json(),
                 "held_out": skill,
                 "objective": self.config.objective,
-                "selection": None if self.selection is None else self.selection.to_json(),
                 "draws": [round(float(d), 4) for d in draws],
             },
         )

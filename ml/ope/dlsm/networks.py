@@ -106,7 +106,7 @@ class DlsmNetworks(nn.Module):
         self.window, self.config = window, config
         z, hidden, heads = config.latent, config.hidden, config.heads
         self.state_width = window if config.state_terms == "window" else 1
-        extra = (1 if config.action_emission else 0) + (hidden if config.recurrent_heads else 0)
+        extra = 1 if config.action_emission else 0
         self.linear: LinearPart | None = None
         self.first = GaussianHead(window, z, heads)
         self.encoder = LatentRecurrence(1 + window, z, hidden, config.skip)
@@ -133,10 +133,9 @@ class DlsmNetworks(nn.Module):
         start = block * int(torch.randint(max(1, steps // block), (), generator=generator)) if block else 0
         return Noise(first, encoder, decoder, start)
 
-    def head_input(self, z: Tensor, actions: Tensor, h: Tensor | None = None) -> Tensor:
-        """What the heads of steps see, [..., Z (+ H) (+ 1)]; actions without the last axis, h where `recurrent_heads` ask for it."""
-        parts = [z] if h is None else [z, h]
-        return torch.cat([*parts, actions.unsqueeze(-1)] if self.config.action_emission else parts, dim=-1)
+    def head_input(self, z: Tensor, actions: Tensor) -> Tensor:
+        """Return what the heads of steps see, [..., Z (+ 1)]; actions come without the last axis."""
+        return torch.cat([z, actions.unsqueeze(-1)] if self.config.action_emission else [z], dim=-1)
 
     def posterior_terms(self, batch: Batch, noise: Noise, fast: bool = True) -> Terms:
         """Theorem 1: reconstruction from samples of the encoder, decoder following the encoder's path."""
@@ -149,7 +148,7 @@ class DlsmNetworks(nn.Module):
         if self.config.free_bits:
             kl = kl.clamp(min=self.config.free_bits)
         kl_path = (kl * batch.alive).sum(0)
-        states, rewards, outcomes = self._reconstruct(batch, z, h if self.config.recurrent_heads else None, fast)
+        states, rewards, outcomes = self._reconstruct(batch, z, fast)
         return Terms(first_states + states, rewards, outcomes, kl_first, kl_path)
 
     def free_running_terms(self, batch: Batch, noise: Noise, fast: bool = True) -> Terms:
@@ -166,8 +165,7 @@ class DlsmNetworks(nn.Module):
             batch = replace(batch, usable=batch.usable * (torch.arange(len(a)) >= noise.start).unsqueeze(1))
             start = z0
         z, _, _ = self.decoder.run(a, start, noise.decoder, fast)
-        h = self.decoder.recurrent(a, torch.cat([start.unsqueeze(0), z[:-1]]), fast) if self.config.recurrent_heads else None
-        states, rewards, outcomes = self._reconstruct(batch, z, h, fast)
+        states, rewards, outcomes = self._reconstruct(batch, z, fast)
         return Terms(first_states + states, rewards, outcomes, kl_first, torch.zeros_like(kl_first))
 
     def _along_posterior(self, batch: Batch, noise: Noise, z0: Tensor, fast: bool) -> Tensor:
@@ -182,10 +180,8 @@ class DlsmNetworks(nn.Module):
     def loss(self, batch: Batch, noise: Noise, fast: bool = True) -> Tensor:
         """The training objective, negated, per living step of the batch."""
         c = self.config
-        total = torch.zeros((), dtype=batch.states.dtype)
-        if c.objective in ("posterior", "sum"):
-            total = total + self.posterior_terms(batch, noise, fast).bound(c.kl_weight, c.end_weight).sum()
-        if c.objective in ("free_running", "sum"):
+        total = self.posterior_terms(batch, noise, fast).bound(c.kl_weight, c.end_weight).sum()
+        if c.objective == "sum":
             total = total + self.free_running_terms(batch, noise, fast).bound(c.kl_weight, c.end_weight).sum()
         return -total / batch.alive.sum()
 
@@ -197,9 +193,9 @@ class DlsmNetworks(nn.Module):
         log_prob = gaussian_log_prob(batch.states[0], *self.first_state(z0)).sum(1) * batch.first_known
         return z0, kl, log_prob
 
-    def _reconstruct(self, batch: Batch, z: Tensor, h: Tensor | None, fast: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _reconstruct(self, batch: Batch, z: Tensor, fast: bool) -> tuple[Tensor, Tensor, Tensor]:
         """log p of s_1 ... s_T, of r_0 ... r_{T-1} and of the outcomes along z_1 ... z_T, [B] each."""
-        seen = self.head_input(z, batch.actions, h)
+        seen = self.head_input(z, batch.actions)
         targets = batch.states[1:, :, -self.state_width :]
         if self.config.residual:
             targets = self._left(batch).unsqueeze(2)
@@ -235,8 +231,7 @@ class DlsmNetworks(nn.Module):
         z0 = mean + log_std.exp() * noise.first
         a = wide[0].unsqueeze(-1)
         z, _, _ = self.decoder.run(a, z0, noise.decoder)
-        h = self.decoder.recurrent(a, torch.cat([z0.unsqueeze(0), z[:-1]])) if self.config.recurrent_heads else None
-        seen = self.head_input(z, wide[0], h)
+        seen = self.head_input(z, wide[0])
         state_mean, state_log_std = self.state(seen)
         if self.linear is not None:
             state_mean = self._with_linear(batch, draws, state_mean, state_log_std, generator)

@@ -147,7 +147,7 @@ def _roll_block(
         action = torch.as_tensor(a, dtype=dtype)
         z, h, c = networks.decoder.step(action.unsqueeze(1), z, h, c, shared(config.latent))
         pooled += z
-        seen = networks.head_input(z, action, h if config.recurrent_heads else None)
+        seen = networks.head_input(z, action)
         mean, log_std = networks.state(seen)
         drawn = (mean + log_std.exp() * shared(networks.state_width)).numpy()
         if linear is not None:

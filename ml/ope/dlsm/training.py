@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from ml.ope.dlsm import pretrained
 from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.dlsm.held_out import Constant, FreeRuns, held_out
@@ -26,15 +25,11 @@ from ml.trajectories import ReplayBuffer
 
 @dataclass(frozen=True)
 class Member:
-    """A trained ensemble member: its networks at the check that `keep` names, that check, and the course as (step, loss, score).
-
-    `pretrained`: whether it started from the constants of `ml.ope.dlsm.pretrained`.
-    """
+    """A trained ensemble member: its networks at the check that `keep` names, that check, and the course as (step, loss, score)."""
 
     networks: DlsmNetworks
     check: FreeRuns
     course: tuple[tuple[int, float, float], ...]
-    pretrained: bool = False
 
 
 class MemberTraining:
@@ -45,7 +40,6 @@ class MemberTraining:
         held: indices of the sessions that are not learnt from and say when to stop.
         config: settings. seed: of initial weights, noise and batches.
         fingerprint: names buffer and settings; a checkpoint of another one is refused.
-        left_out: indices of sessions that are neither learnt from nor looked at.
         learnt: indices of those that are learnt from, which may repeat; all others where it is not given.
     """
 
@@ -58,13 +52,12 @@ class MemberTraining:
         config: DlsmConfig,
         seed: int,
         fingerprint: str,
-        left_out: Sequence[int] = (),
         learnt: Sequence[int] | None = None,
     ) -> None:
         self.config, self.scale, self.settings, self.seed = config, scale, buffer.settings, seed
         self.fingerprint = fingerprint
         self.held = tuple(held)
-        others = [i for i in range(len(buffer.sessions)) if i not in {*held, *left_out}]
+        others = [i for i in range(len(buffer.sessions)) if i not in set(held)]
         self.learnt = others if learnt is None else list(learnt)
         linear = LinearPart.fit(buffer, scale, self.learnt) if config.residual else None
         self.batch = batch if linear is None else linear.of(batch)
@@ -76,7 +69,6 @@ class MemberTraining:
             if linear is not None:
                 self.networks.linear = linear
                 self.networks.start_at_zero()
-            self.pretrained = config.pretrained and pretrained.start(self.networks)
         self.optimizer = torch.optim.AdamW(
             self.networks.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, foreach=True
         )
@@ -96,7 +88,7 @@ class MemberTraining:
         """Train to the end, going on from a checkpoint where there is one; the member is that of the check that `keep` names."""
         if checkpoint is not None and checkpoint.exists():
             self.load(checkpoint)
-        if (self.config.residual or self.config.pretrained) and not self.course:
+        if self.config.residual and not self.course:
             self.check()
             report(0.0, "fitting the deep latent sequential model", held_out_score=self.course[-1][2])
         while not self.finished:
@@ -111,7 +103,7 @@ class MemberTraining:
             raise ValueError("the DLSM's held-out score was never a finite number: lower the learning rate")
         self.networks.load_state_dict(self.best_weights)
         self.networks.eval()
-        return Member(self.networks, self.best, tuple(self.course), self.pretrained)
+        return Member(self.networks, self.best, tuple(self.course))
 
     def advance(self) -> None:
         """One gradient step over a batch of sessions."""
