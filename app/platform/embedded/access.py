@@ -1,8 +1,7 @@
 """Who may use the embedded database: three roles with generated passwords, and no one else.
 
 `postgres` is the superuser of the server's own upkeep; `betaloop` owns the database, and migrations run as it; `betaloop_service`, as which
-the service connects, owns nothing and has the rights of `app.platform.service_role`. A data folder of version 0.1.0 (no passwords,
-everything owned by the superuser) is converted at its next start, and one without the third role gets it.
+the service connects, owns nothing and has the rights of `app.platform.service_role`.
 """
 
 from __future__ import annotations
@@ -27,30 +26,6 @@ _SETTING_UP = (
     "# Written by betaloop: for the moment in which passwords are set; the socket's folder is closed to others.\nlocal all postgres trust\n"
 )
 _RELOAD_TIMEOUT_S = 20.0
-_HAND_OVER = """
-do $$
-declare statement text;
-begin
-  for statement in
-    select format('alter schema %I owner to betaloop', nspname) from pg_namespace
-      where nspowner = 'postgres'::regrole and nspname !~ '^pg_' and nspname <> 'information_schema'
-    union all
-    select format('alter table %s owner to betaloop', c.oid::regclass) from pg_class c join pg_namespace n on n.oid = c.relnamespace
-      where c.relowner = 'postgres'::regrole and c.relkind in ('r', 'p', 'v', 'm', 'f', 'S')
-        and n.nspname !~ '^pg_' and n.nspname <> 'information_schema'
-        and not exists (select from pg_depend d where d.objid = c.oid and d.classid = 'pg_class'::regclass and d.deptype in ('a', 'i', 'e'))
-    union all
-    select format('alter routine %s owner to betaloop', p.oid::regprocedure) from pg_proc p join pg_namespace n on n.oid = p.pronamespace
-      where p.proowner = 'postgres'::regrole and n.nspname !~ '^pg_' and n.nspname <> 'information_schema'
-        and not exists (select from pg_depend d where d.objid = p.oid and d.classid = 'pg_proc'::regclass and d.deptype = 'e')
-    union all
-    select format('alter type %s owner to betaloop', t.oid::regtype) from pg_type t join pg_namespace n on n.oid = t.typnamespace
-      where t.typowner = 'postgres'::regrole and t.typtype in ('e', 'd') and n.nspname !~ '^pg_' and n.nspname <> 'information_schema'
-  loop
-    execute statement;
-  end loop;
-end $$
-"""
 
 
 @dataclass(frozen=True)
@@ -136,11 +111,5 @@ class Access:
 
     def _ensure_database(self) -> None:
         with psycopg.connect(self.conninfo("postgres"), autocommit=True) as connection:
-            row = connection.execute("select pg_get_userbyid(datdba) from pg_database where datname = %s", (DATABASE,)).fetchone()
-            if row is None:
+            if connection.execute("select 1 from pg_database where datname = %s", (DATABASE,)).fetchone() is None:
                 connection.execute(sql.SQL("create database {} owner {}").format(sql.Identifier(DATABASE), sql.Identifier(OWNER)))
-            elif row[0] != OWNER:
-                with psycopg.connect(self.conninfo(DATABASE), autocommit=True) as inside:
-                    inside.execute(_HAND_OVER)
-                # last: an interrupted conversion is begun again
-                connection.execute(sql.SQL("alter database {} owner to {}").format(sql.Identifier(DATABASE), sql.Identifier(OWNER)))

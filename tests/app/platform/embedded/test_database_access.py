@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +12,7 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.platform import files
-from app.platform.database import database_url, get_engine, owner_url
+from app.platform.database import get_engine
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.embedded.system_user import system_user
 from app.platform.migrate import migrate
@@ -43,40 +41,6 @@ def data(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def server_of(data: Path) -> EmbeddedPostgres:
     return EmbeddedPostgres(data / "postgres", durable=False, server_user=get_settings().server_user)
-
-
-def run_as_postgres(data: Path, program: str, *arguments: str) -> None:
-    """One of PostgreSQL's own programs, under the server's user where we are root."""
-    server = server_of(data)
-    done = server._programs.run(program, *arguments)
-    assert done.returncode == 0, done.stdout
-
-
-def old_data_folder(data: Path) -> None:
-    """What version 0.1.0 left behind: no passwords, everything the superuser's, readable files."""
-    folder, sockets = data / "postgres", data / "postgres.socket"
-    folder.mkdir(mode=0o700)
-    sockets.mkdir(mode=0o777)
-    if os.geteuid() == 0:
-        for path in (folder, sockets):
-            shutil.chown(path, get_settings().server_user)
-    run_as_postgres(data, "initdb", "--auth=trust", "--encoding=utf8", "--locale=C.UTF-8", "-U", "postgres", "-D", str(folder))
-    run_as_postgres(data, "pg_ctl", "-D", str(folder), "-l", str(folder / "server.log"), "-o", f"-h '' -k {sockets}", "-w", "start")
-    with psycopg.connect(f"host={sockets} user=postgres dbname=postgres", autocommit=True) as connection:
-        connection.execute("create database betaloop")
-    url = f"postgresql://postgres@/betaloop?host={sockets}"
-    code = "from app.platform.migrate import migrate; migrate()"
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, env=os.environ | {"BETALOOP_DATABASE_URL": url})
-    with psycopg.connect(url) as connection:
-        connection.execute("create type colour as enum ('red')")
-        connection.execute("insert into study (code, name) values ('KEPT', 'A study of before')")
-    run_as_postgres(data, "pg_ctl", "-D", str(folder), "-w", "stop")
-    stored = data / "files" / "ab"
-    stored.mkdir(parents=True)
-    (stored / "abcd").write_text("a recording")
-    for path in (data / "files", stored):
-        path.chmod(0o755)
-    (stored / "abcd").chmod(0o644)
 
 
 def test_no_other_user_gets_into_the_database(data: Path) -> None:
@@ -133,30 +97,6 @@ def test_the_service_is_no_superuser_and_can_migrate(data: Path) -> None:
     get_engine().dispose()
 
 
-@pytest.mark.slow
-def test_a_data_folder_of_0_1_0_opens_with_its_rows_and_is_closed_to_others(data: Path) -> None:
-    old_data_folder(data)
-    migrate()
-    with get_engine().begin() as connection:
-        assert connection.exec_driver_sql("select name from study where code = 'KEPT'").scalar() == "A study of before"
-        assert connection.exec_driver_sql("select rolsuper from pg_roles where rolname = current_user").scalar() is False
-        assert excess(connection) == []
-        owners = """select distinct pg_get_userbyid(o) from (select relowner, relnamespace from pg_class union all
-          select proowner, pronamespace from pg_proc) as t(o, n) join pg_namespace s on s.oid = n where s.nspname in ('public', 'dbos')"""
-        assert connection.exec_driver_sql(owners).fetchall() == [("betaloop",)]
-    get_engine().dispose()
-    with psycopg.connect(owner_url().replace("+psycopg", "")) as connection:
-        connection.execute("alter table participant add column added int")
-        connection.execute("alter type colour add value 'green'")
-    with pytest.raises(psycopg.OperationalError):
-        psycopg.connect(f"host={data / 'postgres.socket'} user=postgres dbname=postgres")
-    assert "password=" not in database_url()
-    assert (data / "postgres.socket").stat().st_mode & 0o777 == 0o700
-    assert (data / "postgres.location").read_text() == "postgres\n"
-    for path, mode in (("files", 0o700), ("files/ab", 0o700), ("files/ab/abcd", 0o600)):
-        assert (data / path).stat().st_mode & 0o777 == mode
-
-
 def test_lost_secrets_are_made_anew_by_the_owner_of_the_data_folder(data: Path) -> None:
     server = server_of(data)
     server.start()
@@ -179,3 +119,13 @@ def test_stored_files_are_the_services_alone(db: Session) -> None:
     assert path.stat().st_mode & 0o777 == 0o600
     for folder in (path.parent, path.parent.parent, path.parent.parent / "incoming"):
         assert folder.stat().st_mode & 0o777 == 0o700
+
+
+def test_stored_files_that_stand_open_are_closed_when_the_service_migrates(db: Session) -> None:
+    path = files.path_of(files.store(db, b"a recording").sha256)
+    db.rollback()
+    open_to_all = {path: 0o644, path.parent: 0o755, path.parent.parent: 0o755}
+    for each, mode in open_to_all.items():
+        each.chmod(mode)
+    migrate()
+    assert [each.stat().st_mode & 0o777 for each in open_to_all] == [0o600, 0o700, 0o700]
