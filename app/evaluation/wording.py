@@ -100,13 +100,6 @@ def _no_ordering_skill(flag: Flag) -> str:
     return "the data cannot order policies" + (f": {', and '.join(why)}" if why else "")
 
 
-def _difference_error(flag: Flag) -> str:
-    return (
-        f"{method_name(flag.fact('method'))} predicted the differences between {flag.fact('controllers'):.0f} left-out controllers with a "
-        f"mean error of {percent(flag.value)} of their range (least of all: {percent(flag.limit)})"
-    )
-
-
 def _sessions_changed(flag: Flag) -> str:
     what = {
         "newer": "newer: visit " + ", ".join(flag.fact("visits")),
@@ -218,7 +211,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     ),
     # of verdicts
     "retired": lambda f: f"retired: {f.fact('text')}",
-    "no_posterior": lambda f: "this ranking is of before verdicts were asked of the chances of every outcome: evaluate again",
+    "no_posterior": lambda f: "this ranking does not have the chances of every outcome: evaluate again",
     "all_below_zero": lambda f: "its whole estimated gain over cDBS is below 0",
     "coverage_unchecked": lambda f: f"what the data cover could not be checked: {f.fact('text')}",
     "reference_missing": lambda f: "the cDBS reference, which it is held against, has no estimate",
@@ -243,13 +236,6 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "not_settled_by_sessions": lambda f: "more sessions held near what it does would not settle it",
     "sessions_needed": lambda f: counted(int(number(f)), "session"),
     "near_amplitude": lambda f: f"held near {f.value:.1f} mA" if f.unit == "mA" else f"held near {percent(f.value)} of the cDBS amplitude",
-    # of the choice of a method
-    "difference_error": _difference_error,
-    "beats_usual_order": lambda f: (
-        f"by more than a standard error better than {method_name(f.fact('method'))}, the first of the usual order"
-    ),
-    "not_beaten": lambda f: "none was better by more than a standard error than this first of the usual order",
-    "too_few_controllers": lambda f: f"the data cannot choose: {number(f):.0f} controllers could be left out, {f.limit:.0f} are needed",
     # of a ranking that the study has left behind
     "settings_changed": lambda f: f"settings version {number(f):.0f} is in force; this ranking used version {f.limit:.0f}",
     "sessions_changed": _sessions_changed,

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ml.ope.compare.skill import HeldOut, Prediction, skills
+
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
@@ -158,3 +160,31 @@ def test_the_page_puts_unsupported_candidates_last_whatever_their_values(module)
     assert not page.estimates["below"].supported
     assert page.places["below"] == 3
     assert {*page.places.values()} == {1, 2, 3}
+
+
+def held(errors):
+    """Predictions of four controllers that return 0, 10, 20 and 30, off by these errors."""
+    rows = tuple(Prediction(m, str(c), 2, 10.0 * c + e, 10.0 * c, 1.0, True) for m, own in errors.items() for c, e in enumerate(own))
+    return HeldOut(tuple(sorted(skills(rows), key=lambda s: s.difference_error)), rows, {})
+
+
+def test_the_lead_over_the_usual_first_is_the_mean_over_pairs_with_a_jackknife_over_controllers(module):
+    errors = {"linear": [0.0, 4.0, -2.0, 1.0], "fqe": [0.0, 1.0, 0.0, 1.0]}
+    rows, lead = held(errors).predictions, module("support.page_order").lead
+
+    def by_hand(names):
+        pairs = [(i, j) for i in names for j in names if i < j]
+        return np.mean([abs(errors["linear"][i] - errors["linear"][j]) - abs(errors["fqe"][i] - errors["fqe"][j]) for i, j in pairs])
+
+    left = np.array([by_hand([c for c in range(4) if c != out]) for out in range(4)])
+    gain, error = lead(rows, "linear", "fqe")
+    assert gain == pytest.approx(by_hand(range(4)))
+    assert error == pytest.approx(np.sqrt(3 / 4 * np.sum((left - left.mean()) ** 2)))
+    assert lead(rows[:2] + rows[4:], "linear", "fqe") == (0.0, float("inf"))
+
+
+def test_a_method_takes_the_place_of_the_usual_first_only_by_more_than_a_standard_error(module):
+    most_skilful = module("support.page_order").most_skilful
+    assert most_skilful(held({"linear": [0.0, 8.0, -6.0, 9.0], "fqe": [0.0] * 4})) == "fqe"
+    assert most_skilful(held({"linear": [0.0, 1.0, 0.0, 0.0], "fqe": [0.5, 0.0, 0.0, 0.0]})) == "linear"
+    assert most_skilful(held({"linear": [0.0, 8.0], "fqe": [0.0, 0.0]})) is None, "two controllers are too few"

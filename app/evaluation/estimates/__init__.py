@@ -1,1 +1,1 @@
-"""Estimates: what the child processes compute, which methods there are, coverage of the data, choice of the default method."""
+"""Estimates: what the child processes compute, which methods there are, coverage of the data, errors on left-out controllers."""

@@ -1,4 +1,4 @@
-"""What the child processes of evaluation run: check coverage, fit one DLSM ensemble member, estimate by one method, choose the method."""
+"""What the child processes of evaluation run: check coverage, fit one DLSM ensemble member, estimate, test methods."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from app.platform.web.numbers import number
 from ml import progress
 from ml.faults import said_of
 from ml.loading import load_libraries
-from ml.ope.compare.skill import choose_default
+from ml.ope.compare.skill import held_out_skill
 from ml.ope.dlsm.config import DlsmConfig
 from ml.ope.flags import not_counted_tests
 from ml.ope.posterior.further_sessions import session_noise
@@ -164,7 +164,7 @@ def choose_method(params: dict[str, Any], workdir: Path, report: StepReport) -> 
         workdir: not used. report: progress over controllers.
 
     Returns:
-        `choice`, as `ml.ope.compare.skill.Choice` has it, or `failed` with the reason where the data cannot choose.
+        `held_out`, as `ml.ope.compare.skill.HeldOut` has it, or `failed` with the reason.
     """
     buffer = read_buffer(params["snapshot_sha256"])
     quick = {name: e for name, e in quick_estimators(params["seed"]).items() if name in params["methods"]}
@@ -172,7 +172,7 @@ def choose_method(params: dict[str, Any], workdir: Path, report: StepReport) -> 
         return {"failed": "none of the methods asked for is fitted fast enough to leave each controller out in turn"}
     policies = {int(policy_id): policy for policy_id, policy in _policies(params["policies"], buffer).items()}
     try:
-        choice = choose_default(
+        held = held_out_skill(
             buffer,
             quick,
             policies=policies,
@@ -183,7 +183,7 @@ def choose_method(params: dict[str, Any], workdir: Path, report: StepReport) -> 
         )
     except ValueError as error:
         return {"failed": said_of(error, report.log)}
-    return {"choice": _finite(choice.to_json())}
+    return {"held_out": _finite(held.to_json())}
 
 
 def dlsm_members(preset: str, seed: int) -> int:

@@ -34,7 +34,7 @@ def stored(outcome: Mapping[str, Any] | None, methods: Iterable[str]) -> dict[st
         `table` of held-out skill, `no_difference_error`, `predictions`, `failed` by method (or one reason for all under the key "") and
         `not_compared`, the methods with estimates that were not held against left-out controllers.
     """
-    held: Mapping[str, Any] = (outcome or {}).get("choice") or {}
+    held: Mapping[str, Any] = (outcome or {}).get("held_out") or {}
     table = list(held.get("table", []))
     failed = dict(held.get("failed", {})) | ({"": str(outcome["failed"])} if outcome and "failed" in outcome else {})
     return {
@@ -59,7 +59,7 @@ def widened(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, d
     `held_out_difference_error`, the error of differences beyond the noise of the observed means, for the interval of a gain. The
     combination takes those of its parts by their weights.
     """
-    held: Mapping[str, Any] = (outcome or {}).get("choice") or {}
+    held: Mapping[str, Any] = (outcome or {}).get("held_out") or {}
     excess = {row["method"]: float(row["excess"]) for row in held.get("table", []) if row.get("excess") is not None}
     apart = difference_errors(held.get("predictions", []))
 
@@ -119,7 +119,7 @@ def combined(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, 
     Args:
         estimates: method -> policy -> estimate. outcome: of `choose_method`.
     """
-    table = ((outcome or {}).get("choice") or {}).get("table", [])
+    table = ((outcome or {}).get("held_out") or {}).get("table", [])
     bias = {row["method"]: float(row["bias"]) for row in table if row["method"] != AGGREGATE}
     parts = {m: by_policy for m, by_policy in estimates.items() if m not in (AGGREGATE, POSTERIOR) and (not bias or m in bias)}
     if len(parts) < 2:

@@ -1,9 +1,8 @@
-"""Which method to believe on these data: each predicts the return of controllers that were left out of its fit, and is held against what
-their sessions returned. No true return, no simulator: sessions alone.
+"""Errors of methods on these data: each predicts the return of controllers that were left out of its fit, compared with what their
+sessions returned. No true return, no simulator: sessions alone.
 
 A controller is left out whole (the question that a new policy asks), and what it did is given to the methods as a policy: the policy itself
-where it is at hand, uniform draws for the random controller, else a clone. Only differences between controllers count for the choice, since
-only they rank; observed means of few sessions are noisy, so the choice is made where it can be and says so where it cannot.
+where it is at hand, uniform draws for the random controller, else a clone. The errors widen the intervals of the methods.
 """
 
 from __future__ import annotations
@@ -20,21 +19,17 @@ from ml.ope.behaviour import Key, clones, controllers
 from ml.ope.compare.aggregate import combine
 from ml.ope.compare.metrics import spearman
 from ml.ope.estimate import Estimate, Estimator, checked_horizon
-from ml.ope.flags import Flag
 from ml.ope.observed import Observed, observed
-from ml.ope.registry import AGGREGATE, preference
+from ml.ope.registry import AGGREGATE
 from ml.policies.policy import Policy
 from ml.progress import Report, silent
 from ml.trajectories import ReplayBuffer
 
 FEWEST_CONTROLLERS = 3
-"""Left-out controllers below which the data choose no method."""
+"""Controllers with r_end that make a comparison by whole returns."""
 
 NINETY = 1.645
 """Half-width of a normal's 90 % interval, the level of all estimates, in standard deviations."""
-
-NEEDED_LEAD = 1.0
-"""A method takes the place of the first of the usual order only where its errors are smaller by more than so many standard errors."""
 
 
 @dataclass(frozen=True)
@@ -78,27 +73,23 @@ class Skill:
 
 
 @dataclass(frozen=True)
-class Choice:
-    """The method that the ranking should rest on.
+class HeldOut:
+    """Skill of the methods on left-out controllers.
 
     Attributes:
-        method: its key. chosen_by_data: False where the preference decided alone. reasons: what the choice rests on.
         table: skill of every method, best first. predictions: all of them. failed: methods that could not be fitted, with the reason.
     """
 
-    method: str
-    chosen_by_data: bool
-    reasons: tuple[Flag, ...]
     table: tuple[Skill, ...]
     predictions: tuple[Prediction, ...]
     failed: Mapping[str, str]
 
     def to_json(self) -> dict[str, Any]:
-        """Everything, JSON-able."""
-        return asdict(self) | {"failed": dict(self.failed), "reasons": [reason.to_json() for reason in self.reasons]}
+        """Return everything, JSON-able."""
+        return asdict(self) | {"failed": dict(self.failed)}
 
 
-def choose_default(
+def held_out_skill(
     buffer: ReplayBuffer,
     estimators: Mapping[str, Estimator],
     *,
@@ -107,66 +98,19 @@ def choose_default(
     aggregate: bool = True,
     seed: int = 0,
     report: Report = silent,
-) -> Choice:
-    """Choose a method by its predictions of left-out controllers.
+) -> HeldOut:
+    """Compare predictions of left-out controllers with what their sessions returned.
 
     Args:
-        buffer: all sessions. estimators: candidates by key; each is fitted once per controller, so give quick settings.
+        buffer: all sessions. estimators: methods by key; each is fitted once per controller, so give quick settings.
         policies: logged policies by `policy_id`; the others are cloned.
         horizon_steps: H, the buffer's median session length by default.
-        aggregate: let the combination of all compete.
+        aggregate: include the combination of all.
         seed: of clones.
-
-    Raises:
-        ValueError: no estimator.
     """
-    if not estimators:
-        raise ValueError("a choice needs at least one method")
     horizon = checked_horizon(buffer, horizon_steps)
     predictions, failed = held_out_predictions(buffer, estimators, policies or {}, horizon, aggregate, seed, report)
-    table = sorted((s for s in skills(predictions)), key=lambda s: s.difference_error)
-    fallback = next((m for m in preference() if m in estimators and m not in failed), next(iter(estimators)))
-    most = max((s.controllers for s in table), default=0)
-    if most < FEWEST_CONTROLLERS:
-        reason = Flag("too_few_controllers", float(most), float(FEWEST_CONTROLLERS), "controllers")
-        return Choice(fallback, False, (reason,), tuple(table), predictions, failed)
-    full = [s for s in table if s.controllers == most]
-    order = {m: k for k, m in enumerate(preference())}
-    first = min((s for s in full if s.method != AGGREGATE), key=lambda s: order.get(s.method, len(order)), default=full[0])
-    leads = {s.method: lead(predictions, first.method, s.method) for s in full if s is not first}
-    ahead = [s for s in full if s is not first and leads[s.method][0] > NEEDED_LEAD * leads[s.method][1]]
-    chosen = ahead[0] if ahead else first
-    return Choice(chosen.method, True, _reasons(chosen, first, full, most), tuple(table), predictions, failed)
-
-
-def lead(predictions: tuple[Prediction, ...], first: str, other: str) -> tuple[float, float]:
-    """By how much `other` predicts differences between left-out controllers better than `first`: mean over pairs, and its standard error.
-
-    The pairs share controllers, so the standard error is the jackknife's over controllers; infinite below three common ones.
-    """
-    tables = [{p.controller: p.predicted - p.observed for p in predictions if p.method == m} for m in (first, other)]
-    common = [c for c in tables[0] if c in tables[1]]
-
-    def gain(names: list[str]) -> float:
-        errors = [np.array([table[c] for c in names]) for table in tables]
-        upper = np.triu_indices(len(names), 1)
-        own, others = (np.abs(np.subtract.outer(e, e))[upper].mean() for e in errors)
-        return float(own - others)
-
-    if len(common) < FEWEST_CONTROLLERS:
-        return 0.0, float("inf")
-    left = np.array([gain([c for c in common if c != out]) for out in common])
-    k = len(common)
-    return gain(common), float(np.sqrt((k - 1) / k * np.sum((left - left.mean()) ** 2)))
-
-
-def _reasons(chosen: Skill, first: Skill, full: list[Skill], controllers: int) -> tuple[Flag, ...]:
-    """The chosen method's error of differences against the least of all, and how it stands to the first of the usual order."""
-    error, least = chosen.difference_error, full[0].difference_error
-    found = Flag.of("difference_error", error, least, "share of range", method=chosen.method, controllers=float(controllers))
-    if chosen is not first:
-        return found, Flag.of("beats_usual_order", method=first.method)
-    return (found,) if full[0] is first else (found, Flag("not_beaten"))
+    return HeldOut(tuple(sorted(skills(predictions), key=lambda s: s.difference_error)), predictions, failed)
 
 
 def with_held_out_error(estimate: Estimate, error: float) -> Estimate:

@@ -19,7 +19,7 @@ from app.learning.snapshots.buffers import read_buffer
 from app.platform import files
 from app.study.repository import participant_by_code
 from ml.deploy.bundle import verify_bundle
-from ml.ope.compare.skill import choose_default
+from ml.ope.compare.skill import held_out_skill
 from ml.ope.registry import estimators, quick_estimators
 from ml.ope.support.diagnostics import diagnose
 from ml.policies.onnx_policy import OnnxPolicy
@@ -80,10 +80,10 @@ def test_an_evaluation_gives_the_numbers_that_the_estimators_give(
             pytest.approx(direct.step_return, rel=1e-9),
         )
     quick = {name: e for name, e in quick_estimators(0).items() if name in CHEAP}
-    choice = choose_default(buffer, quick, horizon_steps=buffer.median_steps())
+    skill = held_out_skill(buffer, quick, horizon_steps=buffer.median_steps())
     held_out = db.get_one(Evaluation, done["result"]["evaluation_id"]).diagnostics["held_out"]
     assert {s["method"]: s["difference_error"] for s in held_out["table"]} == {
-        s.method: pytest.approx(s.difference_error) for s in choice.table
+        s.method: pytest.approx(s.difference_error) for s in skill.table
     }
     # nobody named the posterior: it ranks all the same, and its verdict stands beside it
     assert (ranking["default_method"], ranking["choice"]) == ("posterior", None)

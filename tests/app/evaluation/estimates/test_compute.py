@@ -90,9 +90,8 @@ def test_one_session_is_refused_in_the_same_words_by_every_method_that_fits(meth
 def test_the_choice_names_its_table_or_why_there_is_none(db: Session, tmp_path: Path) -> None:
     params = call(db, buffer_of(sessions()), methods=["dlsm", "linear", "fqe", "wis", "aggregate"])
     params["policies"] = []
-    found = json.loads(json.dumps(choose_method(params, tmp_path, StepReport(lambda _: None))))["choice"]
+    found = json.loads(json.dumps(choose_method(params, tmp_path, StepReport(lambda _: None))))["held_out"]
     assert {"linear", "fqe", "wis"} <= {row["method"] for row in found["table"]}
-    assert found["chosen_by_data"] is True
     assert {p["controller"] for p in found["predictions"]} == {"random", "cdbs", "no_dbs"}
     one = params | {"methods": ["dlsm", "pdis"]}
     assert "none of the methods asked for" in choose_method(one, tmp_path, StepReport(lambda _: None))["failed"]

@@ -20,10 +20,7 @@ from app.learning.snapshots.service import take_snapshot
 from app.study.repository import participant_by_code
 from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate
-from ml.ope.flags import Flag
 from tests.app.evaluations import estimate, judged
-
-LEAST = Flag.of("difference_error", 0.2, 0.2, "share of range", method="fqe", controllers=4.0)
 
 
 def skill(method: str, error: float, bias: float = 1.0) -> dict[str, Any]:
@@ -33,24 +30,16 @@ def skill(method: str, error: float, bias: float = 1.0) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def outcome(method: str, *table: dict[str, Any], by_data: bool = True, reason: Flag = LEAST) -> dict[str, Any]:
-    choice: dict[str, Any] = {
-        "method": method,
-        "chosen_by_data": by_data,
-        "reasons": [reason.to_json()],
-        "table": list(table),
-        "predictions": [],
-        "failed": {},
-    }
-    return {"choice": choice}
+def outcome(*table: dict[str, Any]) -> dict[str, Any]:
+    return {"held_out": {"table": list(table), "predictions": [], "failed": {}}}
 
 
 def seen(method: str, **observed: float) -> list[dict[str, Any]]:
     return [{"method": method, "controller": name, "observed": value} for name, value in observed.items()]
 
 
-NO_SKILL = outcome("fqe", skill("fqe", 0.7), skill("linear", 0.9))
-NO_SKILL["choice"]["predictions"] = seen("fqe", random=0.0, cdbs=4.0, no_dbs=10.0) + seen("linear", random=0.0, cdbs=4.0)
+NO_SKILL = outcome(skill("fqe", 0.7), skill("linear", 0.9))
+NO_SKILL["held_out"]["predictions"] = seen("fqe", random=0.0, cdbs=4.0, no_dbs=10.0) + seen("linear", random=0.0, cdbs=4.0)
 
 
 def tables(**supported: bool) -> dict[str, Any]:
@@ -61,24 +50,24 @@ def tables(**supported: bool) -> dict[str, Any]:
 
 
 def test_the_error_without_skill_is_that_of_saying_that_all_controllers_are_alike() -> None:
-    predictions = NO_SKILL["choice"]["predictions"]
+    predictions = NO_SKILL["held_out"]["predictions"]
     assert no_difference_error(predictions) == pytest.approx((4 + 10 + 6) / 3 / 10)
     assert no_difference_error(predictions[:1]) is None
     assert no_difference_error([]) is None
 
 
 def test_only_methods_of_known_bias_are_combined() -> None:
-    made = combined(tables(dlsm=True, linear=True, fqe=True), outcome("fqe", skill("fqe", 0.1), skill("linear", 0.3, bias=9.0)))
+    made = combined(tables(dlsm=True, linear=True, fqe=True), outcome(skill("fqe", 0.1), skill("linear", 0.3, bias=9.0)))
     weights = made["estimates"]["1"].details["weights"]
     assert set(weights) == {"fqe", "linear"}
     assert weights["fqe"] > 0.9  # its squared error is some hundredth of the other's
-    assert "at least two methods" in combined(tables(dlsm=True, fqe=True), outcome("fqe", skill("fqe", 0.1)))["failed"]
+    assert "at least two methods" in combined(tables(dlsm=True, fqe=True), outcome(skill("fqe", 0.1)))["failed"]
     assert "supports any policy" in combined(tables(dlsm=False, fqe=False), None)["failed"]
 
 
 def test_intervals_are_widened_by_the_errors_on_left_out_controllers() -> None:
-    given = outcome("fqe", skill("fqe", 0.1) | {"excess": 10.0}, skill("linear", 0.2) | {"excess": 0.0})
-    given["choice"]["predictions"] = [
+    given = outcome(skill("fqe", 0.1) | {"excess": 10.0}, skill("linear", 0.2) | {"excess": 0.0})
+    given["held_out"]["predictions"] = [
         {"method": m, "controller": name, "predicted": said, "observed": seen, "observed_standard_error": error, "supported": supported}
         for m, rows in {
             # fqe: differences of supported controllers off by 5 with a noise of 3 and 0; the third controller was not supported
@@ -87,7 +76,7 @@ def test_intervals_are_widened_by_the_errors_on_left_out_controllers() -> None:
         }.items()
         for name, said, seen, error, supported in rows
     ]
-    assert difference_errors(given["choice"]["predictions"]) == {"fqe": pytest.approx(4.0), "linear": 0.0}
+    assert difference_errors(given["held_out"]["predictions"]) == {"fqe": pytest.approx(4.0), "linear": 0.0}
     raw = tables(dlsm=True, linear=True, fqe=True)
     found = widened(raw, given)
     assert found["dlsm"] == raw["dlsm"]
@@ -113,7 +102,7 @@ def test_what_left_out_controllers_showed_is_stored_and_shown_in_the_fold_and_ch
     store_evaluation(
         db, job_id=None, created_by="test", snapshot=take_snapshot(db, participant, SYSTEM), horizon_steps=60, candidates=policies,
         results=results, config={"methods": ["dlsm", "fqe", "linear", "aggregate", "posterior"]},
-        skill=outcome("fqe", skill("fqe", 0.12), skill("linear", 0.34)),
+        skill=outcome(skill("fqe", 0.12), skill("linear", 0.34)),
     )  # fmt: skip
     db.commit()
     found = db.scalars(select(Evaluation)).one()

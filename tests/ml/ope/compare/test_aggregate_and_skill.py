@@ -9,10 +9,9 @@ from scipy.optimize import minimize
 
 from ml.faults import BROKE
 from ml.ope.compare.aggregate import combine, convex_weights, error_matrix
-from ml.ope.compare.skill import Prediction, choose_default, lead, skills, with_held_out_error
+from ml.ope.compare.skill import Prediction, held_out_skill, skills, with_held_out_error
 from ml.ope.estimate import Estimate, checked_horizon
 from ml.ope.fqe.estimator import Fqe, FqeConfig
-from ml.ope.importance import ImportanceSampling
 from ml.ope.linear.estimator import LinearConfig, LinearModel
 from ml.policies.policy import ConstantPolicy
 from ml.qoc import Qoc
@@ -101,12 +100,12 @@ def test_skill_numbers_are_those_of_counting_by_hand():
     assert skill.rank_correlation == 1.0
 
 
-def test_predictions_that_are_all_off_by_the_same_amount_lose_nothing_in_the_choice():
+def test_predictions_that_are_all_off_by_the_same_amount_lose_nothing_in_the_table():
     rows = tuple(Prediction("m", str(i), 1, v + 50.0, v, None, True) for i, v in enumerate([0.0, 1.0, 3.0]))
     assert skills(rows)[0].difference_error == pytest.approx(0.0)
 
 
-def test_the_method_that_predicts_left_out_controllers_is_chosen_and_the_table_says_why(linear_simulator):
+def test_the_method_that_predicts_left_out_controllers_is_first_in_the_table(linear_simulator):
     class Backwards:
         """Says the opposite of a linear model."""
 
@@ -122,63 +121,11 @@ def test_the_method_that_predicts_left_out_controllers_is_chosen_and_the_table_s
 
     buffer = linear_simulator.buffer(seed=0, n=16, steps=100)
     candidates = {"fqe": Backwards(), "linear": LinearModel(LinearConfig(draws=20))}
-    choice = choose_default(buffer, candidates, aggregate=False)
-    assert choice.method == "linear"
-    assert choice.chosen_by_data
-    assert choice.table[0].method == "linear"
-    assert choice.table[0].difference_error < choice.table[1].difference_error
-    assert {p.controller for p in choice.predictions} == {"random", "cdbs", "rl", "other"}
-    json.dumps(choice.to_json())
-
-
-def test_the_lead_over_the_usual_first_is_the_mean_over_pairs_with_a_jackknife_over_controllers():
-    errors = {"linear": [0.0, 4.0, -2.0, 1.0], "fqe": [0.0, 1.0, 0.0, 1.0]}
-    rows = tuple(Prediction(m, str(c), 2, 10.0 * c + e, 10.0 * c, 1.0, True) for m, own in errors.items() for c, e in enumerate(own))
-
-    def by_hand(names):
-        pairs = [(i, j) for i in names for j in names if i < j]
-        return np.mean([abs(errors["linear"][i] - errors["linear"][j]) - abs(errors["fqe"][i] - errors["fqe"][j]) for i, j in pairs])
-
-    left = np.array([by_hand([c for c in range(4) if c != out]) for out in range(4)])
-    gain, error = lead(rows, "linear", "fqe")
-    assert gain == pytest.approx(by_hand(range(4)))
-    assert error == pytest.approx(np.sqrt(3 / 4 * np.sum((left - left.mean()) ** 2)))
-    assert lead(rows[:2] + rows[4:], "linear", "fqe") == (0.0, float("inf"))
-
-
-@pytest.mark.slow
-def test_a_method_takes_the_place_of_the_usual_first_only_by_more_than_a_standard_error(linear_simulator):
-    class Said:
-        """Predictions by the mean amplitude of the policy: exact to a slope and an offset of one controller."""
-
-        def __init__(self, method, slope, wrong):
-            self.method, self.slope, self.wrong = method, slope, wrong
-
-        def fit(self, buffer, report=None, checkpoint_dir=None):
-            self.kinds = {s.controller for s in buffer.sessions}
-            return self
-
-        def evaluate(self, policies, horizon_steps=None, report=None):
-            found = LinearModel(LinearConfig(draws=20)).fit(full).evaluate(policies, horizon_steps)
-            shift = self.wrong if "cdbs" not in self.kinds else 0.0
-            return {n: replace(e, value=self.slope * e.value + shift, step_return=self.slope * e.step_return) for n, e in found.items()}
-
-    full = linear_simulator.buffer(seed=0, n=16, steps=100)
-    clear = choose_default(full, {"linear": Said("linear", -1.0, 0.0), "fqe": Said("fqe", 1.0, 0.0)}, aggregate=False)
-    assert clear.method == "fqe"
-    assert [r.code for r in clear.reasons] == ["difference_error", "beats_usual_order"]
-    assert clear.reasons[1].fact("method") == "linear"
-    hardly = choose_default(full, {"linear": Said("linear", 1.0, 0.4), "fqe": Said("fqe", 1.0, 0.0)}, aggregate=False)
-    assert hardly.method == "linear"
-
-
-def test_too_few_controllers_leave_the_choice_to_the_usual_order(linear_simulator):
-    sessions = tuple(s for s in linear_simulator.buffer(seed=0, n=10, steps=40).sessions if s.controller in ("random", "cdbs"))
-    buffer = replace(linear_simulator.buffer(seed=0, n=10, steps=40), sessions=sessions)
-    candidates = {"wis": ImportanceSampling("wis", draws=20), "linear": LinearModel(LinearConfig(draws=20))}
-    choice = choose_default(buffer, candidates)
-    assert (choice.method, choice.chosen_by_data) == ("linear", False)
-    assert [(r.code, r.value, r.limit) for r in choice.reasons] == [("too_few_controllers", 2, 3)]
+    held = held_out_skill(buffer, candidates, aggregate=False)
+    assert held.table[0].method == "linear"
+    assert held.table[0].difference_error < held.table[1].difference_error
+    assert {p.controller for p in held.predictions} == {"random", "cdbs", "rl", "other"}
+    json.dumps(held.to_json())
 
 
 def test_a_method_that_cannot_work_is_named_with_its_reason(small_buffer):
@@ -195,11 +142,10 @@ def test_a_method_that_cannot_work_is_named_with_its_reason(small_buffer):
             np.linalg.cholesky(-np.eye(2))
 
     bare = replace(small_buffer, sessions=tuple(replace(s, qoc=Qoc()) for s in small_buffer.sessions))
-    choice = choose_default(bare, {"dlsm": Refusing(), "fqe": Broken(), "linear": LinearModel(LinearConfig(draws=20))})
+    held = held_out_skill(bare, {"dlsm": Refusing(), "fqe": Broken(), "linear": LinearModel(LinearConfig(draws=20))})
     with pytest.raises(ValueError) as refused:
         checked_horizon(small_buffer, 0)
-    assert choice.failed == {"dlsm": str(refused.value), "fqe": BROKE}, "what a library says of its arrays is nobody's reason"
-    assert choice.method == "linear"
+    assert held.failed == {"dlsm": str(refused.value), "fqe": BROKE}, "what a library says of its arrays is nobody's reason"
 
 
 def test_intervals_are_widened_by_errors_on_left_out_controllers_that_chance_does_not_explain():
@@ -217,9 +163,9 @@ def test_a_controller_without_r_end_is_left_out_of_the_comparison_where_enough_o
     buffer = linear_simulator.buffer(seed=0, n=16, steps=60)
     bare = replace(buffer, sessions=tuple(replace(s, qoc=Qoc()) if s.controller == "other" else s for s in buffer.sessions))
     linear = {"linear": LinearModel(LinearConfig(draws=20))}
-    found = choose_default(bare, linear, aggregate=False).predictions
+    found = held_out_skill(bare, linear, aggregate=False).predictions
     assert {p.controller for p in found} == {"random", "cdbs", "rl"}
     few = replace(bare, sessions=tuple(s for s in bare.sessions if s.controller != "rl"))
-    steps = choose_default(few, linear, aggregate=False).predictions
+    steps = held_out_skill(few, linear, aggregate=False).predictions
     assert {p.controller for p in steps} == {"random", "cdbs", "other"}
     assert all(p.observed < 0 for p in steps)  # step returns, every one of them; r_end is positive here
