@@ -389,8 +389,6 @@ PREDICTED: tuple[tuple[Outcome, Prediction], ...] = tuple((o, o.prediction) for 
 
 BY_KEY: Mapping[str, Outcome] = {o.key: o for o in OUTCOMES}
 BY_FIELD: Mapping[str, Outcome] = {o.field: o for o in OUTCOMES}
-
-
 END_WEIGHTS: Mapping[str, EndWeight] = {o.end.setting: o.end for o in OUTCOMES if o.end is not None}
 
 

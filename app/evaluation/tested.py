@@ -16,6 +16,7 @@ from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies.service import onnx_of, window_of
 from app.platform.errors import Invalid
 from ml.mdp import MdpSettings
+from ml.ope.posterior.gaussian import QUANTITIES
 from ml.ope.posterior.tested import TestSession, differences_to_cdbs, spread_of_random
 from ml.trajectories import ReplayBuffer
 
@@ -80,7 +81,7 @@ def _shown(session: DrivenSession, settings: MdpSettings, horizon_steps: int) ->
     result = actual(trajectory, settings, horizon_steps)
     # a session that was stopped is a failure here as it is in buffers, whatever was measured
     counted = {name: v for name, v in asdict(trajectory.counted_qoc).items() if v is not None}
-    values = {name: v for name, v in result.shown.items() if name != "mean_beta"} | counted
+    values = {name: v for name, v in (result.shown | counted).items() if name in QUANTITIES}
     if result.value is not None:
         values["return"] = result.value
     return TestSession(None if session.policy_id is None else str(session.policy_id), session.visit, values)

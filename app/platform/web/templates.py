@@ -16,7 +16,7 @@ from app.platform.database import now
 from app.platform.web.charts import counted, written
 from app.platform.web.numbers import fixed, minutes, number, p_text, place, rate, size, stated, time_left, typed, when, whole
 from app.settings import get_settings
-from ml.outcomes import ALL, ANY, OUTCOMES
+from ml.outcomes import ALL, ANY, OUTCOMES, Outcome
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -67,7 +67,13 @@ def sign_on_name() -> str:
     return settings.oidc_name if settings.oidc_issuer else ""
 
 
+def outcome_value(value: float | None, outcome: Outcome) -> str:
+    """Write an outcome of a session: whole where its values are."""
+    return fixed(value, 0) if outcome.whole else number(value)
+
+
 _environment.filters.update(
+    outcome=outcome_value,
     written=written,
     counted=counted,
     number=number,
