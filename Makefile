@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow check measure audit format lock bench soak clean
+.PHONY: help install demo smoke test test-slow check measure audit format lock bench soak clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -24,6 +24,9 @@ $(STAMP): requirements.lock pyproject.toml
 
 demo: install ## Start betaloop with a synthetic study at http://127.0.0.1:8000.
 	$(BIN)/betaloop demo
+
+smoke: install ## Walk once from an upload to a signed controller and back, within a minute: the first thing to run after a change.
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/app/test_smoke.py
 
 test: install ## Run the test suite.
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow"
