@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -9,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import mkdtemp
 
+import anyio.from_thread
 import psycopg
 import pytest
 from alembic import command
@@ -46,6 +48,16 @@ ROOM_IN_MEMORY = 2 << 30
 
 
 pytest_plugins = ["tests.hazard_marks"]
+
+gc.disable()  # what is loaded to collect the tests stays: to look through it meanwhile takes a quarter of the time
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop() -> None:
+    """Search from now on what tests make, and only that, as seldom as the service does."""
+    gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
@@ -97,8 +109,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedPostgre
     shutil.rmtree(folder, ignore_errors=True)
 
 
-_counter = iter(range(10**9))
-
+_open: list[str] = []
+"""Databases of tests that are in use now: more than one where a template is made within a test."""
 
 _administrators: dict[str, psycopg.Connection] = {}
 
@@ -127,10 +139,15 @@ def drop_database(server: EmbeddedPostgres, name: str) -> None:
 
 
 def close_connections() -> None:
-    """Close this process's connections to the database in use, so that it can be copied."""
+    """Close this process's connections to the database in use, so that it can be copied.
+
+    The engines stay: each test's database has the name of the last one's, and what was compiled for that one's queries serves this one's.
+    """
     for engine in database._engines.values():
         engine.dispose()
-    database._engines.clear()
+    for client in jobs_engine._clients.values():
+        client.destroy()
+    jobs_engine._clients.clear()
 
 
 @contextmanager
@@ -140,7 +157,8 @@ def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.Monke
     Args:
         keep: the name of a copy that is left at the end, a template for other tests; `data` is left with it.
     """
-    name = f"test_{os.getpid()}_{next(_counter)}"
+    name = f"test_{os.getpid()}_{len(_open)}"
+    _open.append(name)
     copy_database(server, name, template)
     url = server.url(name)
     monkeypatch.setenv("BETALOOP_DATABASE_URL", url)
@@ -159,6 +177,7 @@ def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.Monke
         if not keep:
             shutil.rmtree(data, ignore_errors=True)
         drop_database(server, name)
+        _open.pop()
 
 
 @pytest.fixture
@@ -185,6 +204,14 @@ def cheap_passwords() -> None:
     """Argon2 as in the service, at a cost that hundreds of tests can bear."""
     accounts._hasher = PasswordHash((FewAtOnce(time_cost=1, memory_cost=64, parallelism=1),))
     accounts._decoy.cache_clear()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_event_loop() -> Iterator[None]:
+    """The event loop of every client of this process: to start one for each request, or client, takes as long as a small request."""
+    with anyio.from_thread.start_blocking_portal() as portal, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TestClient, "portal", portal)
+        yield
 
 
 @pytest.fixture(autouse=True)
@@ -242,15 +269,14 @@ def service_app(application, fresh_database: str):  # type: ignore[no-untyped-de
 
 
 @pytest.fixture
-def client(service_app, make_token: Callable[[str], str]) -> Iterator[TestClient]:  # type: ignore[no-untyped-def]
+def client(client_as: Callable[[str], TestClient]) -> TestClient:
     """A client that calls as an administrator."""
-    with TestClient(service_app, headers={"Authorization": f"Bearer {make_token('admin')}"}) as client:
-        yield client
+    return client_as("admin")
 
 
 @pytest.fixture
 def client_as(service_app, make_token: Callable[[str], str]) -> Callable[[str], TestClient]:  # type: ignore[no-untyped-def]
-    """Clients by role: viewer, clinician, engineer, admin."""
+    """Clients by role: viewer, clinician, engineer, admin. The service they call was not started: test_incoming_files.py does it."""
 
     def make(role: str) -> TestClient:
         return TestClient(service_app, headers={"Authorization": f"Bearer {make_token(role)}"})
