@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -180,15 +181,45 @@ def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.Monke
         _open.pop()
 
 
-@pytest.fixture
-def fresh_database(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """An empty database at the newest schema."""
-    with own_database(server, tmp_path / "data", monkeypatch, "betaloop") as url:
-        yield url
-
-
 Template = tuple[str, Path]
 """A database that nobody is connected to, and its data folder; tests work on copies."""
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What a test that asks for `enrolled` begins with: an administrator and a participant, made once.
+
+    Attributes:
+        token: of the administrator.
+    """
+
+    template: Template
+    token: str
+
+
+@pytest.fixture(scope="session")
+def begun_once(server: EmbeddedPostgres, application, tmp_path_factory: pytest.TempPathFactory) -> Begun:  # type: ignore[no-untyped-def]
+    """The administrator of `client`, and the participant of `enrolled`."""
+    data = tmp_path_factory.mktemp("begun") / "data"
+    data.mkdir()
+    with pytest.MonkeyPatch.context() as patch, own_database(server, data, patch, "betaloop", keep="begun"):
+        token = _token_of("admin")
+        _enrol(TestClient(application, headers={"Authorization": f"Bearer {token}"}))
+    return Begun(("begun", data), token)
+
+
+@pytest.fixture
+def begun(request: pytest.FixtureRequest) -> Begun | None:
+    """What the test begins with; None where it does not ask for a participant, or only in its course."""
+    return request.getfixturevalue("begun_once") if "enrolled" in request.fixturenames else None
+
+
+@pytest.fixture
+def fresh_database(begun: Begun | None, server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A database at the newest schema: empty, or what a test with a participant begins with."""
+    copied = copy_of(begun.template, server, tmp_path, monkeypatch) if begun else None
+    with copied or own_database(server, tmp_path / "data", monkeypatch, "betaloop") as url:
+        yield url
 
 
 @contextmanager
@@ -239,17 +270,16 @@ def owner_db(fresh_database: str) -> Iterator[Session]:
     engine.dispose()
 
 
+def _token_of(role: str) -> str:
+    with database.transaction("test") as db:
+        accounts.add_user(db, f"{role}@clinic.example", Role(role), PASSWORD)
+        return accounts.create_token(db, f"{role}@clinic.example", "tests")
+
+
 @pytest.fixture
 def make_token(fresh_database: str) -> Callable[[str], str]:
     """Make a user of a role and return an API token."""
-    from app.accounts import service
-
-    def make(role: str) -> str:
-        with database.transaction("test") as db:
-            service.add_user(db, f"{role}@clinic.example", Role(role), PASSWORD)
-            return service.create_token(db, f"{role}@clinic.example", "tests")
-
-    return make
+    return _token_of
 
 
 @pytest.fixture(scope="session")
@@ -269,9 +299,9 @@ def service_app(application, fresh_database: str):  # type: ignore[no-untyped-de
 
 
 @pytest.fixture
-def client(client_as: Callable[[str], TestClient]) -> TestClient:
+def client(service_app, fresh_database: str, begun: Begun | None) -> TestClient:  # type: ignore[no-untyped-def]
     """A client that calls as an administrator."""
-    return client_as("admin")
+    return TestClient(service_app, headers={"Authorization": f"Bearer {begun.token if begun else _token_of('admin')}"})
 
 
 @pytest.fixture
@@ -298,10 +328,15 @@ def sign_plan(service_app, fresh_database: str) -> Callable[..., Response]:  # t
     return sign
 
 
-@pytest.fixture
-def enrolled(client: TestClient) -> str:
-    """Code of a participant with a cDBS amplitude and a threshold, and a visit 1."""
+def _enrol(client: TestClient) -> None:
     body = {"code": "P1", "settings": {"xi_beta": 1.0, "cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"}}
     assert client.post("/api/v1/participants", json=body).status_code == 201
     assert client.post("/api/v1/participants/P1/visits", json={"number": 1, "date": "2026-03-02"}).status_code == 201
+
+
+@pytest.fixture
+def enrolled(client: TestClient, begun: Begun | None) -> str:
+    """Code of a participant with a cDBS amplitude and a threshold, and a visit 1."""
+    if begun is None:
+        _enrol(client)
     return "P1"
