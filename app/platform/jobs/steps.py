@@ -7,7 +7,6 @@ import logging
 import threading
 import traceback
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -158,12 +157,6 @@ class JobRunner:
         self._children.close()
         return done
 
-    def _prepare(self, kind: registry.JobKind) -> None:
-        """Have the libraries of a job's steps loaded while the job finds out what to compute; an error is raised by its first step."""
-        if kind.compute:
-            with suppress(OSError):
-                self._children.prepare(sorted({reference.partition(":")[0] for reference in kind.compute.values()}))
-
     def _run(self, job_id: str, requests: StopRequests) -> None:
         check = _check_abandoned(requests)
         job = persist(lambda: _job(job_id), check)
@@ -175,9 +168,7 @@ class JobRunner:
         try:
             if job.cancel_requested_at is not None:
                 raise JobCancelled
-            kind = registry.kind(job.kind)
-            self._prepare(kind)
-            result = _as_json(kind.run(context), f"the result of job kind {job.kind!r}")
+            result = _as_json(registry.kind(job.kind).run(context), f"the result of job kind {job.kind!r}")
             requests.check()
             ledger.close(JobStatus.SUCCEEDED, result=result)
         except JobCancelled:

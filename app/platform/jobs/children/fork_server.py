@@ -31,20 +31,18 @@ LONGEST_ORDER = 1 << 16
 
 
 def main(arguments: list[str]) -> int:
-    """Load modules as for an order (`module`) or call functions that do (`module:function`), and serve until the starter has gone."""
+    """Import modules (`module`), call what is to be made ready (`module:function`), and serve until the starter has gone."""
     child.die_with_parent()
     niceness, *names = arguments
     child.step_back(int(niceness))
+    for name in names:
+        module, _, function = name.partition(":")
+        loaded = import_module(module)
+        if function:
+            getattr(loaded, function)()
+    _leave_to_itself()
     with socket.socket(fileno=os.dup(0)) as orders:
-        server = _Server(orders)
-        for name in names:
-            module, _, function = name.partition(":")
-            if function:
-                getattr(import_module(module), function)()
-            else:
-                server.load(module)
-        _leave_to_itself()
-        server.serve()
+        _Server(orders).serve()
     return 0
 
 
@@ -85,7 +83,7 @@ class _Server:
         order = socket.socket(fileno=order_fd)
         call = json.loads(order.recv(LONGEST_ORDER))
         if (module := call.get("module")) is not None:
-            self.load(module)
+            self._load(module)
         pid = os.fork()
         if pid == 0:
             self._become_child(call, order, log, report)
@@ -94,7 +92,7 @@ class _Server:
         self._running[pid] = order
         _tell(order, {"pid": pid})
 
-    def load(self, module: str) -> None:
+    def _load(self, module: str) -> None:
         """Import a module of compute functions for the children to come; what goes wrong with it, its child tells in its own log."""
         if module in self._loaded:
             return

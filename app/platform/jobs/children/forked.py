@@ -24,7 +24,7 @@ class ForkedProcesses(ChildProcesses):
     """Child processes forked by one server process. It starts with the first child and ends when idle; a killed one is replaced.
 
     Args:
-        prepared: what the server loads (`module`) and calls (`module:function`) before it forks.
+        prepared: what the server imports (`module`) and calls (`module:function`) before it forks.
         learns: whether it also imports the module of each call before it forks the first child for it, and calls its `prepare()` where it
             has one, so that later children of that module find everything loaded.
         niceness: how far the server steps back behind other processes while it imports, 0 to 19; children go by their limits.
@@ -44,17 +44,13 @@ class ForkedProcesses(ChildProcesses):
         self._used_at = 0.0
         self._alarm: threading.Timer | None = None
 
-    def prepare(self, modules: Sequence[str] = ()) -> None:
-        """Start the server ahead of a call that is likely to come soon; returns before the server has loaded anything.
-
-        Args:
-            modules: those of the calls to come, which a new server loads at once.
-        """
+    def prepare(self) -> None:
+        """Start the server ahead of a call that is likely to come soon; returns before the server has loaded anything."""
         self._note_use(0)
         if not self._one_at_a_time.acquire(blocking=False):
             return  # a call is starting, and the server with it
         try:
-            self._connected(modules)
+            self._connected()
         finally:
             self._one_at_a_time.release()
 
@@ -124,12 +120,11 @@ class ForkedProcesses(ChildProcesses):
             socket.send_fds(orders, [b"c"], [theirs.fileno(), log, report])
         return ForkedChild(mine)
 
-    def _connected(self, modules: Sequence[str] = ()) -> socket.socket:
+    def _connected(self) -> socket.socket:
         if self._to_server is None:
             mine, theirs = socket.socketpair()
-            arguments = ["-m", MODULE, *self._arguments, *modules]
             with theirs:
-                self._server = self.open_process(arguments, stdin=theirs.fileno(), stdout=subprocess.DEVNULL)
+                self._server = self.open_process(["-m", MODULE, *self._arguments], stdin=theirs.fileno(), stdout=subprocess.DEVNULL)
             self._to_server = mine
         return self._to_server
 

@@ -149,16 +149,3 @@ def test_no_call_is_lost_where_calls_come_just_when_the_process_ends(kinds, tmp_
     finally:
         children.close()
     assert len(servers) > 1, "it ended between calls"
-
-
-@pytest.mark.parametrize("ahead", [True, False])
-def test_a_process_started_ahead_loads_the_modules_of_the_calls_to_come(kinds, tmp_path, ahead):
-    children = ForkedProcesses()  # whose calls name no module to load
-    try:
-        children.prepare(["sample_job_kinds"] if ahead else [])
-        call = ComputeCall("who", "sample_job_kinds:who_prepared", {}, tmp_path / "1", ChildLimits(1024))
-        result = children.run(call, lambda messages: None, lambda: None)["result"]
-        assert result["prepared"] == ([children.server_pid] if ahead else [])
-        assert result["forked_by"] == children.server_pid
-    finally:
-        children.close()
