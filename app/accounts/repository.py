@@ -18,9 +18,7 @@ def user_by_email(db: Session, email: str) -> User | None:
     address = normal_address(email)
     if address is None:
         return None
-    # users of earlier versions were stored with small letters alone
-    spellings = {address, email.strip().lower()}
-    return db.scalar(select(User).where(User.email.in_(spellings)).order_by(User.email != address).limit(1))
+    return db.scalar(select(User).where(User.email == address))
 
 
 def some_password_hash(db: Session, address: str) -> str | None:

@@ -135,7 +135,7 @@ _FURTHER = ("sessions_needed", "near_amplitude", "visits_needed")
 
 _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "retired": lambda f: f"retired: {f.fact('text')}",
-    "no_posterior": lambda f: "evaluated by an earlier betaloop: evaluate again",
+    "no_posterior": lambda f: "without the chances of every outcome: evaluate again",
     "adverse_event": lambda f: "serious adverse event, not cleared by a clinician",
     "nearly_off": lambda f: f"nearly off {percent(f.value)} of the time",
     "beyond_margin": lambda f: (

@@ -209,7 +209,6 @@ _SENTENCES: dict[Reason, Callable[[Mapping[str, Any]], str]] = {
     Reason.RECORDED_SIDE: lambda f: "of the recording that a controller could have seen",
     Reason.NO_SIDE: lambda f: "the file states no side",
     Reason.CUT_OUT: lambda f: f"cut out of proposed session {f['session']}",
-    Reason.SENTENCE: lambda f: str(f["text"]),
 }
 
 

@@ -108,10 +108,9 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
         "policies": chosen["policies"],
     }
     methods = _fitted(params)
-    others = chosen.get("others")  # a job that an earlier version began does not have it
+    others = chosen["others"]
     pooled = {"others": others["evidence"]} if others else {}
-    # nor the policies that are tested and not evaluated, of which its tests are not
-    shown_by = {name: chosen[name] for name in ("tests", "tested", "tests_left_out") if name in chosen}
+    shown_by = {name: chosen[name] for name in ("tests", "tested", "tests_left_out")}
     own: dict[str, dict[str, Any]] = {"dlsm": models, POSTERIOR: shown_by | pooled}
     calls: list[ComputeStep] = [(COVERAGE_STEP, "check_coverage", common)]
     calls += [(f"estimate/{method}", "evaluate_method", common | {"method": method} | own.get(method, {})) for method in methods]

@@ -85,9 +85,8 @@ def training_calls(params: TrainParams, planned: Mapping[str, Any], groups: Sequ
     common = {
         "snapshot_sha256": snapshot["sha256"],
         "held_out": params.held_out,
-        # a job that an earlier version began knows neither
-        "margins": snapshot.get("margins"),
-        "tested": planned.get("tested_so_far"),
+        "margins": snapshot["margins"],
+        "tested": planned["tested_so_far"],
     }
     calls: list[ComputeStep] = []
     for group in groups:

@@ -105,8 +105,7 @@ class TrainedPolicy:
             window, hidden = saved["shape"]
             policy = MlpPolicy(window, hidden)
             policy.load_state_dict(saved["policy"])
-            # Files from before there were several algorithms hold one critic by its own name.
-            stored = saved["networks"] if "networks" in saved else {"critic": saved["critic"]}
+            stored = saved["networks"]
             networks = learner.networks(config, policy, [0] * (len(stored) + 1))
             for name, weights in stored.items():
                 networks[name].load_state_dict(weights)

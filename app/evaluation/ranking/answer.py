@@ -27,7 +27,7 @@ SAME_SHARE = 0.02
 """Two policies do the same only where their shares of time nearly off differ by less, whatever they ask for on average."""
 
 AS_THE_TEACHER = 0.02
-"""Of a ranking of before distances were stored: a student whose mean amplitude and distance to cDBS differ from its teacher's by less does
+"""Of a ranking without a map of behaviours: a student whose mean amplitude and distance to cDBS differ from its teacher's by less does
 what its teacher does; of other pairs nothing is known there."""
 
 OFF_SHARE = 0.8
@@ -200,7 +200,7 @@ def differences(own: Estimate | None, cdbs: Estimate | None) -> dict[str, Differ
 
 
 def map_of(evaluation: Evaluation) -> BehaviourMap | None:
-    """What its policies ask for at which beta, and how far they are apart; None of an evaluation of before it was stored."""
+    """What its policies ask for at which beta, and how far they are apart; None of an evaluation without a map."""
     stored = (evaluation.diagnostics.get(STORED) or {}).get(MAP)
     return BehaviourMap.from_json(stored) if stored else None
 

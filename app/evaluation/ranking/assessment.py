@@ -102,7 +102,7 @@ class Assessment:
 
     @property
     def standard_errors(self) -> Mapping[int, Mapping[str, float]]:
-        """By policy, those of its posterior return by their cause (`statistical`, `model_error`); without those of earlier versions."""
+        """By policy, those of its posterior return by their cause (`statistical`, `model_error`)."""
         known = {a.policy.id: a.posterior.details.get("standard_errors") for a in self.assessed if a.posterior is not None}
         return {policy_id: errors for policy_id, errors in known.items() if errors}
 
@@ -113,7 +113,7 @@ class Assessment:
 
     @property
     def left_out_outcomes(self) -> Mapping[str, Mapping[str, float | None]]:
-        """How well outcomes of left-out sessions and visits are predicted (`EndModel.predictability`); empty in earlier versions."""
+        """How well outcomes of left-out sessions and visits are predicted (`EndModel.predictability`); empty without a posterior."""
         return self._posterior_detail("left_out_outcomes")
 
     def _posterior_detail(self, name: str) -> Mapping[str, Any]:

@@ -81,7 +81,7 @@ class Picture:
     """Both figures and the numbers behind them.
 
     Attributes:
-        behaviour: amplitude against beta; None where the evaluation is of before it was stored.
+        behaviour: amplitude against beta; None where the evaluation has no map of behaviours.
         doses: what each dose is expected to do; None without any.
         behaviour_columns, behaviour_rows, dose_columns, dose_rows: tables.
         lines, thin_lines: behaviours whose line has a name and a colour, and those whose has none.

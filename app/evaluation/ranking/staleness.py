@@ -132,8 +132,7 @@ def _edited(db: Session, sessions: Sequence[StudySession], moment: datetime) -> 
     changed = repository.changed_since(db, moment, wanted)
     moved, readmitted = set(), set()
     for before, after in _pairs(*changed["session"]):
-        # rows of before sessions could be marked as stopped lack that column
-        if any(before[name] != after[name] for name in OF_STEPS) or bool(before.get(STOPPED)) != bool(after.get(STOPPED)):
+        if any(before[name] != after[name] for name in OF_STEPS) or bool(before[STOPPED]) != bool(after[STOPPED]):
             moved.add(int(after["id"]))
         if before["excluded_reason"] and not after["excluded_reason"]:
             readmitted.add(int(after["id"]))

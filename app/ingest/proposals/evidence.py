@@ -50,7 +50,7 @@ class Reason(StrEnum):
     """`recording`; `montages`: how many sets of sensing contacts it went through."""
     CHANNEL = "channel"
     """`stream`, `channel`; `lead` where known; `usable`: its usable steps when it was chosen; `passed`: channels that were not taken, each
-    with `why` and `usable`. Evidence of earlier versions has no `usable`."""
+    with `why` and `usable`."""
     PROGRAM = "program"
     """`program`; `programs`: every one of the control recording, with `number`, `how`, `low`, `high` (mA or fraction)."""
     UNREADABLE = "unreadable"
@@ -59,8 +59,6 @@ class Reason(StrEnum):
     NO_SIDE = "no_side"
     CUT_OUT = "cut_out"
     """`session`: of the proposal that was cut."""
-    SENTENCE = "sentence"
-    """`text`: stored before evidence had a shape."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +79,8 @@ class Evidence:
         return {"source": self.source, "reason": self.reason, "facts": dict(self.facts)}
 
     @classmethod
-    def from_json(cls, stored: Any) -> Evidence:
-        """Evidence as it was stored; a bare sentence is of a time when that was all, and a person's word began with "as stated" then."""
-        if isinstance(stored, str):
-            source = Source.PERSON if stored[:9] == "as stated" else Source.RECORDING
-            return cls(source, Reason.SENTENCE, {"text": stored})
+    def from_json(cls, stored: Mapping[str, Any]) -> Evidence:
+        """Evidence as it was stored."""
         return cls(Source(stored["source"]), Reason(stored["reason"]), stored["facts"])
 
 

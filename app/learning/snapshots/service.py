@@ -77,7 +77,7 @@ class Member:
             table.cdbs_ma if table else None,
             self.left_out,
             _digest(s) if s else None,
-            # absent where not known, so that sessions without a dose keep the pins of before hours were pinned
+            # absent where not known, so that sessions without a dose have no such pin
             *([] if hours is None else [hours]),
         ]
 

@@ -86,9 +86,8 @@ def _judge(job: JobContext, params: NextGenerationParams, planned: dict[str, Any
 
 
 def judging_call(params: NextGenerationParams, planned: dict[str, Any]) -> dict[str, Any]:
-    """Params by which `evaluate_method` judges the tested policies; a plan that an earlier version made has `tests` of these alone."""
-    others = planned.get("others")
-    known = {"tests": planned["tests"]} if "tests" in planned else planned["tested_so_far"]
+    """Params by which `evaluate_method` judges the tested policies."""
+    others, known = planned["others"], planned["tested_so_far"]
     judged = {p["id"] for p in planned["tested"]}
     return {
         "snapshot_sha256": planned["snapshot"]["sha256"],
@@ -99,5 +98,5 @@ def judging_call(params: NextGenerationParams, planned: dict[str, Any]) -> dict[
         "policies": [{"id": p["id"], "sha256": p["sha256"]} for p in planned["tested"]],
         "tests": known["tests"],
         # what cannot be a parent, as a retired policy, informs those that can
-        "tested": [p for p in known.get("policies", []) if p["id"] not in judged],
+        "tested": [p for p in known["policies"] if p["id"] not in judged],
     } | ({"others": others["evidence"]} if others else {})

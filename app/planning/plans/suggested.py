@@ -74,7 +74,7 @@ def _portfolio(found: Assessment, slots: int) -> tuple[Suggested, ...]:
             policies[str(row.one.policy.id)] = row.one.policy
             if any(own.one.tested is not None for own in (row, *row.twins)):
                 tested.add(str(row.one.policy.id))
-    # of one session; evaluations of before do not say it
+    # of one session
     noise = float(found.cdbs.posterior.details.get("return_noise") or 0.0)
     for number in range(slots, 0, -1):
         # a day of fewer policies has fewer cDBS sessions, and each policy is held against their mean

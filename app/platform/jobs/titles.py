@@ -1,4 +1,4 @@
-"""What a step is called where anybody reads it: its title and messages without names of methods, also those that earlier versions stored.
+"""What a step is called where anybody reads it: its title and messages without names of methods.
 
 The stored title names the method, for engineers: their folds and the interface give it as it is.
 """

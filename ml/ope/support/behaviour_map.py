@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -45,16 +45,16 @@ class BehaviourMap:
         tried: recorded steps by column and row of amplitude, [COLUMNS][DOSES]; row i holds the fractions from i / DOSES on.
         policies: by name.
         apart: mean absolute difference of the amplitudes of two policies over the recorded windows, fraction of cDBS, each pair once, under
-            the name that comes first; empty in a map of before it was stored.
+            the name that comes first.
     """
 
     edges: tuple[float, ...]
     tried: tuple[tuple[int, ...], ...]
     policies: dict[str, Curve]
-    apart: dict[str, dict[str, float]] = field(default_factory=dict)
+    apart: dict[str, dict[str, float]]
 
     def distance(self, one: str, other: str) -> float | None:
-        """How far two policies are apart, fraction of cDBS, as `apart` has it; None where it was not stored."""
+        """How far two policies are apart, fraction of cDBS, as `apart` has it; None where one of them is not in the map."""
         found = self.apart.get(one, {}).get(other)
         return found if found is not None else self.apart.get(other, {}).get(one)
 
@@ -67,7 +67,7 @@ class BehaviourMap:
         """A stored map."""
         curves = {name: Curve(*(tuple(c[member]) for member in ("middle", "low", "high"))) for name, c in stored["policies"].items()}
         tried = tuple(tuple(column) for column in stored["tried"])
-        return cls(tuple(stored["edges"]), tried, curves, {name: dict(to) for name, to in stored.get("apart", {}).items()})
+        return cls(tuple(stored["edges"]), tried, curves, {name: dict(to) for name, to in stored["apart"].items()})
 
 
 def behaviour_map(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> BehaviourMap:

@@ -264,9 +264,3 @@ def test_tries_that_count_no_more_are_removed(db: Session, ada: str) -> None:
     with pytest.raises(Unauthorized):
         service.sign_in(db, ada, "wrong password")
     assert db.execute(text("select email from sign_in_attempt")).scalars().all() == [ada]
-
-
-def test_a_user_of_an_earlier_version_still_signs_in(db: Session, ada: str) -> None:
-    db.execute(text("update app_user set email = 'stra\u00dfe@clinic.example'"))
-    db.commit()
-    assert service.sign_in(db, "Stra\u00dfe@clinic.example", PASSWORD)

@@ -56,7 +56,7 @@ def test_every_step_of_a_training_knows_what_tested_sessions_showed_and_gains_mo
     assert told["value"] < blind["value"]
     assert told["standard_error"] < blind["standard_error"]
     before = stored_gains(buffer, like_it, None, known_tests(None, buffer))["0"]
-    assert before == blind, "a job that an earlier version began"
+    assert before == blind, "without tests"
 
 
 def retire(client: TestClient, policy_id: int) -> None:

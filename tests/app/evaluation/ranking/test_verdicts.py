@@ -347,7 +347,7 @@ def test_the_fold_tells_statistical_error_from_what_structures_get_wrong(client:
     page = client.get(PAGE).text
     (table,) = [part for part in page.split("<table")[1:] if "<caption>Standard errors of the posterior" in part]
     numbers = re.findall(r'<td class="num">([^<]*)</td>', table.split("</table>")[0])
-    assert numbers == ["1.23", "4.56"], "the other estimate is of an earlier version"
+    assert numbers == ["1.23", "4.56"], "the other estimate has none"
     assert "4.56" not in above_fold(page)
 
 

@@ -114,11 +114,5 @@ def test_a_persons_word_is_told_from_a_guess_by_its_source_and_not_by_its_senten
     assert not guess_controller([side(steps([0, 0]))])[1].stated
 
 
-@pytest.mark.parametrize(("sentence", "stated"), [("as stated by a@clinic.example", True), ("the file states no amplitude", False)])
-def test_evidence_stored_as_a_sentence_is_still_read(sentence: str, stated: bool) -> None:
-    evidence = Evidence.from_json(sentence)
-    assert (evidence.stated, wording.reason(evidence)) == (stated, sentence)
-
-
 def test_every_reason_has_words() -> None:
     assert set(wording._SENTENCES) | {Reason.STATED} == set(Reason)

@@ -51,7 +51,7 @@ def test_a_draft_says_so_and_holds_everything_that_the_clinic_needs(client: Test
         f"Page 1 of {len(pages)}",
         f"plan {plan['id']}, seed 7, evaluation {studied.evaluation}, snapshot {plan['evaluation']['snapshot_id']}",
         "by admin@clinic.example",
-        "Verdict cannot tell: evaluated by an earlier betaloop: evaluate again",
+        "Verdict cannot tell: without the chances of every outcome: evaluate again",
         "100 % under cDBS",
         "! The recordings say too little of what policy 'rl-02-small' does",
     ):
