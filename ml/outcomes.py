@@ -19,7 +19,7 @@ class Margin:
     Attributes:
         field: its name in tables, forms and the interface. kind: a share of the value under cDBS, or points of the outcome's scale.
         default: ours, no clinical standard. least, most: bounds of the form. unit: of the margin, for the bounds' message.
-        label, help, form_unit: of the form. description: of the interface. exported: of the data package.
+        label, help, form_unit: of the form. description: of the interface and the data package.
     """
 
     field: str
@@ -32,7 +32,6 @@ class Margin:
     help: str
     form_unit: str
     description: str
-    exported: str
 
     def __post_init__(self) -> None:
         self.check(self.default)
@@ -259,7 +258,6 @@ OUTCOMES: tuple[Outcome, ...] = (
             help="Share of the grasp frequency under cDBS, 0.1 being 10 %.",
             form_unit="of cDBS",
             description="Grasp may be slower by this share of the frequency under cDBS.",
-            exported="Grasp may be slower by this share of the frequency under cDBS.",
         ),
         failure=None,
         end=EndWeight(
@@ -310,7 +308,6 @@ OUTCOMES: tuple[Outcome, ...] = (
             help="On the participant's scale of 1 to 10.",
             form_unit="points",
             description="The rating may be lower by this many points.",
-            exported="The rating may be lower by this.",
         ),
         failure=1.0,
         end=EndWeight(
@@ -362,7 +359,6 @@ OUTCOMES: tuple[Outcome, ...] = (
             help="Of the time: 10 allows 30 % where cDBS has 20 %.",
             form_unit="% points",
             description="Tremor may take up this many more percentage points of the time.",
-            exported="Tremor may take up this many more percentage points.",
         ),
         failure=100.0,
         end=EndWeight(

@@ -15,9 +15,8 @@ from app.platform.database import ONE_STANDING, Base
 from app.study.characteristics.models import CharacteristicsVersion
 from app.study.doses.models import Dose
 from app.study.margins.models import MarginsLock, MarginsVersion
-from app.study.outcome_fields import add_value_columns, value_checks
+from app.study.outcome_fields import HasOutcomes, add_value_columns, value_checks
 from app.study.sessions.models import Activity, SessionConditions
-from ml.outcomes import Outcome
 
 
 class Controller(StrEnum):
@@ -377,7 +376,7 @@ class Trace(Base):
     recording: Mapped[Recording] = relationship(back_populates="traces")
 
 
-class QocRevision(Base):
+class QocRevision(HasOutcomes, Base):
     """End-of-session QoCs of a session, a column per outcome; a correction is a new revision."""
 
     __tablename__ = "qoc"
@@ -395,11 +394,6 @@ class QocRevision(Base):
     """Names of the QoCs that stand in this revision as they were derived from uploaded files, not as a person typed them."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     session: Mapped[StudySession] = relationship(back_populates="qocs")
-
-    def value(self, outcome: Outcome) -> float | None:
-        """Return the value of an outcome; None where not measured."""
-        found: float | None = getattr(self, outcome.field)
-        return found
 
 
 add_value_columns(QocRevision)

@@ -33,6 +33,15 @@ def margin_check() -> CheckConstraint:
     return CheckConstraint(" and ".join(bounds), name="margins")
 
 
+class HasOutcomes:
+    """A row with a column per outcome."""
+
+    def value(self, outcome: Outcome) -> float | None:
+        """Return the value of an outcome; None where not measured."""
+        found: float | None = getattr(self, outcome.field)
+        return found
+
+
 def add_value_columns(table: type[Base]) -> None:
     """Add a column per outcome to a table, null where not measured."""
     for o in OUTCOMES:

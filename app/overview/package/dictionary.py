@@ -38,7 +38,7 @@ class Days:
 
 _INDENT = "\n        "
 _VALUES = _INDENT.join(f"{o.column} {'integer' if o.whole else 'number'} {o.exported}" for o in OUTCOMES)
-_MARGINS = _INDENT.join(f"{o.margin.field} number {o.margin.exported}" for o in OUTCOMES)
+_MARGINS = _INDENT.join(f"{o.margin.field} number {o.margin.description}" for o in OUTCOMES)
 
 TITLES = {
     "sessions": "one row per confirmed session",

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_a_new_outcome_goes_from_the_entry_form_to_the_primary_analysis(make_token: Callable[[str], str]) -> None:
-    command = [sys.executable, "-m", "tests.app.new_outcome", make_token("admin")]
+    command = [sys.executable, "-m", "tests.app.analysis.new_outcome", make_token("admin")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stderr[-4000:]
     seen = json.loads(done.stdout)

@@ -27,7 +27,6 @@ RECORD = """    Outcome(
         margin=Margin(
             field="balance_points", kind="points", default=4.0, least=0.5, most=20, unit="points", label="Balance lower by",
             help="On the scale of 0 to 56.", form_unit="points", description="Balance may be lower by this many points.",
-            exported="Balance may be lower by this.",
         ),
     ),
 """
