@@ -31,9 +31,10 @@ from benchmarks.support.ope_cases import CDBS, DESIGNS, STEPS, Case, virtual_cas
 from ml.ope.compare.metrics import spearman
 from ml.ope.posterior.estimator import build
 from ml.ope.posterior.verdict import Levels, verdict
+from ml.outcomes import PREDICTED
 from ml.population.virtual import WORLDS_PER_PART, DataDesign, World, world
 from ml.population.virtual.sessions import Days
-from ml.population.virtual.world import GRASP_SHARE, RATING_POINTS, TREMOR_POINTS, VISITS, visit_plan
+from ml.population.virtual.world import MARGINS, VISITS, visit_plan
 from ml.qoc import Margins, Qoc
 from ml.trajectories import ReplayBuffer
 
@@ -58,10 +59,7 @@ def worth_a_test(case: Case, name: str) -> bool:
     """Whether a candidate is truly within the margins and saves energy."""
     own, cdbs = case.truth["policies"][name], case.truth["policies"][CDBS]
     return bool(
-        own["grasp_hz"][0] >= (1 - GRASP_SHARE) * cdbs["grasp_hz"][0]
-        and own["rating"][0] >= cdbs["rating"][0] - RATING_POINTS
-        and own["tremor_percent"][0] <= cdbs["tremor_percent"][0] + TREMOR_POINTS
-        and own["energy"][0] < cdbs["energy"][0]
+        all(o.slack(own[o.field][0], cdbs[o.field][0], MARGINS.of(o)) >= 0 for o, _ in PREDICTED) and own["energy"][0] < cdbs["energy"][0]
     )
 
 

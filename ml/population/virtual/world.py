@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from ml.designs import DesignSettings, lay_out
 from ml.mdp import MdpSettings, step_reward
+from ml.outcomes import PREDICTED
 from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.population.virtual.candidates import draw_candidates
 from ml.population.virtual.patient import MECHANISMS, Patient, draw_patient
 from ml.population.virtual.sessions import Days, Sessions, new_days, simulate, visit_days
 from ml.population.virtual.traits import TRAITS, with_trait
-from ml.qoc import Qoc
+from ml.qoc import Margins, Qoc
 from ml.trajectories import Hold, ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
@@ -45,8 +46,8 @@ WITHOUT_END: Final = 0.25
 STEPS, NO_DBS_STEPS, PAUSE_H = 300, 150, 10 / 60
 VISITS, RANDOM_SESSIONS = 3, 4
 
-GRASP_SHARE, RATING_POINTS, TREMOR_POINTS, ENERGY_SAVED = 0.10, 1.0, 10.0, 0.20
-"""Margins of a responder against cDBS: grasp slower by a share, rating lower, tremor higher (percentage points); energy saved."""
+MARGINS, ENERGY_SAVED = Margins(), 0.20
+"""Margins of a responder against cDBS, and the share of energy that it saves."""
 
 _DATA, _DATA_DAYS, _CALIBRATION = 1 << 40, 1 << 41, 1 << 42
 """First session numbers of what is not truth on new days."""
@@ -278,12 +279,8 @@ def end_rewards(settings: MdpSettings, grasp_hz: Floats, rating: Floats, tremor_
 
 
 def within_margins(policy: Truth, cdbs: Truth) -> bool:
-    """Whether all three QoCs are truly no worse than under cDBS by more than the margins."""
-    return (
-        policy.grasp_hz.value >= (1 - GRASP_SHARE) * cdbs.grasp_hz.value
-        and policy.rating.value >= cdbs.rating.value - RATING_POINTS
-        and policy.tremor_percent.value <= cdbs.tremor_percent.value + TREMOR_POINTS
-    )
+    """Whether no predicted outcome is truly worse than under cDBS by more than its margin."""
+    return all(o.slack(getattr(policy, o.field).value, getattr(cdbs, o.field).value, MARGINS.of(o)) >= 0 for o, _ in PREDICTED)
 
 
 def simple_policies(settings: MdpSettings, spread: float) -> dict[str, Policy]:
