@@ -1,7 +1,8 @@
-"""Outcomes of a session: one record each, and nothing about an outcome is written down elsewhere.
+"""Outcomes of a session, one record each.
 
-Forms, tables, charts, statistics, export and the interface loop over `OUTCOMES`. A new outcome is a record here and a column for its values
-and its margin (a migration). Source: Gao et al. 2023, section 3.
+Forms, tables, charts, statistics, export and the interface loop over `OUTCOMES`. A new outcome is a record here and columns for its values
+and its margin (a migration). The priors of the outcome model stay in `ml/ope/outcomes/regressions.py`, and what is read from files with
+its readers. Source: Gao et al. 2023, section 3.
 """
 
 from __future__ import annotations
