@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, create_model
-from sqlalchemy import CheckConstraint, Float, SmallInteger
+from sqlalchemy import CheckConstraint, Double, SmallInteger
 from sqlalchemy.orm import mapped_column
 
 from app.platform.database import Base
@@ -45,13 +45,13 @@ class HasOutcomes:
 def add_value_columns(table: type[Base]) -> None:
     """Add a column per outcome to a table, null where not measured."""
     for o in OUTCOMES:
-        setattr(table, o.field, mapped_column(SmallInteger if o.whole else Float, nullable=True))
+        setattr(table, o.field, mapped_column(SmallInteger if o.whole else Double, nullable=True))
 
 
 def add_margin_columns(table: type[Base]) -> None:
     """Add a column per margin to a table."""
     for o in OUTCOMES:
-        setattr(table, o.margin.field, mapped_column(Float, nullable=False))
+        setattr(table, o.margin.field, mapped_column(Double, nullable=False))
 
 
 def fields_model(name: str, field_of: Callable[[Outcome], Mapping[str, Any]], base: type[Model] = Model) -> type[Model]:
