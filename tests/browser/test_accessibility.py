@@ -75,7 +75,7 @@ SHEET = 703
 def test_on_paper_nothing_runs_past_its_card(window: Callable, studied: list[int], monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[type-arg]
     monkeypatch.setattr(get_settings(), "development", True)
     watched = window(SHEET, 900, "light")
-    watched.sign_in()
+    watched.signed_in()
     watched.page.emulate_media(media="print")
     found: list[str] = []
     for name, path in PAGES.items():
@@ -86,7 +86,7 @@ def test_on_paper_nothing_runs_past_its_card(window: Callable, studied: list[int
 
 def test_on_paper_settings_and_margins_have_their_values(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
     watched = window(SHEET, 900, "light")
-    watched.sign_in()
+    watched.signed_in()
     watched.page.emulate_media(media="print")
     for page, field in (("settings", "cdbs_amplitude_ma"), ("margins", "rating_points")):
         watched.open(f"/participants/P1/{page}")
@@ -114,7 +114,7 @@ def test_no_page_breaks_a_rule_of_accessibility_or_moves(
 
 def test_the_first_tick_of_a_ranking_is_fifteen_tabs_away_at_most(ranked: dict[str, int], window: Callable) -> None:  # type: ignore[type-arg]
     watched = window(1280, 900, "light")
-    watched.sign_in()
+    watched.signed_in()
     watched.open(RANKED["evaluate/ranking"])
     keys = 0
     while not watched.page.evaluate("() => document.activeElement.matches('input[name=policy_ids]')"):
@@ -170,7 +170,7 @@ def looked_at(watched: Any, addresses: dict[str, str], for_the_tour: bool = Fals
     """What axe-core and the eye for shifts find on pages; pictures of them where they are asked for."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     pictures = os.environ.get("BETALOOP_TOUR") if for_the_tour else None
-    watched.sign_in()
+    watched.signed_in()
     found: list[str] = []
     for name, path in addresses.items():
         watched.open(path)

@@ -30,7 +30,7 @@ def sampled(client: TestClient, enrolled: str) -> int:
 def test_the_home_page_gets_the_energy_saved_once_it_stands(window: Callable, enrolled: str, db: Session) -> None:  # type: ignore[type-arg]
     adder(db, enrolled)("rl", fraction=0.5)
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open("/")
     expect(watched.page.locator("#energy-saved[data-late=here] dd b").first).to_have_text("75")
     expect(watched.page.locator("#energy-saved a", has_text="Show what")).to_have_count(0)
@@ -40,7 +40,7 @@ def test_the_home_page_gets_the_energy_saved_once_it_stands(window: Callable, en
 def test_a_dot_of_the_months_and_a_row_of_their_table_open_the_session(window: Callable, enrolled: str, db: Session) -> None:  # type: ignore[type-arg]
     session = adder(db, enrolled)("cdbs", grasp=2.0)
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open("/participants/P1")
     watched.charts_drawn()
     first = watched.page.locator("#story .scatterlayer .point").first
@@ -64,7 +64,7 @@ def test_a_dot_of_the_months_and_a_row_of_their_table_open_the_session(window: C
 
 def test_raw_samples_are_drawn_and_every_chart_of_the_session_follows_a_zoom(window: Callable, sampled: int) -> None:  # type: ignore[type-arg]
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/sessions/{sampled}")
     watched.page.locator("#signal").scroll_into_view_if_needed()
     watched.page.wait_for_selector("#signal[data-drawn=yes] .scatterlayer path.js-line")

@@ -27,7 +27,7 @@ OTHER = "second@clinic.example"
 def tab(window: Callable[..., Watched], studied: list[int]) -> Watched:
     """A tab in which the administrator has signed in."""
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     return watched
 
 

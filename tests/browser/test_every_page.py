@@ -73,7 +73,7 @@ def test_the_tour_shows_every_page(window: Callable, world: World) -> None:  # t
         if pictures:
             tour.take(watched.page, pictures, tour.PAGES[route])
         if route == "/sign-in":
-            watched.sign_in(password=PASSWORD)
+            watched.signed_in(password=PASSWORD)
     session = world.upload("tour.csv", tour.samples(), visit="2", controller="other")["sessions"][0]["id"]
     for name, card in tour.PARTS.items():
         watched.open(f"/sessions/{session}")
@@ -90,7 +90,7 @@ def test_the_tour_shows_every_page(window: Callable, world: World) -> None:  # t
 @WINDOWS
 def test_every_page_keeps_to_every_rule_and_to_its_place(window: Callable, world: World, axe: Any, width: int, scheme: str) -> None:  # type: ignore[type-arg]
     watched = window(width, 900, scheme)
-    watched.sign_in(password=PASSWORD)
+    watched.signed_in(password=PASSWORD)
     reader = TestClient(world.app, headers={"Accept": "text/html"}, follow_redirects=False)
     reader.post("/sign-in", data={"email": "admin@clinic.example", "password": PASSWORD})
     found, seen = [], 0
@@ -127,7 +127,7 @@ def test_on_paper_no_page_has_anything_cut_off(window: Callable[..., Watched], w
         charts += len(watched.page.query_selector_all("figure[data-drawn=yes]"))
         if name == "/sign-in":
             watched.page.emulate_media(media="screen")
-            watched.sign_in(password=PASSWORD)
+            watched.signed_in(password=PASSWORD)
             watched.page.emulate_media(media="print")
     assert "\n".join(found) == ""
     assert charts >= 20
@@ -143,7 +143,7 @@ def test_pages_of_a_sealed_plan_keep_to_every_rule_and_name_no_controller(
     stated = {"participant": "P2", "visit": str(number), "controller": "cdbs"}
     session = world.send("/uploads", data=stated, files={"file": ("s.csv", TABLE.replace(b"8,1,1", b"8,1.3,1", 1))})["sessions"][0]["id"]
     watched = window(width, 900, scheme)
-    watched.sign_in(password=PASSWORD)
+    watched.signed_in(password=PASSWORD)
     found = []
     for name, path in (("visit", f"/visits/{visit}"), ("plan", f"/visits/{visit}/plan"), ("session", f"/sessions/{session}")):
         watched.open(path)

@@ -38,7 +38,7 @@ def test_from_sign_in_to_a_participants_charts(window: Callable, studied: list[i
 
 def test_a_slash_leads_to_the_search_unless_somebody_types(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open("/participants/P1/visits/new")
     watched.page.focus("[name=note]")
     watched.page.keyboard.press("/")
@@ -63,7 +63,7 @@ def test_the_time_left_of_a_job_moves_with_its_bar(window: Callable, enrolled: s
     db.add(job)
     db.commit()
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/jobs/{job.id}")
     left, bar = watched.page.locator("[data-time-left]"), watched.page.locator("[data-step=job]")
     expect(left).to_have_text("about 10 min left")
@@ -78,7 +78,7 @@ def test_the_time_left_of_a_job_moves_with_its_bar(window: Callable, enrolled: s
 
 def test_no_chart_offers_to_send_data_elsewhere(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/sessions/{studied[0]}")
     assert watched.charts_drawn() >= 1
     titles = [b.get_attribute("data-title") or "" for b in watched.page.query_selector_all(".modebar-btn")]
@@ -102,7 +102,7 @@ BUTTONS_OVER = """() => [...document.querySelectorAll("figure[data-drawn=yes]")]
 def test_the_buttons_of_a_chart_cover_neither_its_data_nor_on_a_tablet_its_title(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
     for width in (768, 1280):
         watched = window(width, 1024)
-        watched.sign_in()
+        watched.signed_in()
         for path in (f"/sessions/{studied[0]}", "/participants/P1", "/participants/P1/analyses/paper"):
             watched.open(path)
             assert watched.charts_drawn() >= 1
@@ -112,7 +112,7 @@ def test_the_buttons_of_a_chart_cover_neither_its_data_nor_on_a_tablet_its_title
 
 def test_the_session_chart_breaks_its_line_at_missing_beta(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/sessions/{studied[0]}")
     watched.charts_drawn()
     first = watched.page.query_selector("#control .scatterlayer .trace")
@@ -124,7 +124,7 @@ def test_the_session_chart_breaks_its_line_at_missing_beta(window: Callable, stu
 
 def test_the_theme_is_chosen_kept_and_redraws_the_charts(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
     watched = window(scheme="light")
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/sessions/{studied[0]}")
     watched.charts_drawn()
     light = watched.page.evaluate(COLOURS)
@@ -137,7 +137,7 @@ def test_the_theme_is_chosen_kept_and_redraws_the_charts(window: Callable, studi
 def test_paper_takes_every_chart_in_the_light_colours(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
     """Also charts that nobody scrolled to, and from a page in the dark theme."""
     watched = window(1280, 400, "dark")
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/sessions/{studied[0]}")
     charts = len(watched.page.query_selector_all("figure[data-chart]"))
     watched.page.wait_for_function("() => window.Plotly")
@@ -150,22 +150,23 @@ def test_paper_takes_every_chart_in_the_light_colours(window: Callable, studied:
     assert watched.errors == []
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_targets_are_large_enough_for_a_finger_on_a_tablet(window: Callable, studied: list[int], scheme: str) -> None:  # type: ignore[type-arg]
-    watched = window(820, 1180, scheme)
-    watched.sign_in()
+def test_targets_are_large_enough_for_a_finger_on_a_tablet(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+    watched = window(820, 1180)
+    watched.signed_in()
     paths = ["/", "/participants/P1", "/participants/P1/visits", "/visits/1", f"/sessions/{studied[0]}", "/participants/P1/settings"]
     for path in [*paths, "/participants/P1/upload", "/participants/new", "/account", "/accounts"]:
         watched.open(path)
-        assert watched.page.evaluate(SMALL_TARGETS) == [], path
-        wide = watched.page.evaluate("() => document.documentElement.scrollWidth - document.documentElement.clientWidth")
-        assert wide <= 0, f"{path} is {wide} px wider than the tablet"
+        for scheme in ("light", "dark"):
+            watched.page.emulate_media(color_scheme=scheme)
+            assert watched.page.evaluate(SMALL_TARGETS) == [], (path, scheme)
+            wide = watched.page.evaluate("() => document.documentElement.scrollWidth - document.documentElement.clientWidth")
+            assert wide <= 0, f"{path} is {wide} px wider than the tablet in the {scheme} theme"
     assert watched.errors == []
 
 
 def test_files_dropped_on_the_upload_page_become_sessions(window: Callable, enrolled: str, client: TestClient, table: bytes) -> None:  # type: ignore[type-arg]
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/participants/{enrolled}/upload?visit=1")
     watched.page.select_option("[name=controller]", "cdbs")
     files = [["good.csv", table.decode()], ["bad <b>.csv", "a,b\n1,2\n"], ["again.csv", table.decode()]]
@@ -193,7 +194,7 @@ def test_a_refused_upload_says_so_at_the_field_and_keeps_the_files(
     window: Callable, enrolled: str, client: TestClient, table: bytes
 ) -> None:  # type: ignore[type-arg]
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/participants/{enrolled}/upload?visit=1")
     page = watched.page
     page.select_option("[name=controller]", "rl")
@@ -225,7 +226,7 @@ def test_a_refused_upload_says_so_at_the_field_and_keeps_the_files(
 
 def test_a_table_alone_whose_columns_nobody_knows_leads_to_its_mapping(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
     watched = window(768, 1024)
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/participants/{enrolled}/upload?visit=1")
     rows = "".join(f"{2 * k};{1 + k % 5};2.0\n" for k in range(1, 12)).encode()
     watched.page.set_input_files("input[type=file]", {"name": "t.csv", "mimeType": "text/csv", "buffer": b"Zeit;Signal;Strom\n" + rows})
@@ -236,7 +237,7 @@ def test_a_table_alone_whose_columns_nobody_knows_leads_to_its_mapping(window: C
 
 def test_tables_of_unknown_columns_alone_lead_to_their_mappings_and_each_says_what_is_wrong(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/participants/{enrolled}/upload?visit=1")
     transfer = watched.page.evaluate_handle(
         "() => { const t = new DataTransfer(); for (const [n, x] of [['one.csv', 'a,b\\n1,2\\n3,4\\n'], ['two.csv', 'c,d\\n1,2\\n3,4\\n']])"
@@ -255,7 +256,7 @@ def test_tables_of_unknown_columns_alone_lead_to_their_mappings_and_each_says_wh
 
 def test_what_cannot_be_taken_back_asks_first(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open("/account")
     watched.page.fill("[name=name]", "a tablet")
     watched.page.click("text=Make token")
@@ -274,7 +275,7 @@ def test_what_cannot_be_taken_back_asks_first(window: Callable, enrolled: str) -
 def test_tables_sort_numbers_as_numbers_with_missing_ones_last(window: Callable, studied: list[int], client: TestClient) -> None:  # type: ignore[type-arg]
     client.put(f"/api/v1/sessions/{studied[1]}/qoc", json={"grasp_hz": None, "reason": "taken back"})
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     watched.open("/visits/1")
     grasp = watched.page.locator("table.data tbody td:nth-child(8)")
     expect(grasp).to_have_text(["2.00", "—", "4.00"])

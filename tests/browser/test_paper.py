@@ -25,7 +25,7 @@ UNCUT = "() => [...document.querySelectorAll('.file > summary > .line')].every((
 def printed(window: Callable[..., Watched]) -> Watched:
     """A window as wide as a sheet, signed in, with the styles of paper."""
     watched = window(SHEET, 900, "light")
-    watched.sign_in()
+    watched.signed_in()
     watched.page.emulate_media(media="print")
     return watched
 

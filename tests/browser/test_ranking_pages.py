@@ -52,7 +52,7 @@ def undecided(policies: list[int], judge: Judge) -> None:
 
 def answered(watched: Any) -> str:
     """The answer's words, all of which are on the first screen."""
-    watched.sign_in()
+    watched.signed_in()
     watched.open("/participants/P1/ranking")
     answer = watched.page.locator("#answer")
     box = answer.bounding_box()
@@ -85,7 +85,7 @@ def test_where_nothing_is_worth_a_visit_the_first_screen_says_what_to_do_instead
 
 def test_a_comparison_is_moved_along_its_session(window: Callable, policies: list[int], studied: list[int]) -> None:  # type: ignore[type-arg]
     watched = window(1280, SCREEN)
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/participants/P1/compare?session={studied[0]}&policy={policies[0]}&policy={policies[5]}")
     page = watched.page
     slider, time, cells = page.locator("#f-at"), page.locator("[data-scrub-time]"), page.locator("[data-scrub-cell]")

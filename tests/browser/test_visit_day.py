@@ -28,7 +28,7 @@ SCREENS = ((768, 1024), (1024, 768), (1280, 900))
 
 def test_a_cut_network_and_a_reload_without_it_lose_nothing(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     watched = window(768, 1024)
-    watched.sign_in()
+    watched.signed_in()
     open_day(watched, clinic_day)
     worker_ready(watched)
     tap(watched, "start")
@@ -59,7 +59,7 @@ def test_a_dose_takes_two_taps_without_network_too(window: Callable[..., Watched
     body = {"version": 0, "characteristics": schedule, "reason": "asked"}
     assert clinic_day.client.put("/api/v1/participants/P1/characteristics", json=body).status_code == 200
     watched = window(768, 1024)
-    watched.sign_in()
+    watched.signed_in()
     open_day(watched, clinic_day)
     watched.page.context.set_offline(True)
     tap(watched, "dose")
@@ -86,7 +86,7 @@ def test_a_killed_browser_sends_what_it_held_when_it_comes_back(chromium: Any, a
     profile = str(tmp_path / "profile")
     context = chromium.browser_type.launch_persistent_context(profile, executable_path=program(), args=FLAGS)
     watched = Watched(context.new_page(), address)
-    watched.sign_in()
+    watched.signed_in()
     open_day(watched, clinic_day)
     worker_ready(watched)
     context.set_offline(True)
@@ -108,7 +108,7 @@ def test_a_killed_browser_sends_what_it_held_when_it_comes_back(chromium: Any, a
 
 def test_what_waits_is_encrypted_and_gone_once_acknowledged(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     watched = window(768, 1024)
-    watched.sign_in()
+    watched.signed_in()
     open_day(watched, clinic_day)
     watched.page.context.set_offline(True)
     tap(watched, "start")
@@ -128,7 +128,7 @@ def test_what_waits_is_encrypted_and_gone_once_acknowledged(window: Callable[...
 
 def test_an_expired_sign_in_loses_nothing_and_nobody_else_can_read_it(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     watched = window(768, 1024)
-    watched.sign_in()
+    watched.signed_in()
     open_day(watched, clinic_day)
     with transaction("test") as db:
         db.execute(text("update sign_in set ended_at = now()"))
@@ -156,7 +156,7 @@ def test_an_expired_sign_in_loses_nothing_and_nobody_else_can_read_it(window: Ca
 def test_two_tablets_that_say_different_things_ask_which_one_counts(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     one, other = window(768, 1024), window(768, 1024)
     for watched in (one, other):
-        watched.sign_in()
+        watched.signed_in()
         open_day(watched, clinic_day)
     tap(one, "start")
     wait_for(one, 0)
@@ -178,7 +178,7 @@ def test_two_tablets_that_say_different_things_ask_which_one_counts(window: Call
 
 def test_a_severe_side_effect_tells_to_return_to_clinical_settings(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     watched = window(768, 1024)
-    watched.sign_in()
+    watched.signed_in()
     open_day(watched, clinic_day)
     tap(watched, "start")
     tap(watched, "dyskinesia-severe")
@@ -201,7 +201,7 @@ def test_a_severe_side_effect_tells_to_return_to_clinical_settings(window: Calla
 
 def test_a_tap_is_not_lost_when_something_arrives_under_the_finger(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     watched = window(768, 1024)
-    watched.sign_in()
+    watched.signed_in()
     open_day(watched, clinic_day)
     tap(watched, "start")
     wait_until_stored(watched, clinic_day, 1)
@@ -221,7 +221,7 @@ def test_grasps_are_counted_for_ten_seconds(window: Callable[..., Watched], clin
     watched = window(768, 1024)
     clock = watched.page.clock
     clock.install()
-    watched.sign_in()
+    watched.signed_in()
     open_day(watched, clinic_day)
     tap(watched, "start")
     tap(watched, "count")
@@ -245,7 +245,7 @@ def test_grasps_are_counted_for_ten_seconds(window: Callable[..., Watched], clin
 
 def test_a_note_is_screened_before_it_is_kept(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     watched = window(768, 1024)
-    watched.sign_in()
+    watched.signed_in()
     open_day(watched, clinic_day)
     tap(watched, "start")
     tap(watched, "note")
@@ -262,16 +262,20 @@ def test_a_note_is_screened_before_it_is_kept(window: Callable[..., Watched], cl
     assert stored(clinic_day) == ["start", "note"]
 
 
-@pytest.mark.parametrize(("width", "height"), SCREENS)
-def test_it_can_be_touched_and_read_on_every_screen(window: Callable[..., Watched], clinic_day: ClinicDay, width: int, height: int) -> None:
+def test_it_can_be_touched_and_read_on_every_screen(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     for scheme, acts in (("light", ("start", "stop", "speech-severe")), ("dark", ())):
-        watched = window(width, height, scheme)
-        watched.sign_in()
+        watched = window(*SCREENS[0], scheme)
+        watched.signed_in()
         open_day(watched, clinic_day)
         for act in ("", *acts, "note", "count", "type"):
             if act:
+                for width, height in SCREENS:
+                    watched.page.set_viewport_size({"width": width, "height": height})
+                    watched.page.click(f"[data-act='{act}']", trial=True)  # it could be touched there
                 tap(watched, act)
-            assert once_drawn(watched) == [], (scheme, act)
+            for width, height in SCREENS:
+                watched.page.set_viewport_size({"width": width, "height": height})
+                assert once_drawn(watched) == [], (width, height, scheme, act)
             if act in ("note", "count", "type"):
                 watched.page.keyboard.press("Escape")
         wait_for(watched, 0)
@@ -281,7 +285,7 @@ def test_it_can_be_touched_and_read_on_every_screen(window: Callable[..., Watche
 def test_the_plain_form_does_it_without_scripts(chromium: Any, address: str, clinic_day: ClinicDay) -> None:
     context = chromium.new_context(viewport={"width": 768, "height": 1024}, java_script_enabled=False)
     watched = Watched(context.new_page(), address)
-    watched.sign_in()
+    watched.signed_in()
     watched.open(f"/visit-day/{clinic_day.visit}")
     page = watched.page
 

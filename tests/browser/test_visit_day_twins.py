@@ -36,7 +36,7 @@ KEEPABLE = (
 
 def test_the_tablet_screens_notes_as_the_service_does(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     open_day(watched, clinic_day)
     script = """async ([notes, rules, module]) => {
       const { screen } = await import(module);
@@ -50,7 +50,7 @@ def test_the_tablet_screens_notes_as_the_service_does(window: Callable[..., Watc
 def test_the_tablet_reads_entries_as_the_service_does(window: Callable[..., Watched], clinic_day: ClinicDay) -> None:
     days = [_drawn_day(seed) for seed in range(40)]
     watched = window()
-    watched.sign_in()
+    watched.signed_in()
     open_day(watched, clinic_day)
     script = """async ([days, module]) => {
       const r = await import(module);
