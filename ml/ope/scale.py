@@ -91,11 +91,11 @@ def learn_scale(buffer: ReplayBuffer) -> Scale:
     return Scale(
         log=log,
         beta_mean=float(shown.mean()),
-        beta_std=_positive(float(shown.std())),
+        beta_std=_positive(float(shown.std()), float(np.abs(shown).max())),
         beta_low=float(beta.min()),
         beta_high=float(beta.max()),
         reward_mean=float(rewards.mean()),
-        reward_std=_positive(float(rewards.std())),
+        reward_std=_positive(float(rewards.std()), float(np.abs(rewards).max())),
         outcome_mean=tuple(float(v) for v in mean),
         outcome_std=tuple(float(v) if v > 1e-12 else 0.0 for v in std),
         outcome_seen=tuple(seen),
@@ -115,5 +115,6 @@ def _skewness(values: Floats) -> float:
     return float(np.mean(centred**3)) / spread**3 if spread > 0 else 0.0
 
 
-def _positive(value: float) -> float:
-    return value if value > 1e-12 else 1.0
+def _positive(deviation: float, largest: float) -> float:
+    """A standard deviation; 1 where it is but rounding of values up to the largest."""
+    return deviation if deviation > 1e-12 * largest else 1.0

@@ -5,19 +5,34 @@ averaged over instead of being fixed at its likeliest value, which in a dozen se
 equations and the restricted likelihood as in Searle, Casella and McCulloch 1992, chapters 6 and 7; the prior of a group's standard
 deviation over that of the noise is the half-Cauchy of scale 1 (Gelman 2006; Polson and Scott 2012).
 
-Everything follows from sums over rows (W^T W, W^T y, y^T y), so thousands of rows cost no more than a dozen.
+Everything follows from sums over rows (W^T W, W^T y, y^T y): rows are read once. Columns cost: with q of them a point of the lambdas' grid
+takes q^3 operations and q^2 numbers. Levels of sessions and visits are not among the q: `ml.statistics.nested` eliminates them first, which
+takes q^2 operations per session.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import product
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.statistics.nested import Reduced, SessionSums
+
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+SMALLEST_SQUARES = 1e-12
+"""Sum of squares below which a column is one of zeros. Columns have no unit: indicators, and amplitudes as fractions of cDBS."""
+
+PERFECT = 1e-12
+"""Share of the sum of y^2 that a perfect fit leaves: y may have any unit."""
+
+RIDGE = 1e-10
+"""Penalty of columns that are not shrunk, as a share of the trace of the Gram matrix."""
 
 SMALLEST, LARGEST = 1e-6, 1e3
 """Bounds of every lambda."""
@@ -36,33 +51,56 @@ STEPS = (1.2, 1.5, 2.0, 3.0, 5.0, 8.0)
 a half on average is taken, so that the grid is as wide as what the data leave open."""
 
 
+def live_columns(diagonal: Floats) -> NDArray[np.bool_]:
+    """Columns that are not zero, for their sums of squares [..., q]."""
+    return np.asarray(diagonal > SMALLEST_SQUARES)
+
+
 @dataclass(frozen=True)
 class Sums:
     """What the rows are needed for: gram W^T W [q, q], moment W^T y [q], square y^T y, number of rows."""
 
+    levels: ClassVar[tuple[str, ...]] = ()
+
     gram: Floats
     moment: Floats
     square: float
-    rows: int
+    number: int
 
     @classmethod
     def of(cls, design: Floats, y: Floats) -> Sums:
         """Of a design [n, q] and targets [n]."""
         return cls(design.T @ design, design.T @ y, float(y @ y), len(y))
 
-    @classmethod
-    def pooled(cls, parts: Sequence[Sums]) -> Sums:
-        """Of the rows of all parts together, at least one part."""
-        return cls(
-            np.sum([p.gram for p in parts], axis=0),
-            np.sum([p.moment for p in parts], axis=0),
-            sum(p.square for p in parts),
-            sum(p.rows for p in parts),
-        )
+    @property
+    def diagonal(self) -> Floats:
+        """Sums of squares of the columns, [q]."""
+        return np.diagonal(self.gram)
 
-    def without(self, part: Sums) -> Sums:
-        """Of the rows that are not in a part of them."""
-        return Sums(self.gram - part.gram, self.moment - part.moment, self.square - part.square, self.rows - part.rows)
+    @property
+    def trace(self) -> float:
+        """Of the Gram matrix."""
+        return float(np.trace(self.gram))
+
+    def take(self, columns: Indices) -> Sums:
+        """Of some columns."""
+        return replace(self, gram=self.gram[np.ix_(columns, columns)], moment=self.moment[columns])
+
+    def means(self, at: Reduced, columns: Floats) -> tuple[Floats, ...]:
+        """Levels given the columns' coefficients: there is none."""
+        return ()
+
+    def spread(self, at: Reduced, penalties: Floats, noise: Floats) -> Floats:
+        """L^-T times noise [K, R, q], where L L^T are the equations with penalties [K, q]."""
+        q = penalties.shape[1]
+        lower = np.linalg.cholesky(at.joint[:, :q, :q] + penalties[:, :, None] * np.eye(q))
+        return np.asarray(noise @ np.linalg.inv(lower), dtype=np.float64)
+
+    def reduced(self, ratios: Floats) -> Reduced:
+        """The equations, K times for ratios [K, 0]: there is no level to eliminate."""
+        whole = np.block([[self.gram, self.moment[:, None]], [self.moment, np.full((1, 1), self.square)]])
+        k = len(ratios)
+        return Reduced(np.broadcast_to(whole, (k, *whole.shape)), np.zeros(k), np.zeros((k, 0, len(whole))), ratios, np.zeros((k, 0)))
 
 
 @dataclass(frozen=True)
@@ -70,7 +108,8 @@ class MixedModel:
     """Which columns form which group.
 
     Attributes:
-        columns: q. estimated: columns of each group whose lambda is estimated.
+        columns: q, without those of the levels of `SessionSums`, which follow them: those of the visits, then those of the sessions.
+        estimated: columns of each group whose lambda is estimated; the levels of `SessionSums` are two more groups, the last ones.
         known: lambda of columns that have a stated one (weak priors). Columns in neither are not shrunk.
     """
 
@@ -78,30 +117,28 @@ class MixedModel:
     estimated: Mapping[str, Sequence[int]]
     known: Mapping[int, float]
 
-    def fit(self, sums: Sums) -> MixedFit:
+    def fit(self, sums: Sums | SessionSums) -> MixedFit:
         """Posterior by the restricted likelihood.
 
         Raises:
             ValueError: no row.
         """
-        if sums.rows < 1:
-            raise ValueError("a mixed model needs at least one row")
         problem = _Problem(self, sums)
-        names = list(self.estimated)
-        best = problem.search(len(names))
+        names = [*self.estimated, *sums.levels]
+        best = problem.search()
         # Five values of each lambda, three wider apart where four groups would make too many combinations; from six groups on the two
         # at one standard deviation, which still have its mean and its variance (Gauss and Hermite's rule of two points).
         powers = np.arange(-2.0, 3.0) if len(names) < 4 else np.array([-1.7, 0.0, 1.7]) if len(names) < 6 else np.array([-1.0, 1.0])
         axes = [np.clip(v * step**powers, SMALLEST, LARGEST) for v, step in zip(best, problem.steps(best), strict=True)]
         points = sorted(set(product(*[axis.tolist() for axis in axes])))
         ratios = np.array(points, dtype=np.float64).reshape(len(points), len(names))
-        logs, means, factors, squares = problem.solve(ratios)
+        logs, means, _, squares = problem.solve(ratios)
         weights = np.exp(logs - logs.max())
         # every point stands for a cell of the grid, whose volume in log lambda is the product of its axes' spacings
         cell = float(np.sum([np.log(max(np.log(axis.max() / axis.min()), 1e-9) / max(len(np.unique(axis)) - 1, 1)) for axis in axes]))
         log_evidence = float(logs.max() + np.log(weights.sum()) + cell)
         weights /= weights.sum()
-        return MixedFit(tuple(names), best, ratios, weights, means, factors, squares, problem.degrees, log_evidence)
+        return MixedFit(tuple(names), best, ratios, weights, means, squares, problem.degrees, log_evidence, problem)
 
     def restricted(self, sums: Sums) -> RestrictedFit:
         """Coefficients and their covariance at the lambdas of the largest restricted likelihood, without a prior of them.
@@ -109,54 +146,36 @@ class MixedModel:
         Raises:
             ValueError: no row.
         """
-        if sums.rows < 1:
-            raise ValueError("a mixed model needs at least one row")
         problem = _Problem(self, sums, prior=False)
-        best = problem.refined(problem.search(len(self.estimated)))
+        best = problem.refined(problem.search())
         _, means, factors, squares = problem.solve(best[None])
         variance = float(squares[0]) / problem.degrees
         degrees = problem.satterthwaite(best, variance)
         return RestrictedFit(tuple(self.estimated), best, means[0], variance * factors[0] @ factors[0].T, variance, degrees)
 
-    def likeliest(self, sums: Sums) -> tuple[Floats, Floats]:
-        """The likeliest lambdas [G] and the coefficients [q] there: `fit` without what the data leave open.
+    def likeliest(self, sums: Sums | SessionSums) -> tuple[Floats, Floats]:
+        """The likeliest lambdas [G] and all coefficients there: `fit` without what the data leave open.
 
         Raises:
             ValueError: no row.
         """
-        if sums.rows < 1:
-            raise ValueError("a mixed model needs at least one row")
         problem = _Problem(self, sums)
-        best = problem.search(len(self.estimated))
+        best = problem.search()
         return best, problem.solve(best[None])[1][0]
-
-    def conditional(self, sums: Sums, ratios: Floats) -> Floats:
-        """Coefficients [q] at given lambdas, one per estimated group."""
-        return _Problem(self, sums).solve(ratios[None])[1][0]
-
-    def conditional_draws(self, sums: Sums, ratios: Floats, number: int, rng: np.random.Generator) -> Floats:
-        """Draws [number, q] at given lambdas; columns that no row has are drawn from their prior."""
-        problem = _Problem(self, sums)
-        _, means, factors, squares = problem.solve(ratios[None])
-        sigma = np.sqrt(squares[0] / problem.degrees)
-        drawn = means[0] + sigma * rng.standard_normal((number, self.columns)) @ factors[0].T
-        for ratio, columns in zip(ratios, self.estimated.values(), strict=True):
-            unseen = np.setdiff1d(np.asarray(columns, dtype=np.int64), problem.live)
-            drawn[:, unseen] = sigma * np.sqrt(ratio) * rng.standard_normal((number, unseen.size))
-        return np.asarray(drawn, dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class MixedFit:
-    """Posterior of a mixed model: a mixture over K combinations of lambdas.
+    """Posterior of a mixed model: a mixture over K combinations of lambdas; p coefficients, those of levels among them.
 
     Attributes:
         groups: names of the estimated groups, G. likeliest: their lambdas at the likeliest point, [G].
         ratios: lambdas, [K, G]. weights: posterior weight of each combination, [K].
-        means: coefficients, [K, q]. factors: L with L L^T the covariance over sigma^2, [K, q, q].
+        means: coefficients, [K, p].
         squares: residual sum of squares with its penalty, [K]. degrees: of freedom.
         log_evidence: log of the restricted likelihood averaged over the lambdas' prior, up to a constant that is the same for designs of
             the same rows and the same columns that are not shrunk.
+        problem: the equations, for draws.
     """
 
     groups: tuple[str, ...]
@@ -164,21 +183,23 @@ class MixedFit:
     ratios: Floats
     weights: Floats
     means: Floats
-    factors: Floats
     squares: Floats
     degrees: int
     log_evidence: float
+    problem: _Problem = field(repr=False)
 
     @property
     def coefficients(self) -> Floats:
-        """Posterior mean, [q]."""
+        """Posterior mean, [p]."""
         return np.asarray(self.weights @ self.means, dtype=np.float64)
 
     @property
     def covariance(self) -> Floats:
-        """Posterior covariance of the coefficients, [q, q]."""
+        """Posterior covariance of the coefficients, [p, p]; makes K matrices of that size."""
         scale = self.weights * self.squares / max(self.degrees - 2, 1)
-        inside = np.einsum("k,kij,klj->il", scale, self.factors, self.factors)
+        k, p = self.means.shape
+        turned = self.problem.spread(self.ratios, np.broadcast_to(np.eye(p), (k, p, p)))
+        inside = np.einsum("k,kji,kjl->il", scale, turned, turned)
         apart = self.means - self.coefficients
         return np.asarray(inside + np.einsum("k,ki,kj->ij", self.weights, apart, apart), dtype=np.float64)
 
@@ -188,12 +209,19 @@ class MixedFit:
         return float(self.weights @ (values / (1 + values)))
 
     def draws(self, number: int, rng: np.random.Generator) -> Floats:
-        """Coefficients drawn from the posterior, [number, q]."""
+        """Coefficients drawn from the posterior, [number, p]."""
         k = rng.choice(len(self.weights), number, p=self.weights)
         # A variance of one degree of freedom has no mean; what is drawn is cut to what can be averaged.
         sigma = np.sqrt(self.squares[k] / np.maximum(rng.chisquare(self.degrees, number), 0.05 * self.degrees))
         noise = rng.standard_normal((number, self.means.shape[1]))
-        return np.asarray(self.means[k] + sigma[:, None] * np.einsum("nij,nj->ni", self.factors[k], noise), dtype=np.float64)
+        # draws of one combination side by side, so that its equations are solved once
+        points, place, counts = np.unique(k, return_inverse=True, return_counts=True)
+        slot = np.empty(number, dtype=np.int64)
+        slot[np.argsort(place, kind="stable")] = np.concatenate([np.arange(count) for count in counts])
+        grouped = np.zeros((len(points), counts.max(), noise.shape[1]))
+        grouped[place, slot] = noise
+        spread = self.problem.spread(self.ratios[points], grouped)[place, slot]
+        return np.asarray(self.means[k] + sigma[:, None] * spread, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -216,20 +244,26 @@ class RestrictedFit:
 
 
 class _Problem:
-    """The equations of one data set, over the columns that vary at all."""
+    """The equations of one data set, over the columns that vary at all.
 
-    def __init__(self, model: MixedModel, sums: Sums, *, prior: bool = True) -> None:
+    Raises:
+        ValueError: no row.
+    """
+
+    def __init__(self, model: MixedModel, sums: Sums | SessionSums, *, prior: bool = True) -> None:
+        if sums.number < 1:
+            raise ValueError("a mixed model needs at least one row")
         self.q, self.prior = model.columns, prior
         # A column of zeros says nothing: its coefficient stays 0 and it counts in no likelihood.
-        self.live = np.flatnonzero(np.diag(sums.gram) > 1e-12)
+        self.live = np.flatnonzero(live_columns(sums.diagonal))
         place = {int(c): j for j, c in enumerate(self.live)}
-        self.gram, self.moment = sums.gram[np.ix_(self.live, self.live)], sums.moment[self.live]
-        self.square, self.rows = sums.square, sums.rows
+        self.sums = sums.take(self.live)
         self.groups = [[place[c] for c in columns if c in place] for columns in model.estimated.values()]
         self.known = {place[c]: v for c, v in model.known.items() if c in place}
         free = len(self.live) - sum(map(len, self.groups)) - len(self.known)
-        self.degrees = max(self.rows - free, 1)
-        self.fixed = np.full(len(self.live), 1e-10 * max(float(np.trace(self.gram)), 1e-12))
+        self.degrees = max(sums.number - free, 1)
+        self.floor = PERFECT * sums.square or float(np.finfo(np.float64).tiny)
+        self.fixed = np.full(len(self.live), RIDGE * self.sums.trace or 1.0)
         for column, ratio in self.known.items():
             self.fixed[column] = 1 / ratio
 
@@ -239,31 +273,40 @@ class _Problem:
         The last diagonal element of the Cholesky factor of [[A, m], [m^T, y^T y]] is the root of y^T y - m^T A^-1 m.
         """
         q = len(self.live)
-        joint = np.zeros((len(ratios), q + 1, q + 1))
-        joint[:, :q, :q] = self.gram + self._penalties(ratios)[:, :, None] * np.eye(q)
-        joint[:, q, :q] = joint[:, :q, q] = self.moment
+        joint, log_det = self._without_levels(ratios)
+        joint = joint + np.eye(q + 1) * np.append(self._penalties(ratios), np.full((len(ratios), 1), self.floor), axis=1)[:, None, :]
         # a little more than y^T y keeps the matrix positive definite where the fit is perfect
-        floor = self._floor
-        joint[:, q, q] = self.square + floor
         diagonal = np.diagonal(np.linalg.cholesky(joint), axis1=1, axis2=2)
-        return self._logs(ratios, diagonal[:, :q], np.maximum(diagonal[:, q] ** 2 - floor, floor))
+        return self._logs(ratios, diagonal[:, :q], np.maximum(diagonal[:, q] ** 2 - self.floor, self.floor), log_det)
 
     def solve(self, ratios: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Log posterior of the lambdas [K] (up to a constant), coefficients [K, q], factors [K, q, q], squares [K] at lambdas [K, G]."""
-        matrices = self.gram + self._penalties(ratios)[:, :, None] * np.eye(len(self.live))
-        lower = np.linalg.cholesky(matrices)
+        """Log posterior of the lambdas [K] (up to a constant), all coefficients [K, p], factors of the columns [K, q, q], squares [K] at
+        lambdas [K, G].
+        """
+        q, k = len(self.live), len(ratios)
+        at = self.sums.reduced(ratios[:, len(self.groups) :])
+        lower = np.linalg.cholesky(at.joint[:, :q, :q] + self._penalties(ratios)[:, :, None] * np.eye(q))
         inverse = np.linalg.inv(lower)
-        half = inverse @ self.moment
-        squares = np.maximum(self.square - np.sum(half**2, axis=1), self._floor)
-        logs = self._logs(ratios, np.diagonal(lower, axis1=1, axis2=2), squares)
-        means, factors = np.zeros((len(ratios), self.q)), np.zeros((len(ratios), self.q, self.q))
-        means[:, self.live] = np.einsum("kji,kj->ki", inverse, half)
+        half = (inverse @ at.joint[:, :q, q:])[..., 0]
+        squares = np.maximum(at.joint[:, q, q] - np.sum(half**2, axis=1), self.floor)
+        logs = self._logs(ratios, np.diagonal(lower, axis1=1, axis2=2), squares, at.log_det)
+        columns, means, factors = np.einsum("kji,kj->ki", inverse, half), np.zeros((k, self.q)), np.zeros((k, self.q, self.q))
+        means[:, self.live] = columns
         factors[:, self.live[:, None], self.live] = np.swapaxes(inverse, 1, 2)
-        return logs, means, factors, squares
+        return logs, np.concatenate([means, *self.sums.means(at, columns)], axis=1), factors, squares
 
-    @property
-    def _floor(self) -> float:
-        return 1e-12 * max(self.square, 1e-12)
+    def spread(self, ratios: Floats, noise: Floats) -> Floats:
+        """Noise [K, R, p] turned into deviations of the coefficients over sigma, [K, R, p], at lambdas [K, G]."""
+        found, kept = np.zeros(noise.shape), np.append(self.live, np.arange(self.q, noise.shape[2]))
+        at = self.sums.reduced(ratios[:, len(self.groups) :])
+        found[:, :, kept] = self.sums.spread(at, self._penalties(ratios), noise[:, :, kept])
+        return found
+
+    def _without_levels(self, ratios: Floats) -> tuple[Floats, Floats]:
+        """Equations [K, q + 1, q + 1] and log determinants [K] of what was eliminated, for lambdas [K, G]: few pairs of levels differ."""
+        pairs, place = np.unique(ratios[:, len(self.groups) :], axis=0, return_inverse=True)
+        at = self.sums.reduced(pairs)
+        return at.joint[place], at.log_det[place]
 
     def _penalties(self, ratios: Floats) -> Floats:
         penalties = np.tile(self.fixed, (len(ratios), 1))
@@ -271,15 +314,16 @@ class _Problem:
             penalties[:, columns] = 1 / ratios[:, g : g + 1]
         return penalties
 
-    def _logs(self, ratios: Floats, diagonal: Floats, squares: Floats) -> Floats:
+    def _logs(self, ratios: Floats, diagonal: Floats, squares: Floats, eliminated: Floats) -> Floats:
         counts = np.array([len(columns) for columns in self.groups], dtype=np.float64)
-        log_det = 2 * np.log(diagonal).sum(1) + np.log(ratios) @ counts
+        log_det = 2 * np.log(diagonal).sum(1) + np.log(ratios[:, : len(counts)]) @ counts + eliminated
         # In log lambda the half-Cauchy of sqrt(lambda) has the density sqrt(lambda) / (1 + lambda).
         prior = (0.5 * np.log(ratios) - np.log1p(ratios)).sum(1) if self.prior else 0.0
         return np.asarray(prior - 0.5 * (log_det + self.degrees * np.log(squares)), dtype=np.float64)
 
-    def search(self, groups: int) -> Floats:
+    def search(self) -> Floats:
         """Likeliest lambdas [G], one coordinate at a time, first over decades, then around what was found."""
+        groups = len(self.groups) + len(self.sums.levels)
         best = np.full(groups, 0.1)
         for _ in range(6):
             before = best.copy()

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from ml.ope.outcomes.minutes import FEATURES, step_features
@@ -70,11 +71,9 @@ def memories(a: Floats, before: float | None = None) -> Floats:
     Args:
         before: amplitude that had been on for long before the session; its own first one where that is None.
     """
-    result = np.empty((a.size, len(DECAYS)))
-    result[0] = remember(fresh_memory(a[:1] if before is None else np.array([before])), a[:1])[0]
-    for k in range(1, a.size):
-        result[k] = remember(result[k - 1 : k], a[k : k + 1])[0]
-    return result
+    first = a[0] if before is None else before
+    passed = [scipy.signal.lfilter([1 - decay], [1, -decay], a, zi=np.array([decay * first]))[0] for decay in DECAYS]
+    return np.stack(passed, axis=1)
 
 
 @dataclass(frozen=True)

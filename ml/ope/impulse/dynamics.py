@@ -21,12 +21,14 @@ from numpy.typing import NDArray
 
 from ml.ope.estimate import require_two_sessions
 from ml.ope.fqe.steps import after_doses, held_amplitude, lead_dose, lead_doses
-from ml.ope.linear.dynamics import autoregression, innovations_of, level_model, level_sums, log_noise_weights, split_coefficients
+from ml.ope.linear.dynamics import autoregression, innovations_of, level_sums, log_noise_weights, split_coefficients, visit_numbers
 from ml.ope.scale import Scale
-from ml.statistics.mixed import MixedFit, MixedModel, Sums
+from ml.statistics.mixed import MixedFit, MixedModel
+from ml.statistics.nested import SessionSums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 EDGES = (0, 1, 2, 3, 4, 6, 9, 13, 19, 27, 39, 56, 81, 116, 166)
 """First lag of every stretch of lags over which the impulse response is constant, and the lag at which it ends, steps."""
@@ -86,12 +88,16 @@ class LaggedMeans:
         self._sums[: MEMORY + 1] = np.arange(MEMORY + 1).reshape(-1, *([1] * first.ndim)) * first
         self._now = MEMORY
 
-    def step(self, value: Floats) -> Floats:
-        """Means [..., STRETCHES] with the newest value [...] at lag 0."""
+    def sums(self, value: Floats) -> Floats:
+        """Sums of the signal up to every edge, [STRETCHES + 1, ...], with the newest value [...] at lag 0."""
         self._now += 1
         self._sums[self._now] = self._sums[self._now - 1] + value
-        at = self._now - np.array(EDGES)
-        return np.moveaxis((self._sums[at[:-1]] - self._sums[at[1:]]) / np.diff(EDGES).reshape(-1, *([1] * value.ndim)), 0, -1)
+        return np.asarray(self._sums[self._now - np.array(EDGES)], dtype=np.float64)
+
+    def step(self, value: Floats) -> Floats:
+        """Means [..., STRETCHES] with the newest value [...] at lag 0."""
+        sums = np.moveaxis(self.sums(value), 0, -1)
+        return np.asarray((sums[..., :-1] - sums[..., 1:]) / np.diff(EDGES), dtype=np.float64)
 
 
 def lagged_means(signal: Floats, before: float | None = None) -> Floats:
@@ -195,6 +201,9 @@ class Response:
         self._groups = [(SHAPES[s], np.flatnonzero(dynamics.shapes == s)) for s in np.unique(dynamics.shapes)]
         self._means = [LaggedMeans(dose(shape, before[:, members]), steps) for shape, members in self._groups]
         self._before = before
+        # an answer is a weighted sum of the signal's sums up to the edges
+        each = dynamics.gains / np.diff(EDGES)
+        self._weights = np.pad(each, ((0, 0), (0, 1))) - np.pad(each, ((0, 0), (1, 0)))
 
     def lasting(self) -> Floats:
         """Answer [P, D, n] before the first amplitudes."""
@@ -207,7 +216,7 @@ class Response:
         """Answer [P, D, n] once the amplitudes a [P, D, n] are in force."""
         answer = np.empty_like(a)
         for (shape, members), means in zip(self._groups, self._means, strict=True):
-            answer[:, members] = np.einsum("pdnk,dk->pdn", means.step(dose(shape, a[:, members])), self._dynamics.gains[members])
+            answer[:, members] = np.einsum("kpdn,dk->pdn", means.sums(dose(shape, a[:, members])), self._weights[members])
         return answer
 
 
@@ -223,23 +232,21 @@ def fit_impulse(
         ValueError: fewer than two sessions with usable steps.
     """
     require_two_sessions("the response model", sum(bool(t.usable.any()) for t in tables))
-    window, visits = buffer.settings.window, np.array([s.visit for s in buffer.sessions])
-    own = (visits[:, None] == np.unique(visits)).astype(np.float64)
+    window, visit = buffer.settings.window, visit_numbers(buffer)
     phi = np.zeros(window)
     best: Combination | None = None
     for turn in range(TURNS):
         candidates = ALPHAS if turn == 0 else _beside(best)
-        found = _weighed(tables, own, phi, SHAPES[:1] if turn == 0 else SHAPES[:2], candidates)
+        found = _weighed(tables, visit, phi, SHAPES[:1] if turn == 0 else SHAPES[:2], candidates)
         best = max(found, key=lambda c: c.weight)
-        residual = [_residual(t, best, own, i) for i, t in enumerate(tables)]
+        residual = _residuals(tables, best, visit)
         phi = autoregression(residual, [t.usable for t in tables], window)
-    combinations = _weighed(tables, own, phi, SHAPES, ALPHAS)
+    combinations = _weighed(tables, visit, phi, SHAPES, ALPHAS)
     best = max(combinations, key=lambda c: c.weight)
     noise = log_noise_weights(
-        [_residual(t, best, own, i) for i, t in enumerate(tables)], [t.beta for t in tables], [t.amplitude for t in tables],
-        [t.usable for t in tables], phi,
+        _residuals(tables, best, visit), [t.beta for t in tables], [t.amplitude for t in tables], [t.usable for t in tables], phi
     )  # fmt: skip
-    return _drawn(combinations, own, phi, noise, lead_doses(buffer.sessions, otherwise), draws, seed)
+    return _drawn(combinations, visit, phi, noise, lead_doses(buffer.sessions, otherwise), draws, seed)
 
 
 def _beside(best: Combination | None) -> tuple[float, ...]:
@@ -248,57 +255,50 @@ def _beside(best: Combination | None) -> tuple[float, ...]:
 
 
 def _weighed(
-    tables: Sequence[ResponseTable], own: Floats, phi: Floats, shapes: Sequence[str], alphas: Sequence[float]
+    tables: Sequence[ResponseTable], visit: Indices, phi: Floats, shapes: Sequence[str], alphas: Sequence[float]
 ) -> list[Combination]:
     found: list[tuple[str, float, MixedFit]] = []
     for shape in shapes:
-        sums = Sums.pooled(response_sums(tables, own, phi, shape))
-        found += [(shape, alpha, _fit(sums, own, alpha)) for alpha in alphas]
+        sums = response_sums(tables, visit, phi, shape)
+        found += [(shape, alpha, RESPONSE_MODEL.fit(moved(sums, alpha))) for alpha in alphas]
     logs = np.array([fit.log_evidence for _, _, fit in found])
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     return [Combination(s, a, float(w), f) for (s, a, f), w in zip(found, weights, strict=True)]
 
 
-def response_sums(tables: Sequence[ResponseTable], own: Floats, phi: Floats, shape: str) -> list[Sums]:
-    """Sums of every session over rows filtered by phi; columns: 1, means over stretches of lags, visits, sessions."""
-    return [level_sums(t.beta, t.means[shape], t.usable, own, i, phi) for i, t in enumerate(tables)]
+def response_sums(tables: Sequence[ResponseTable], visit: Indices, phi: Floats, shape: str) -> SessionSums:
+    """Sums of every session over rows filtered by phi; columns: 1, means over stretches of lags."""
+    return level_sums([t.beta for t in tables], [t.means[shape] for t in tables], [t.usable for t in tables], visit, phi)
 
 
-def moved(sums: Sums, own: Floats, alpha: float) -> Sums:
-    """Sums for the columns (1, u, visits, sessions), of which `prior_root` makes the impulse response."""
-    root, levels = prior_root(alpha), own.shape[1] + len(own)
-    change = np.zeros((1 + STRETCHES + levels, 1 + root.shape[1] + levels))
-    change[0, 0] = 1.0
-    change[1 : 1 + STRETCHES, 1 : 1 + root.shape[1]] = root
-    change[1 + STRETCHES :, 1 + root.shape[1] :] = np.eye(levels)
-    return Sums(change.T @ sums.gram @ change, change.T @ sums.moment, sums.square, sums.rows)
-
-
-def response_model(own: Floats) -> MixedModel:
-    """The mixed model of the columns (1, u, visits, sessions)."""
-    return level_model((("response", tuple(range(1, 2 + STRETCHES))),), STRETCHES + 1, own, {})
-
-
-def _fit(sums: Sums, own: Floats, alpha: float) -> MixedFit:
-    return response_model(own).fit(moved(sums, own, alpha))
-
-
-def _split(coefficients: Floats, own: Floats, alpha: float) -> tuple[Floats, Floats]:
-    """Gains [D, STRETCHES] and levels [D, n] from coefficients [D, q + 1]."""
+def moved(sums: SessionSums, alpha: float) -> SessionSums:
+    """Sums for the columns (1, u), of which `prior_root` makes the impulse response."""
     root = prior_root(alpha)
-    answers, levels = split_coefficients(coefficients, own, root.shape[1])
+    change = np.zeros((1 + STRETCHES, 1 + root.shape[1]))
+    change[0, 0], change[1:, 1:] = 1.0, root
+    return sums.changed(change)
+
+
+RESPONSE_MODEL = MixedModel(STRETCHES + 2, {"response": range(1, 2 + STRETCHES)}, {})
+"""The mixed model of the columns (1, u)."""
+
+
+def _split(coefficients: Floats, visit: Indices, alpha: float) -> tuple[Floats, Floats]:
+    """Gains [D, STRETCHES] and levels [D, n] from coefficients [D, p]."""
+    root = prior_root(alpha)
+    answers, levels = split_coefficients(coefficients, visit, root.shape[1])
     return answers @ root.T, levels
 
 
-def _residual(table: ResponseTable, chosen: Combination, own: Floats, i: int) -> Floats:
-    """eta [W + T] of a session at the posterior mean of a combination."""
-    gains, levels = _split(chosen.fit.coefficients[None], own, chosen.alpha)
-    return np.asarray(table.beta - table.means[chosen.shape] @ gains[0] - levels[0, i], dtype=np.float64)
+def _residuals(tables: Sequence[ResponseTable], chosen: Combination, visit: Indices) -> list[Floats]:
+    """eta [W + T] of every session at the posterior mean of a combination."""
+    gains, levels = _split(chosen.fit.coefficients[None], visit, chosen.alpha)
+    return [table.beta - table.means[chosen.shape] @ gains[0] - levels[0, i] for i, table in enumerate(tables)]
 
 
 def _drawn(
-    combinations: Sequence[Combination], own: Floats, phi: Floats, noise: Floats, before: Floats, draws: int, seed: int
+    combinations: Sequence[Combination], visit: Indices, phi: Floats, noise: Floats, before: Floats, draws: int, seed: int
 ) -> ImpulseDynamics:
     """Draws shared out over the combinations by their evidence (largest remainders, so that a rare one is not a matter of luck)."""
     live = [c for c in combinations if c.weight >= FEWEST_WEIGHT]
@@ -310,9 +310,9 @@ def _drawn(
     gains, levels, shapes = [], [], []
     for combination, count in zip(live, counts, strict=True):
         if count:
-            g, own_levels = _split(combination.fit.draws(int(count), rng), own, combination.alpha)
+            g, own = _split(combination.fit.draws(int(count), rng), visit, combination.alpha)
             gains.append(g)
-            levels.append(own_levels)
+            levels.append(own)
             shapes += [SHAPES.index(combination.shape)] * int(count)
     shares_of = {name: sum(c.weight * c.fit.share(name) for c in combinations) for name in ("visit", "session")}
     evidence = {(c.shape, c.alpha): c.weight for c in combinations}

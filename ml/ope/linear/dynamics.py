@@ -10,16 +10,17 @@ by phi (Cochrane and Orcutt 1949; generalised least squares), then phi on what i
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.estimate import require_two_sessions
-from ml.ope.fqe.steps import after_doses, fresh_memory, held_amplitude, lead_dose, lead_doses, memories, remember
+from ml.ope.fqe.steps import DECAYS, after_doses, fresh_memory, held_amplitude, lead_dose, lead_doses, memories
 from ml.ope.scale import Scale
-from ml.statistics.mixed import MixedModel, Sums
+from ml.statistics.mixed import MixedModel
+from ml.statistics.nested import SessionSums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
@@ -43,10 +44,14 @@ def answers(a: Floats, memory: Floats) -> Floats:
     Args:
         a: amplitude, [N]. memory: memories of amplitudes with a in them, [N, 3]; `ml.ope.fqe.steps.DECAYS`.
     """
-    dose = memory[:, 1]
-    timing = [a - dose, memory[:, 0] - dose, memory[:, 2] - dose]
+    return np.stack(_answers(a, memory.T), axis=1)
+
+
+def _answers(a: Floats, memory: Floats) -> list[Floats]:
+    """`answers` one by one, of any shape [...], for memories [3, ...]."""
+    fast, dose, slow = memory
     saturating = 4 * (dose / (dose + SATURATION) - dose / (1 + SATURATION))
-    return np.stack([dose, *timing, 4 * (dose**2 - dose), 4 * (a**2 - a), saturating], axis=1)
+    return [dose, a - dose, fast - dose, slow - dose, 4 * (dose**2 - dose), 4 * (a**2 - a), saturating]
 
 
 def noise_features(a: Floats, predicted: Floats) -> Floats:
@@ -117,19 +122,25 @@ class LinearResponse:
     """The answer of beta to amplitudes [P, D, n] as they come after those `before` them, with coefficients [D, 7]."""
 
     def __init__(self, beta: Floats, before: Floats) -> None:
-        self._beta, self._shape, self._memory = beta, before.shape, fresh_memory(before.ravel())
+        self._gains = [gain[:, None] for gain in beta.T]
+        self._memory = np.repeat(before[None], len(DECAYS), axis=0)
 
     def lasting(self) -> Floats:
         """Answer [P, D, n] before the first amplitudes."""
-        return self._answer(self._memory[:, 0])
+        return self._answer(self._memory[0])
 
     def step(self, a: Floats) -> Floats:
         """Answer [P, D, n] once the amplitudes a [P, D, n] are in force."""
-        self._memory = remember(self._memory, a.ravel())
-        return self._answer(a.ravel())
+        for memory, decay in zip(self._memory, DECAYS, strict=True):
+            memory *= decay
+            memory += (1 - decay) * a
+        return self._answer(a)
 
     def _answer(self, a: Floats) -> Floats:
-        return np.einsum("pdnj,dj->pdn", answers(a, self._memory).reshape(*self._shape, -1), self._beta)
+        total = np.zeros_like(a)
+        for gain, values in zip(self._gains, _answers(a, self._memory), strict=True):
+            total += gain * values
+        return total
 
 
 def fit_dynamics(
@@ -144,20 +155,19 @@ def fit_dynamics(
         ValueError: fewer than two sessions with usable steps.
     """
     require_two_sessions("the linear model", sum(bool(t.usable.any()) for t in tables))
-    window, visits = buffer.settings.window, np.array([s.visit for s in buffer.sessions])
-    own = (visits[:, None] == np.unique(visits)).astype(np.float64)
+    window, visit = buffer.settings.window, visit_numbers(buffer)
     phi = np.zeros(window)
     for _ in range(TURNS):
-        _, coefficients = linear_model(own).likeliest(Sums.pooled(linear_sums(tables, own, phi)))
-        beta, levels = _split(coefficients[None], own)
+        _, coefficients = LINEAR_MODEL.likeliest(linear_sums(tables, visit, phi))
+        beta, levels = _split(coefficients[None], visit)
         phi = autoregression(_residuals(tables, beta[0], levels[0]), [t.usable for t in tables], window)
-    fit = linear_model(own).fit(Sums.pooled(linear_sums(tables, own, phi)))
-    beta, levels = _split(fit.coefficients[None], own)
+    fit = LINEAR_MODEL.fit(linear_sums(tables, visit, phi))
+    beta, levels = _split(fit.coefficients[None], visit)
     shares = {name: fit.share(name) for name in ("visit", "session")}
     usable, amplitudes = [t.usable for t in tables], [t.amplitude for t in tables]
     noise = log_noise_weights(_residuals(tables, beta[0], levels[0]), [t.beta for t in tables], amplitudes, usable, phi)
     mean = Dynamics(phi, beta, levels, noise, shares, lead_doses(buffer.sessions, otherwise), fit.log_evidence, fit.likeliest)
-    drawn = _split(fit.draws(draws, np.random.default_rng([seed, 0xD7A])), own)
+    drawn = _split(fit.draws(draws, np.random.default_rng([seed, 0xD7A])), visit)
     return mean, replace(mean, beta=drawn[0], levels=drawn[1])
 
 
@@ -170,11 +180,15 @@ def innovations_of(eta: Floats, beta: Floats, amplitude: Floats, usable: NDArray
     return np.asarray(np.where(usable, innovation / scale, np.nan), dtype=np.float64)
 
 
-def split_coefficients(coefficients: Floats, own: Floats, width: int) -> tuple[Floats, Floats]:
-    """Answers [D, width] and levels [D, n] from coefficients [D, q] of `level_model`."""
-    first = 1 + width
-    visits = coefficients[:, first : first + own.shape[1]]
-    return coefficients[:, 1:first], coefficients[:, :1] + visits @ own.T + coefficients[:, first + own.shape[1] :]
+def visit_numbers(buffer: ReplayBuffer) -> Indices:
+    """Number of each session's visit among those of the buffer, [n], from 0."""
+    return np.unique([s.visit for s in buffer.sessions], return_inverse=True)[1].astype(np.int64)
+
+
+def split_coefficients(coefficients: Floats, visit: Indices, width: int) -> tuple[Floats, Floats]:
+    """Answers [D, width] and levels [D, n] from coefficients [D, p] of columns (1, answers), visits and sessions."""
+    visits, sessions = coefficients[:, 1 + width : -visit.size], coefficients[:, -visit.size :]
+    return coefficients[:, 1 : 1 + width], coefficients[:, :1] + visits[:, visit] + sessions
 
 
 def largest_root(phi: Floats) -> float:
@@ -183,45 +197,30 @@ def largest_root(phi: Floats) -> float:
     return float(np.abs(roots).max()) if roots.size else 0.0
 
 
-def level_model(columns: Sequence[tuple[str, Sequence[int]]], width: int, own: Floats, known: Mapping[int, float]) -> MixedModel:
-    """Mixed model of the columns (1, `width` answers, visits, sessions) with groups of answers by name and the levels' own."""
-    first, visits = 1 + width, own.shape[1]
-    q = first + visits + len(own)
-    groups = dict(columns) | {"visit": tuple(range(first, first + visits)), "session": tuple(range(first + visits, q))}
-    return MixedModel(q, groups, known)
+def level_sums(
+    betas: Sequence[Floats], answers: Sequence[Floats], usable: Sequence[NDArray[np.bool_]], visit: Indices, phi: Floats
+) -> SessionSums:
+    """Sums over the usable rows of every session, filtered by phi: beta [W + T] on (1, answers [W + T, k])."""
+    rest, joint = 1 - float(phi.sum()), []
+    for beta, answer, steps in zip(betas, answers, usable, strict=True):
+        rows = filtered(np.concatenate([answer, beta[:, None]], axis=1), phi)[steps]
+        rows = np.concatenate([np.full((len(rows), 1), rest), rows], axis=1)
+        joint.append(rows.T @ rows)
+    return SessionSums(np.stack(joint), np.array([int(steps.sum()) for steps in usable]), visit)
 
 
-def level_sums(beta: Floats, answers: Floats, usable: NDArray[np.bool_], own: Floats, i: int, phi: Floats) -> Sums:
-    """Sums over the usable rows of session i, filtered by phi: beta [W + T] on (1, answers [W + T, k], visits, sessions)."""
-    n, visits = own.shape
-    width, rest = answers.shape[1], 1 - float(phi.sum())
-    q = 1 + width + visits + n
-    y, x = filtered(beta[:, None], phi)[usable, 0], filtered(answers, phi)[usable]
-    inner, gram, moment = np.arange(1, 1 + width), np.zeros((q, q)), np.zeros(q)
-    # the levels' columns are constant over a session: of them only sums are needed
-    at = np.concatenate([[0], 1 + width + np.flatnonzero(own[i]), [1 + width + visits + i]])
-    total = x.sum(0) * rest
-    gram[np.ix_(inner, inner)] = x.T @ x
-    gram[np.ix_(at, inner)] = total
-    gram[np.ix_(inner, at)] = total[:, None]
-    gram[np.ix_(at, at)] = rest**2 * y.size
-    moment[inner], moment[at] = x.T @ y, rest * y.sum()
-    return Sums(gram, moment, float(y @ y), y.size)
+LINEAR_MODEL = MixedModel(1 + ANSWERS, {"timing": (2, 3, 4), "shape": (5, 6, 7)}, {1: DOSE_RATIO})
+"""The mixed model of (1, answers)."""
 
 
-def linear_model(own: Floats) -> MixedModel:
-    """The mixed model of the linear answers."""
-    return level_model((("timing", (2, 3, 4)), ("shape", (5, 6, 7))), ANSWERS, own, {1: DOSE_RATIO})
+def linear_sums(tables: Sequence[SessionTable], visit: Indices, phi: Floats) -> SessionSums:
+    """Sums of every session for `LINEAR_MODEL`."""
+    return level_sums([t.beta for t in tables], [t.answers for t in tables], [t.usable for t in tables], visit, phi)
 
 
-def linear_sums(tables: Sequence[SessionTable], own: Floats, phi: Floats) -> list[Sums]:
-    """Sums of every session for `linear_model`."""
-    return [level_sums(t.beta, t.answers, t.usable, own, i, phi) for i, t in enumerate(tables)]
-
-
-def _split(coefficients: Floats, own: Floats) -> tuple[Floats, Floats]:
-    """Answers [D, 7] and levels [D, n] from coefficients [D, q]."""
-    return split_coefficients(coefficients, own, ANSWERS)
+def _split(coefficients: Floats, visit: Indices) -> tuple[Floats, Floats]:
+    """Answers [D, 7] and levels [D, n] from coefficients [D, p]."""
+    return split_coefficients(coefficients, visit, ANSWERS)
 
 
 def filtered(values: Floats, phi: Floats) -> Floats:

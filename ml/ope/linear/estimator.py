@@ -9,7 +9,7 @@ is that of the replayed beta, never of its mean. The dynamics are in `linear_dyn
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,6 +25,8 @@ from ml.ope.linear.held_out import replay_skill
 from ml.ope.observed import MeanOverDays, mean_over_days
 from ml.ope.outcomes.minutes import Minutes, by_minute, of_buffer
 from ml.ope.outcomes.model import EndModel, fit_end_model
+from ml.ope.posterior.support import LATE_STEPS
+from ml.ope.posterior.verdict import NEARLY_OFF
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale, outcome_table, session_folds
 from ml.ope.support.coverage import AmplitudeSupport, flags_of
@@ -107,16 +109,16 @@ class LinearModel:
         """
         c, scale = self.config, learn_scale(buffer)
         before = dose_before(buffer)
-        tables = [SessionTable.of(s, scale, before) for s in buffer.sessions]
+        tables = tuple(SessionTable.of(s, scale, before) for s in buffer.sessions)
         draws = max(20, min(c.draws, c.most_rows // len(tables)))
         main, drawn = fit_dynamics(buffer, tables, draws, c.seed, before)
         report(0.4, "fitting the linear model")
-        skill = replay_skill(buffer, scale, session_folds(buffer.sessions, c.folds, c.seed), before)
+        skill = replay_skill(buffer, tables, session_folds(buffer.sessions, c.folds, c.seed), before)
         report(0.8, "replaying left-out sessions")
         severity = main.levels[0]
         ends = fit_end_model(buffer, draws=draws, seed=c.seed, severity=severity)
         report(1.0, "fitting the linear model")
-        return FittedLinear(self.method, c, buffer, scale, tuple(tables), main, drawn, ends.part(0, 0), ends, skill)
+        return FittedLinear(self.method, c, buffer, scale, tables, main, drawn, ends.part(0, 0), ends, skill)
 
 
 @dataclass(frozen=True)
@@ -125,8 +127,10 @@ class Replayed:
 
     Attributes:
         step_return, energy, amplitude, beta: discounted step return, mean a^2, mean a and mean beta, [P, D, n].
-        above: share of steps at or above the threshold, [P, D, n].
-        outcomes: r_end and QoCs, [P, D, n, 4]. actions: [P, D, n, H].
+        outcomes: r_end and QoCs, [P, D, n, 4].
+        above, off: share of steps at or above the threshold, and of amplitudes below `NEARLY_OFF`, [P, D, n].
+        late, switching, from_cdbs: mean amplitude of the last `LATE_STEPS`, mean change from step to step, mean |a - 1|, [P, D, n].
+        sample: amplitudes of about 50 steps with the first coefficients, [P, n, 50].
     """
 
     step_return: Floats
@@ -135,7 +139,11 @@ class Replayed:
     amplitude: Floats
     beta: Floats
     above: Floats
-    actions: Floats
+    late: Floats
+    switching: Floats
+    off: Floats
+    from_cdbs: Floats
+    sample: Floats
 
 
 @dataclass(frozen=True)
@@ -171,31 +179,40 @@ class FittedLinear:
 
     def replay(self, policies: list[Policy], dynamics: Replayable, end: EndModel, horizon: int) -> Replayed:
         """Every session under every policy with every set of coefficients, and with as many draws of the outcomes where `end` has any."""
-        p, d, n, w = len(policies), len(dynamics.levels), len(self.tables), self.buffer.settings.window
-        noise = self._innovations(dynamics, horizon)  # [D, n, H]
-        level = dynamics.levels
+        start, noise = self.beginning(dynamics, horizon)
+        logged = of_buffer(self.buffer)
+        was = Minutes(logged.features[None], logged.share[None], logged.late[None])
+        seen = (end.each if end.draws else end.predict)(was, end.sessions)
+        # one policy after the other: the steps of all of them at once would be gigabytes for a long record
+        each = [self._replayed(*self.steps(policy, dynamics, start, noise), end, seen) for policy in policies]
+        return Replayed(**{f.name: np.stack([getattr(one, f.name) for one in each]) for f in fields(Replayed)})
+
+    def beginning(self, dynamics: Replayable, horizon: int) -> tuple[Floats, Floats]:
+        """Windows before the first step, standardised, [W, D, n], and standardised innovations of the steps, [H, D, n]."""
+        w, levels = self.buffer.settings.window, dynamics.levels
         lead = np.stack([t.beta[:w] for t in self.tables])
         lead = np.where(np.isfinite(lead), lead, dynamics.usual_lead()[:, None])
-        window = np.broadcast_to(lead, (p, d, n, w)).copy()
-        eta = np.empty((p, d, n, w))
+        return np.broadcast_to(lead.T[:, None], (w, *levels.shape)), self._innovations(dynamics, horizon)
+
+    def steps(self, policy: Policy, dynamics: Replayable, start: Floats, noise: Floats) -> tuple[Floats, Floats]:
+        """Beta in the buffer's unit and amplitudes under a policy, [H, D, n] each, from a `beginning`."""
+        (w, *shape), horizon, phi = start.shape, len(noise), dynamics.phi[::-1]
         low, high = self.scale.beta(np.array([self.scale.beta_low, self.scale.beta_high]))
         low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
-        betas, actions = np.empty((horizon, p, d, n)), np.empty((horizon, p, d, n))
+        raw, eta, actions = np.empty((w + horizon, *shape)), np.empty((w + horizon, *shape)), np.empty((horizon, *shape))
+        raw[:w] = self.scale.raw_beta(start)
         response: Response | None = None
         for t in range(horizon):
-            raw = self.scale.raw_beta(window)
-            a = np.stack([policy.act(raw[k].reshape(-1, w)).reshape(d, n) for k, policy in enumerate(policies)])
+            a = actions[t] = policy.act(raw[t : t + w].reshape(w, -1).T).reshape(shape)
             if response is None:
-                response = dynamics.response(a, horizon)
-                eta[:] = window - (response.lasting() + level)[..., None]
-            rest = response.step(a) + level
-            predicted = rest + eta @ dynamics.phi[::-1]
-            newest = predicted + np.exp(noise_features(a, predicted) @ dynamics.noise_weights) * noise[:, :, t]
+                response = dynamics.response(a[None], horizon)
+                eta[:w] = start - (response.lasting()[0] + dynamics.levels)
+            rest = response.step(a[None])[0] + dynamics.levels
+            predicted = rest + np.tensordot(phi, eta[t : t + w], 1)
+            newest = predicted + np.exp(noise_features(a, predicted) @ dynamics.noise_weights) * noise[t]
             newest = np.clip(newest, low, high)
-            eta = np.concatenate([eta[..., 1:], (newest - rest)[..., None]], axis=-1)
-            window = np.concatenate([window[..., 1:], newest[..., None]], axis=-1)
-            betas[t], actions[t] = self.scale.raw_beta(newest), a
-        return self._replayed(np.moveaxis(betas, 0, -1), np.moveaxis(actions, 0, -1), end)
+            eta[w + t], raw[w + t] = newest - rest, self.scale.raw_beta(newest)
+        return raw[w:], actions
 
     def _as_measured(self, policies: list[Policy], horizon: int) -> Floats | None:
         """r_end [P, n] if sessions that were stopped counted as measured; None where none was."""
@@ -206,33 +223,41 @@ class FittedLinear:
         return other.replay(policies, self.main, other.end, horizon).outcomes[:, :, :, 0].mean(1)
 
     def _innovations(self, dynamics: Replayable, horizon: int) -> Floats:
-        """Standardised innovations of every session over the horizon, [D, n, H].
+        """Standardised innovations of every session over the horizon, [H, D, n].
 
         Steps that a session lacks take a known one of the same session, or of any session where it has none.
         """
         found = dynamics.innovations(self.tables)
         rng = np.random.default_rng([self.config.seed, 0x5E55])
-        every = np.concatenate([f[:, np.isfinite(f[0])] for f in found], axis=1)
-        noise = np.empty((len(dynamics.levels), len(found), horizon))
+        noise = np.empty((horizon, len(dynamics.levels), len(found)))
         for i, own in enumerate(found):
             known = np.flatnonzero(np.isfinite(own[0]))
-            source, pick = (own, known) if known.size else (every, np.arange(every.shape[1]))
-            noise[:, i] = source[:, rng.choice(pick, horizon)]
+            source = own[:, known] if known.size else np.concatenate([f[:, np.isfinite(f[0])] for f in found], axis=1)
+            noise[:, :, i] = source[:, rng.choice(source.shape[1], horizon)].T
             within = known[known < horizon]
-            noise[:, i, within] = own[:, within]
+            noise[within, :, i] = own[:, within].T
         return noise
 
-    def _replayed(self, betas: Floats, actions: Floats, end: EndModel) -> Replayed:
-        settings = self.buffer.settings
-        discount = settings.gamma ** np.arange(betas.shape[-1])
-        returns = (discount * step_reward(settings, betas, actions)).sum(-1)
-        logged = of_buffer(self.buffer)
-        was = Minutes(logged.features[None], logged.share[None], logged.late[None])
+    def _replayed(self, betas: Floats, actions: Floats, end: EndModel, seen: Floats) -> Replayed:
+        """What counts of one policy's sessions, [D, n] and so on, from beta and amplitudes [H, D, n]."""
+        settings, late = self.buffer.settings, actions[-LATE_STEPS:]
+        returns = np.tensordot(settings.gamma ** np.arange(len(betas)), step_reward(settings, betas, actions), 1)
         of = end.each if end.draws else end.predict
-        predicted, seen = of(by_minute(betas, actions, settings), end.sessions), of(was, end.sessions)
+        predicted = of(by_minute(np.moveaxis(betas, 0, -1), np.moveaxis(actions, 0, -1), settings), end.sessions)
         outcomes = end.carried(predicted, outcome_table(self.buffer), seen)
-        above = (betas >= settings.xi_beta).mean(-1)
-        return Replayed(returns, outcomes, (actions**2).mean(-1), actions.mean(-1), betas.mean(-1), above, actions)
+        return Replayed(
+            step_return=returns,
+            outcomes=outcomes,
+            energy=(actions**2).mean(0),
+            amplitude=actions.mean(0),
+            beta=betas.mean(0),
+            above=(betas >= settings.xi_beta).mean(0),
+            late=late.mean(0),
+            switching=np.abs(np.diff(actions, axis=0)).mean(0),
+            off=(actions < NEARLY_OFF).mean(0),
+            from_cdbs=np.abs(actions - 1.0).mean(0),
+            sample=np.moveaxis(actions[:: max(1, len(actions) // 50), 0], 0, -1),
+        )
 
     def _returns(self, replayed: Replayed) -> Floats:
         return replayed.step_return + (replayed.outcomes[..., 0] if self.end.seen[0] else 0.0)
@@ -258,7 +283,7 @@ class FittedLinear:
         # Every pair of a draw of the model and a draw of the days: what is common to all policies widens the interval, but is no part of
         # the kept draws.
         interval = percentile_interval(np.add.outer(model, days.common + days.own[i]).ravel() + value, LEVEL)
-        logged, simulated = support.of_policy(policy), support.look(main.actions[i, :1, :, :: max(1, horizon // 50)])
+        logged, simulated = support.of_policy(policy), support.look(main.sample[i])
         flags = list(flags_of(logged, simulated))
         if not with_end:
             flags.append(FEW_END_REWARDS)

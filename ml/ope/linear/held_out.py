@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.ope.linear.dynamics import Dynamics, SessionTable, fit_dynamics
-from ml.ope.scale import Scale
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
@@ -18,25 +17,30 @@ BLOCK = 30
 """Steps whose mean beta is compared: single steps are noise, and the reward follows levels."""
 
 
-def replay_skill(buffer: ReplayBuffer, scale: Scale, folds: Sequence[Sequence[int]], before: float | None = None) -> float | None:
+def replay_skill(
+    buffer: ReplayBuffer, tables: Sequence[SessionTable], folds: Sequence[Sequence[int]], before: float | None = None
+) -> float | None:
     """1 - error / error of the learnt sessions' mean beta, over block means of left-out sessions run freely under their own amplitudes.
 
     A left-out session runs from its own s_0 at the level of its visit's other sessions. None where no session could be left out.
+
+    Args:
+        tables: of all sessions, made with the dose `before` those that say none.
     """
     error, plain = 0.0, 0.0
     for fold in folds:
         rest = [k for k in range(len(buffer.sessions)) if k not in set(fold)]
-        tables = [SessionTable.of(buffer.sessions[k], scale, before) for k in rest]
+        learnt = [tables[k] for k in rest]
         held = [k for k in fold if np.isfinite(buffer.sessions[k].lead_beta).all() and buffer.sessions[k].usable().any()]
-        if not held or sum(bool(t.usable.any()) for t in tables) < 2:
+        if not held or sum(bool(t.usable.any()) for t in learnt) < 2:
             continue
-        model, _ = fit_dynamics(replace(buffer, sessions=tuple(buffer.sessions[k] for k in rest)), tables, 1, 0, before)
-        mean = float(np.concatenate([t.beta[t.beta.size - t.usable.size :][t.usable] for t in tables]).mean())
+        model, _ = fit_dynamics(replace(buffer, sessions=tuple(buffer.sessions[k] for k in rest)), learnt, 1, 0, before)
+        mean = float(np.concatenate([t.beta[t.beta.size - t.usable.size :][t.usable] for t in learnt]).mean())
         visits = np.array([buffer.sessions[k].visit for k in rest])
         for k in held:
             same = visits == buffer.sessions[k].visit
             level = float(model.levels[0, same].mean() if same.any() else model.levels[0].mean())
-            table = SessionTable.of(buffer.sessions[k], scale, before)
+            table = tables[k]
             seen = np.where(table.usable, table.beta[-table.usable.size :], np.nan)
             error += block_error(seen, mean_path(model, table, level))
             plain += block_error(seen, np.full(seen.size, mean))

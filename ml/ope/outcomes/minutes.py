@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -116,13 +116,11 @@ def with_shares(features: Floats, counts: Floats) -> Minutes:
 
 def of_buffer(buffer: ReplayBuffer) -> Minutes:
     """All sessions of a buffer, [n, M, ...]; shorter ones have minutes of share 0 at their beginning."""
-    parts = [by_minute(s.beta, s.amplitude, buffer.settings) for s in buffer.sessions]
-    longest = max(p.share.shape[-1] for p in parts)
-
-    def stacked(arrays: Sequence[Floats]) -> Floats:
-        return np.stack([np.pad(x, [(longest - len(x), 0)] + [(0, 0)] * (x.ndim - 1)) for x in arrays])
-
-    return Minutes(stacked([p.features for p in parts]), stacked([p.share for p in parts]), stacked([p.late for p in parts]))
+    longest = max(s.steps for s in buffer.sessions)
+    beta, amplitude = (np.full((len(buffer.sessions), longest), np.nan) for _ in range(2))
+    for i, session in enumerate(buffer.sessions):
+        beta[i, longest - session.steps :], amplitude[i, longest - session.steps :] = session.beta, session.amplitude
+    return by_minute(beta, amplitude, buffer.settings)
 
 
 def _shares(counts: Floats) -> Floats:

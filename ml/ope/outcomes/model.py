@@ -190,7 +190,7 @@ def fit_end_model(
     settings, table, minutes = buffer.settings, outcome_table(buffer), of_buffer(buffer)
     means = minutes.means[:, [BETA, ABOVE]]
     centre, spread = means.mean(0), means.std(0)
-    spread = np.where(spread > 1e-9, spread, 1.0)
+    spread = np.where(spread > 1e-9 * np.abs(means).max(0), spread, 1.0)  # beta may have any unit
     _, visit = np.unique([s.visit for s in buffer.sessions], return_inverse=True)
     adjusted = {} if severity is None else {"severity": _standardised(severity)}
     sessions = Sessions(visit.astype(np.int64), adjusted | worn_off(buffer))

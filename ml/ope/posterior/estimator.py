@@ -28,8 +28,7 @@ from ml.ope.posterior.gaussian import QUANTITIES, TestedDifference, similarity, 
 from ml.ope.posterior.held_out import HeldOut, held_out
 from ml.ope.posterior.skill import ordering_skill
 from ml.ope.posterior.structures import STRUCTURES, Fit, no_answer
-from ml.ope.posterior.support import LATE_STEPS, SessionSupport, Support
-from ml.ope.posterior.verdict import NEARLY_OFF
+from ml.ope.posterior.support import SessionSupport, Support
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale
 from ml.ope.support.coverage import AmplitudeSupport
@@ -241,16 +240,14 @@ class FittedPosterior:
             outcomes=np.concatenate([r.outcomes for r in found], axis=1),
             weights=np.concatenate(weights),
             summaries=self._summaries(found, np.concatenate(weights)),
-            behaviour=tuple(_behaviour(np.concatenate([r.actions[i].reshape(-1, horizon) for r in found])) for i in range(len(policies))),
+            behaviour=tuple(_behaviour(found, i) for i in range(len(policies))),
         )
 
     def _summaries(self, found: Sequence[Replayed], weights: Floats) -> Floats:
         """`support.SUMMARIES` of every policy, [P, 4], over sessions and draws."""
         each = []
         for r in found:
-            late = r.actions[..., -LATE_STEPS:].mean(-1)
-            switching = np.abs(np.diff(r.actions, axis=-1)).mean(-1)
-            each.append(np.stack([v.mean(-1) for v in (r.amplitude, late, r.above, switching)], axis=-1))  # [P, D, 4]
+            each.append(np.stack([v.mean(-1) for v in (r.amplitude, r.late, r.above, r.switching)], axis=-1))  # [P, D, 4]
         return np.asarray(np.einsum("pds,d->ps", np.concatenate(each, axis=1), weights), dtype=np.float64)
 
     def _draws(self, replays: Replays, policies: Mapping[str, Policy], supports: Sequence[Support], horizon: int) -> Draws:
@@ -314,13 +311,14 @@ def _apart(own: Floats, without_model_errors: Floats) -> dict[str, float]:
     return {name: round(float(drawn.std(ddof=1)), 4) for name, drawn in said.items()}
 
 
-def _behaviour(actions: Floats) -> dict[str, float]:
-    """What a policy does in its replayed sessions: amplitudes of any shape, as fractions of cDBS."""
-    return {
-        "below_cdbs_20_percent": float(np.mean(actions < NEARLY_OFF)),
-        "closeness_to_cdbs": float(np.mean(np.abs(actions - 1.0))),
-        "mean_amplitude": float(actions.mean()),
-    }
+def _behaviour(found: Sequence[Replayed], i: int) -> dict[str, float]:
+    """What policy i does in its replayed sessions, over all draws of all structures."""
+    rows = sum(r.amplitude[i].size for r in found)
+
+    def mean(name: str) -> float:
+        return float(sum(getattr(r, name)[i].sum() for r in found) / rows)
+
+    return {"below_cdbs_20_percent": mean("off"), "closeness_to_cdbs": mean("from_cdbs"), "mean_amplitude": mean("amplitude")}
 
 
 def build(key: str, seed: int, size: Size) -> Posterior:

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from ml.mdp import step_reward
 from ml.ope.fqe.steps import held_amplitude
 from ml.ope.linear.dynamics import noise_features
-from ml.ope.posterior.structures import Fit, LinearForm
+from ml.ope.posterior.structures import Fit, LinearForm, take
 from ml.ope.scale import Scale
-from ml.statistics.mixed import Sums
+from ml.statistics.left_out import left_out_draws
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
@@ -106,46 +106,43 @@ def _form_runs(
     """Rewards of the held sessions in one form, [runs, m, T]."""
     window, sessions = form.phi.size, [buffer.sessions[i] for i in held]
     steps = max(s.steps for s in sessions)
-    total, k = Sums.pooled(form.sums), form.answers[0].shape[1]
-    rest, amplitude = np.zeros((runs, len(held), window + steps)), np.ones((len(held), steps))
-    own = np.array([s.visit for s in buffer.sessions])[:, None] == np.unique([s.visit for s in buffer.sessions])
+    rest, amplitude = np.zeros((window + steps, runs, len(held))), np.ones((steps, len(held)))
+    columns, levels = left_out_draws(form.model, form.sums, form.ratios, held, runs, rng)
     for j, i in enumerate(held):
-        drawn = form.model.conditional_draws(total.without(form.sums[i]), form.ratios, runs, rng)
-        first = 1 + k
-        level = drawn[:, 0] + drawn[:, first + int(np.argmax(own[i]))] + drawn[:, first + own.shape[1] + i]
-        path = drawn[:, 1:first] @ form.answers[i].T + level[:, None]
-        rest[:, j, : path.shape[1]] = path
-        amplitude[j, : sessions[j].steps] = held_amplitude(sessions[j])
+        path = columns[j, :, 1:] @ form.answers[i].T + (columns[j, :, 0] + levels[j])[:, None]
+        rest[: path.shape[1], :, j] = path.T
+        amplitude[: sessions[j].steps, j] = held_amplitude(sessions[j])
     lead = scale.beta(np.stack([s.lead_beta for s in sessions]))
     noise = _innovations(fit, held, runs, steps, rng)
     betas = scale.raw_beta(_autoregressed(form, rest, amplitude, lead, noise, scale))
-    return np.asarray(step_reward(buffer.settings, betas, np.broadcast_to(amplitude, betas.shape)), dtype=np.float64)
+    rewards = step_reward(buffer.settings, betas, np.broadcast_to(amplitude[:, None], betas.shape))
+    return np.ascontiguousarray(np.moveaxis(rewards, 0, -1))
 
 
 def _autoregressed(form: LinearForm, rest: Floats, amplitude: Floats, lead: Floats, noise: Floats, scale: Scale) -> Floats:
-    """Standardised beta [runs, m, T] around its rest [runs, m, W + T] from windows [m, W], with standardised innovations [runs, m, T]."""
+    """Standardised beta [T, runs, m] around its rest [W + T, runs, m] from windows [m, W], with standardised innovations [T, runs, m]."""
     window = form.phi.size
     low, high = scale.beta(np.array([scale.beta_low, scale.beta_high]))
     reach = 0.25 * (high - low)
     eta = np.empty(rest.shape)
-    eta[..., :window] = lead - rest[..., :window]
-    for t in range(window, rest.shape[-1]):
-        predicted = rest[..., t] + eta[..., t - window : t] @ form.phi[::-1]
-        size = np.exp(noise_features(np.broadcast_to(amplitude[:, t - window], predicted.shape), predicted) @ form.noise_weights)
-        eta[..., t] = np.clip(predicted + size * noise[..., t - window], low - reach, high + reach) - rest[..., t]
-    return np.asarray((eta + rest)[..., window:], dtype=np.float64)
+    eta[:window] = lead.T[:, None] - rest[:window]
+    for t in range(window, len(rest)):
+        predicted = rest[t] + np.tensordot(form.phi[::-1], eta[t - window : t], 1)
+        size = np.exp(noise_features(np.broadcast_to(amplitude[t - window], predicted.shape), predicted) @ form.noise_weights)
+        eta[t] = np.clip(predicted + size * noise[t - window], low - reach, high + reach) - rest[t]
+    return np.asarray((eta + rest)[window:], dtype=np.float64)
 
 
 def _innovations(fit: Fit, held: Sequence[int], runs: int, steps: int, rng: np.random.Generator) -> Floats:
-    """Standardised innovations [runs, m, T]: for each a run of those of another session, in their order."""
-    found = fit.drawn.innovations(fit.tables)
+    """Standardised innovations [T, runs, m]: for each a run of those of another session, in their order."""
+    found = take(fit.drawn, np.arange(1)).innovations(fit.tables)
     known = {i: f[0][np.isfinite(f[0])] for i, f in enumerate(found)}
     donors = [i for i, f in known.items() if f.size >= LEAST_KNOWN]
-    noise = np.empty((runs, len(held), steps))
+    noise = np.empty((steps, runs, len(held)))
     for j, i in enumerate(held):
         others = [d for d in donors if d != i] or donors
         for r, d in enumerate(rng.choice(others, runs)):
-            noise[r, j] = np.resize(np.roll(known[d], -int(rng.integers(known[d].size))), steps)
+            noise[:, r, j] = known[d].take(np.arange(steps) + rng.integers(known[d].size), mode="wrap")
     return noise
 
 

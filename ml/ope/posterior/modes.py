@@ -25,12 +25,14 @@ from numpy.typing import NDArray
 
 from ml.ope.estimate import require_two_sessions
 from ml.ope.fqe.steps import after_doses, held_amplitude, lead_dose, lead_doses
-from ml.ope.linear.dynamics import autoregression, innovations_of, level_model, level_sums, log_noise_weights, split_coefficients
+from ml.ope.linear.dynamics import autoregression, innovations_of, level_sums, log_noise_weights, split_coefficients, visit_numbers
 from ml.ope.scale import Scale
-from ml.statistics.mixed import MixedFit, MixedModel, Sums
+from ml.statistics.mixed import MixedFit, MixedModel
+from ml.statistics.nested import SessionSums
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 TIMES = (0.0, 3.0, 8.0, 20.0, 60.0, 180.0)
 """Time constants of the low-passes, steps; 0 passes everything at once."""
@@ -61,38 +63,44 @@ def dose_functions(a: Floats) -> Floats:
 
     Together they make lines, answers that saturate early or late, and ones that turn round.
     """
-    bends = np.array(BENDS)
-    rise, none, full = (1 / (1 + np.exp(-STEEPNESS * (v - bends))) for v in (a[..., None], 0.0, 1.0))
-    return np.concatenate([a[..., None], (rise - none) / (full - none) - a[..., None]], axis=-1)
+    found = np.empty((SHAPES, *a.shape))
+    found[0] = a
+    for k, bend in enumerate(BENDS):
+        rise, none, full = (1 / (1 + np.exp(-STEEPNESS * (v - bend))) for v in (a, 0.0, 1.0))
+        found[1 + k] = (rise - none) / (full - none) - a
+    return np.moveaxis(found, 0, -1)
 
 
 class Filters:
     """Low-passed doses of rows side by side, at first as if `first` [...] had been on for long."""
 
     def __init__(self, first: Floats) -> None:
-        self._passed = np.repeat(dose_functions(first)[..., None, :], len(TIMES), axis=-2)  # [..., M, J]
-        self._sided = np.repeat(first[..., None], len(ONE_SIDED), axis=-1)
-        self._falls = np.zeros((*first.shape, len(FALL_TIMES)))
-        self._now = first
+        straight = SHAPES * len(TIMES)
+        self.columns = np.zeros((COLUMNS, *first.shape))
+        self._passed = self.columns[:straight].reshape(len(TIMES), SHAPES, *first.shape)
+        self._sided = self.columns[straight : straight + len(ONE_SIDED)]
+        self._falls = self.columns[straight + len(ONE_SIDED) :]
+        self._passed[:], self._sided[:], self._now = np.moveaxis(dose_functions(first), -1, 0), first, first
 
     def step(self, a: Floats) -> Floats:
-        """Columns [..., COLUMNS] once the amplitudes a [...] are in force."""
-        self._passed = KEEP[:, None] * self._passed + (1 - KEEP[:, None]) * dose_functions(a)[..., None, :]
-        gap = a[..., None] - self._sided
-        self._sided = self._sided + np.where(gap > 0, RISE, FALL) * gap
+        """`columns`, [COLUMNS, ...], once the amplitudes a [...] are in force; the next step overwrites them."""
+        doses = np.moveaxis(dose_functions(a), -1, 0)
+        for passed, keep in zip(self._passed, KEEP, strict=True):
+            passed *= keep
+            passed += (1 - keep) * doses
+        for sided, rise, sink in zip(self._sided, RISE, FALL, strict=True):
+            gap = a - sided
+            sided += np.where(gap > 0, rise, sink) * gap
         fall = FALL_UNIT * np.maximum(self._now - a, 0.0)
-        self._falls = FALL_KEEP * self._falls + (1 - FALL_KEEP) * fall[..., None]
+        for falls, keep in zip(self._falls, FALL_KEEP, strict=True):
+            falls *= keep
+            falls += (1 - keep) * fall
         self._now = a
         return self.columns
 
-    @property
-    def columns(self) -> Floats:
-        """The columns now, [..., COLUMNS]."""
-        return np.concatenate([self._passed.reshape(*self._now.shape, -1), self._sided, self._falls], axis=-1)
-
 
 def columns_of(a: Floats, first: float) -> Floats:
-    """`Filters` of a whole session, [T, COLUMNS], for amplitudes [T] after `first` had been on for long."""
+    """`Filters` of a whole session, step by step, [T, COLUMNS], for amplitudes [T] after `first` had been on for long."""
     p, start = dose_functions(a), dose_functions(np.array(first))
     passed = np.empty((a.size, len(TIMES), SHAPES))
     for m, keep in enumerate(KEEP):
@@ -173,11 +181,11 @@ class ModeResponse:
 
     def lasting(self) -> Floats:
         """Answer [P, D, n] before the first amplitudes."""
-        return np.einsum("pdnk,dk->pdn", self._filters.columns, self._gains)
+        return np.einsum("kpdn,dk->pdn", self._filters.columns, self._gains)
 
     def step(self, a: Floats) -> Floats:
         """Answer [P, D, n] once the amplitudes a are in force."""
-        return np.einsum("pdnk,dk->pdn", self._filters.step(a), self._gains)
+        return np.einsum("kpdn,dk->pdn", self._filters.step(a), self._gains)
 
 
 @dataclass(frozen=True)
@@ -185,7 +193,7 @@ class FittedModes:
     """The posterior of a fit, and what draws from it need besides."""
 
     fit: MixedFit
-    own: Floats
+    visit: Indices
     phi: Floats
     noise_weights: Floats
     before: Floats
@@ -200,7 +208,7 @@ class FittedModes:
         return self._of(self.fit.coefficients[None])
 
     def _of(self, coefficients: Floats) -> ModeDynamics:
-        gains, levels = _split(coefficients, self.own)
+        gains, levels = _split(coefficients, self.visit)
         shares = {name: self.fit.share(name) for name in ("visit", "session")}
         return ModeDynamics(self.phi, gains, levels, self.noise_weights, shares, self.before)
 
@@ -212,42 +220,42 @@ def fit_modes(buffer: ReplayBuffer, tables: Sequence[ModeTable], otherwise: floa
         ValueError: fewer than two sessions with usable steps.
     """
     require_two_sessions("a model of beta's answer", sum(bool(t.usable.any()) for t in tables))
-    window, visits = buffer.settings.window, np.array([s.visit for s in buffer.sessions])
-    own = (visits[:, None] == np.unique(visits)).astype(np.float64)
+    window, visit = buffer.settings.window, visit_numbers(buffer)
     usable = [t.usable for t in tables]
     phi = np.zeros(window)
     for _ in range(TURNS):
-        _, coefficients = mode_model(own).likeliest(Sums.pooled(mode_sums(tables, own, phi)))
-        phi = autoregression(_residuals(tables, coefficients, own), usable, window)
-    fit = mode_model(own).fit(Sums.pooled(mode_sums(tables, own, phi)))
+        _, coefficients = MODE_MODEL.likeliest(mode_sums(tables, visit, phi))
+        phi = autoregression(_residuals(tables, coefficients, visit), usable, window)
+    fit = MODE_MODEL.fit(mode_sums(tables, visit, phi))
     betas, amplitudes = [t.beta for t in tables], [t.amplitude for t in tables]
-    noise = log_noise_weights(_residuals(tables, fit.coefficients, own), betas, amplitudes, usable, phi)
-    return FittedModes(fit, own, phi, noise, lead_doses(buffer.sessions, otherwise))
+    noise = log_noise_weights(_residuals(tables, fit.coefficients, visit), betas, amplitudes, usable, phi)
+    return FittedModes(fit, visit, phi, noise, lead_doses(buffer.sessions, otherwise))
 
 
-def mode_model(own: Floats) -> MixedModel:
-    """The mixed model of the columns (1, modes, visits, sessions)."""
-    j, first = SHAPES, 1 + COLUMNS
-    groups = (
-        ("fast", tuple(1 + m * j for m in range(SLOW))),
-        ("slow", tuple(1 + m * j for m in range(SLOW, len(TIMES)))),
-        ("shape", tuple(1 + m * j + k for m in range(len(TIMES)) for k in range(1, j))),
-        ("sided", tuple(range(1 + j * len(TIMES), first - len(FALL_TIMES)))),
-        ("falls", tuple(range(first - len(FALL_TIMES), first))),
-    )
-    return level_model(groups, COLUMNS, own, {})
+MODE_MODEL = MixedModel(
+    1 + COLUMNS,
+    {
+        "fast": [1 + m * SHAPES for m in range(SLOW)],
+        "slow": [1 + m * SHAPES for m in range(SLOW, len(TIMES))],
+        "shape": [1 + m * SHAPES + k for m in range(len(TIMES)) for k in range(1, SHAPES)],
+        "sided": range(1 + SHAPES * len(TIMES), 1 + COLUMNS - len(FALL_TIMES)),
+        "falls": range(1 + COLUMNS - len(FALL_TIMES), 1 + COLUMNS),
+    },
+    {},
+)
+"""The mixed model of the columns (1, modes)."""
 
 
-def mode_sums(tables: Sequence[ModeTable], own: Floats, phi: Floats) -> list[Sums]:
-    """Sums of every session for `mode_model`."""
-    return [level_sums(t.beta, t.columns, t.usable, own, i, phi) for i, t in enumerate(tables)]
+def mode_sums(tables: Sequence[ModeTable], visit: Indices, phi: Floats) -> SessionSums:
+    """Sums of every session for `MODE_MODEL`."""
+    return level_sums([t.beta for t in tables], [t.columns for t in tables], [t.usable for t in tables], visit, phi)
 
 
-def _split(coefficients: Floats, own: Floats) -> tuple[Floats, Floats]:
-    """Gains [D, COLUMNS] and levels [D, n] from coefficients [D, q]."""
-    return split_coefficients(coefficients, own, COLUMNS)
+def _split(coefficients: Floats, visit: Indices) -> tuple[Floats, Floats]:
+    """Gains [D, COLUMNS] and levels [D, n] from coefficients [D, p]."""
+    return split_coefficients(coefficients, visit, COLUMNS)
 
 
-def _residuals(tables: Sequence[ModeTable], coefficients: Floats, own: Floats) -> list[Floats]:
-    gains, levels = _split(coefficients[None], own)
+def _residuals(tables: Sequence[ModeTable], coefficients: Floats, visit: Indices) -> list[Floats]:
+    gains, levels = _split(coefficients[None], visit)
     return [table.beta - table.columns @ gains[0] - levels[0, i] for i, table in enumerate(tables)]

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.ope.impulse.dynamics import ImpulseDynamics, ResponseTable, fit_impulse, moved, prior_root, response_model, response_sums
-from ml.ope.linear.dynamics import ANSWERS, Dynamics, SessionTable, fit_dynamics, linear_model, linear_sums
+from ml.ope.impulse.dynamics import RESPONSE_MODEL, ImpulseDynamics, ResponseTable, fit_impulse, moved, prior_root, response_sums
+from ml.ope.linear.dynamics import ANSWERS, LINEAR_MODEL, Dynamics, SessionTable, fit_dynamics, linear_sums, visit_numbers
 from ml.ope.linear.estimator import Replayable
-from ml.ope.posterior.modes import ModeDynamics, ModeTable, fit_modes, mode_model, mode_sums
+from ml.ope.posterior.modes import MODE_MODEL, ModeDynamics, ModeTable, fit_modes, mode_sums
 from ml.ope.scale import Scale
-from ml.statistics.mixed import MixedModel, Sums
+from ml.statistics.mixed import MixedModel
+from ml.statistics.nested import SessionSums
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]
@@ -29,14 +30,14 @@ class LinearForm:
 
     Attributes:
         weight: share of the evidence among the forms of one structure. model: groups of columns. ratios: lambdas of the groups.
-        sums: of every session, [n]. answers: columns of every session, [W + T, k] each; levels have no column here.
+        sums: of every session. answers: columns of every session, [W + T, k] each; levels have no column here.
         phi: autoregression, [W]. noise_weights: of the log of an innovation's scale, [3].
     """
 
     weight: float
     model: MixedModel
     ratios: Floats
-    sums: tuple[Sums, ...]
+    sums: SessionSums
     answers: tuple[Floats, ...]
     phi: Floats
     noise_weights: Floats
@@ -82,9 +83,8 @@ def fit_linear(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, before
     """The linear model: levels, an answer to the dose over about 20 steps with differences in timing, an autoregression."""
     tables = [SessionTable.of(s, scale, before) for s in buffer.sessions]
     mean, drawn = fit_dynamics(buffer, tables, draws, seed, before)
-    own = visits_of(buffer)
-    sums = tuple(linear_sums(tables, own, mean.phi))
-    form = LinearForm(1.0, linear_model(own), mean.ratios, sums, tuple(t.answers for t in tables), mean.phi, mean.noise_weights)
+    sums = linear_sums(tables, visit_numbers(buffer), mean.phi)
+    form = LinearForm(1.0, LINEAR_MODEL, mean.ratios, sums, tuple(t.answers for t in tables), mean.phi, mean.noise_weights)
     return Fit("linear", tuple(tables), drawn, (form,))
 
 
@@ -92,9 +92,9 @@ def no_answer(fit: Fit, buffer: ReplayBuffer) -> Fit:
     """A fitted linear model without any answer to the amplitude, which calls all doses equal: what skill is held against."""
     tables = [replace(t, answers=np.zeros_like(t.answers)) for t in fit.tables]
     mean, drawn = fit_dynamics(buffer, tables, 1, 0, None)
-    own = visits_of(buffer)
     zeros = tuple(np.zeros((t.beta.size, ANSWERS)) for t in tables)
-    form = LinearForm(1.0, linear_model(own), mean.ratios, tuple(linear_sums(tables, own, mean.phi)), zeros, mean.phi, mean.noise_weights)
+    sums = linear_sums(tables, visit_numbers(buffer), mean.phi)
+    form = LinearForm(1.0, LINEAR_MODEL, mean.ratios, sums, zeros, mean.phi, mean.noise_weights)
     return Fit("equal", tuple(tables), drawn, (form,))
 
 
@@ -102,13 +102,13 @@ def fit_response(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, befo
     """The impulse response with a stable-spline prior behind one of four dose shapes."""
     tables = [ResponseTable.of(s, scale, before) for s in buffer.sessions]
     drawn = fit_impulse(buffer, tables, draws, seed, before)
-    own, forms = visits_of(buffer), []
+    forms, visit = [], visit_numbers(buffer)
     best = sorted(drawn.evidence.items(), key=lambda item: -item[1])[:MOST_FORMS]
-    by_shape = {shape: response_sums(tables, own, drawn.phi, shape) for shape in {shape for (shape, _), _ in best}}
+    by_shape = {shape: response_sums(tables, visit, drawn.phi, shape) for shape in {shape for (shape, _), _ in best}}
     for (shape, alpha), weight in best:
-        sums = tuple(moved(s, own, alpha) for s in by_shape[shape])
         answers = tuple(t.means[shape] @ prior_root(alpha) for t in tables)
-        forms.append(LinearForm(weight, response_model(own), drawn.ratios[shape, alpha], sums, answers, drawn.phi, drawn.noise_weights))
+        sums, ratios = moved(by_shape[shape], alpha), drawn.ratios[shape, alpha]
+        forms.append(LinearForm(weight, RESPONSE_MODEL, ratios, sums, answers, drawn.phi, drawn.noise_weights))
     # its draws come combination by combination: shuffled, the first few stand for all
     order = np.random.default_rng([seed, 0x0BDE]).permutation(len(drawn.levels))
     return Fit("impulse", tuple(tables), take(drawn, order), tuple(forms))
@@ -118,16 +118,10 @@ def fit_low_passes(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, be
     """Low-passes of several speeds behind dose functions."""
     tables = [ModeTable.of(s, scale, before) for s in buffer.sessions]
     found = fit_modes(buffer, tables, before)
-    sums = tuple(mode_sums(tables, found.own, found.phi))
+    sums = mode_sums(tables, found.visit, found.phi)
     columns = tuple(t.columns for t in tables)
-    form = LinearForm(1.0, mode_model(found.own), found.fit.likeliest, sums, columns, found.phi, found.noise_weights)
+    form = LinearForm(1.0, MODE_MODEL, found.fit.likeliest, sums, columns, found.phi, found.noise_weights)
     return Fit("modes", tuple(tables), found.drawn(draws, np.random.default_rng([seed, 0x30DE])), (form,))
-
-
-def visits_of(buffer: ReplayBuffer) -> Floats:
-    """Which visit each session belongs to, [n, V]."""
-    visits = np.array([s.visit for s in buffer.sessions])
-    return np.asarray(visits[:, None] == np.unique(visits), dtype=np.float64)
 
 
 STRUCTURES: dict[str, Fitter] = {"linear": fit_linear, "impulse": fit_response, "modes": fit_low_passes}

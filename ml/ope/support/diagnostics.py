@@ -208,7 +208,7 @@ class _Neighbours:
         self._states, self._session = table.states[keep], table.session[keep]
         levels = self._levels(table, self._states)
         self._spread = np.append(levels.std(0), table.actions.std())
-        self._spread[self._spread < 1e-9] = 1.0
+        self._spread[self._spread <= 1e-9 * np.append(np.abs(levels).max(0), 1.0)] = 1.0  # beta may have any unit
         self._points = np.column_stack([levels, table.actions[keep]]) / self._spread
         self._levels_kept = levels
         self._trees = {

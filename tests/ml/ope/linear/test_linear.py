@@ -51,9 +51,10 @@ def test_a_policy_that_would_have_done_what_was_done_gets_back_what_was_observed
         sessions.append(SessionTrajectory(k, 1 + k // 2, "rl", beta[0, :10], beta[0, 10:], a[0], qoc=own))
     fitted = LinearModel(LinearConfig(draws=20)).fit(ReplayBuffer(settings, tuple(sessions), "uV", "table"))
     replayed = fitted.replay([policy], fitted.drawn, fitted.ends, 120)
+    _, actions = fitted.steps(policy, fitted.drawn, *fitted.beginning(fitted.drawn, 120))
     discount = settings.gamma ** np.arange(120)
     for k, s in enumerate(sessions):
-        np.testing.assert_allclose(replayed.actions[0, :, k], np.tile(s.amplitude, (20, 1)), atol=1e-9)
+        np.testing.assert_allclose(actions[:, :, k], np.tile(s.amplitude[:, None], (1, 20)), atol=1e-9)
         np.testing.assert_allclose(replayed.step_return[0, :, k], s.rewards(settings) @ discount)
         np.testing.assert_allclose(replayed.outcomes[0, :, k, 0], s.end_reward(settings))
         np.testing.assert_allclose(replayed.outcomes[0, :, k, 3], s.qoc.tremor_percent)
@@ -64,6 +65,7 @@ def test_all_sessions_policies_and_draws_together_are_each_replayed_alone(small_
     policies = [ConstantPolicy(0.4), ProportionalPolicy(0.7, 1.0, 0.2, 2)]
     fast, model, settings = fitted.replay(policies, fitted.drawn, fitted.ends, 30), fitted.drawn, small_buffer.settings
     for p, policy in enumerate(policies):
+        _, actions = fitted.steps(policy, model, *fitted.beginning(model, 30))
         for d in (0, 7):
             for i, table in enumerate(fitted.tables):
                 noise = model.innovations(fitted.tables)[i][d]
@@ -82,7 +84,7 @@ def test_all_sessions_policies_and_draws_together_are_each_replayed_alone(small_
                     eta, window = [*eta, newest - rest], [*window[1:], newest]
                     beta.append(float(fitted.scale.raw_beta(np.array(newest))))
                     chosen.append(float(a[0]))
-                np.testing.assert_allclose(fast.actions[p, d, i], chosen, atol=1e-9)
+                np.testing.assert_allclose(actions[:, d, i], chosen, atol=1e-9)
                 steps = [
                     settings.gamma**t * (-(b >= settings.xi_beta) - settings.c1 * a)
                     for t, (b, a) in enumerate(zip(beta, chosen, strict=True))

@@ -120,8 +120,9 @@ def test_held_out_skill_is_that_of_block_means_of_sessions_that_were_not_learnt_
     strong, _ = known_system(4, fall=2.0, day=0.05, session=0.05)
     weak, _ = known_system(4, fall=0.0, day=0.05, session=0.6)
     folds = session_folds(strong.sessions, 4, 0)
-    assert replay_skill(strong, learn_scale(strong), folds) > 0.5
-    assert replay_skill(weak, learn_scale(weak), folds) < 0.3
+    tables = [[SessionTable.of(s, learn_scale(buffer)) for s in buffer.sessions] for buffer in (strong, weak)]
+    assert replay_skill(strong, tables[0], folds) > 0.5
+    assert replay_skill(weak, tables[1], folds) < 0.3
     assert block_error(np.r_[np.ones(30), np.full(30, np.nan)], np.zeros(60)) == pytest.approx(1.0)
 
 

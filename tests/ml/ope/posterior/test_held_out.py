@@ -10,7 +10,6 @@ from ml.ope.lead import dose_before
 from ml.ope.posterior.held_out import OWN_VARIANCE, SHRINK, held_out, log_density, weights_of
 from ml.ope.posterior.structures import STRUCTURES, fit_linear, no_answer
 from ml.ope.scale import learn_scale
-from ml.statistics.mixed import MixedModel, Sums
 
 
 def test_a_lead_in_every_session_takes_the_weight_and_luck_in_one_does_not() -> None:
@@ -38,22 +37,6 @@ def test_the_density_of_block_sums_is_the_shrunk_normals() -> None:
     covariance = (1 - SHRINK) * np.cov(runs.T)
     np.fill_diagonal(covariance, np.cov(runs.T).diagonal() + OWN_VARIANCE)
     assert log_density(seen, runs) == pytest.approx(multivariate_normal(runs.mean(0), covariance).logpdf(seen))
-
-
-def test_leaving_out_by_sums_is_fitting_the_others() -> None:
-    rng = np.random.default_rng(3)
-    x = np.concatenate([np.ones((30, 1)), rng.normal(size=(30, 2)), np.kron(np.eye(3), np.ones((10, 1)))], axis=1)
-    y = x @ rng.normal(size=6) + rng.normal(size=30)
-    model, ratios = MixedModel(6, {"slopes": (1, 2), "session": (3, 4, 5)}, {}), np.array([0.5, 0.3])
-    parts = [Sums.of(x[k : k + 10], y[k : k + 10]) for k in (0, 10, 20)]
-    drawn = model.conditional_draws(Sums.pooled(parts).without(parts[1]), ratios, 20000, np.random.default_rng(0))
-    others = np.r_[0:10, 20:30]
-    expected = model.conditional(Sums.of(x[others], y[others]), ratios)
-    spread = drawn.std(0)
-    assert np.all(np.abs(drawn.mean(0) - expected) < 4 * spread / np.sqrt(20000))
-    # nothing is known of the session that was left out: its level is drawn from the prior
-    assert expected[4] == 0
-    assert spread[4] > 1.1 * spread[3]
 
 
 def test_an_answer_to_the_amplitude_predicts_left_out_sessions_better_than_none(known_buffer) -> None:

@@ -57,7 +57,7 @@ def test_columns_are_those_of_the_definition_at_once_and_step_by_step(first: flo
     assert columns_of(a, first).shape == (60, COLUMNS)
     assert np.allclose(columns_of(a, first), expected, atol=1e-12)
     running = Filters(np.full((2, 1), first))
-    assert np.allclose([running.step(np.full((2, 1), value))[1, 0] for value in a], expected, atol=1e-12)
+    assert np.allclose([running.step(np.full((2, 1), value))[:, 1, 0].copy() for value in a], expected, atol=1e-12)
 
 
 def sustained(buffer, before):
