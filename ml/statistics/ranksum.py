@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +18,9 @@ from ml.statistics.within_visits.contrasts import Measurements, Unavailable
 EXACT_UP_TO = 2500
 """Exact p-values while n_x * n_y stays at or below this; beyond it the normal approximation is good to more digits than are shown."""
 
+ROUNDING = 1e-12
+"""Relative rounding of a sum of probabilities."""
+
 
 @dataclass(frozen=True)
 class RankSum:
@@ -24,12 +28,14 @@ class RankSum:
 
     Attributes:
         u: Mann-Whitney U of x: pairs with x > y, ties counting one half.
-        p_value: two-sided.
+        p_value: two-sided: twice the smaller tail. Where ties meet groups of unequal size R's `coin` has another one, the chance of all
+            outcomes that lie as far from the mean.
         method: `exact` (given the ties, where there are any), or `normal approximation` (with tie and continuity correction).
         n_x, n_y: sessions on either side.
         median_x, median_y: medians.
         shift: Hodges-Lehmann estimate of x - y, in the unit of the measurements.
-        low, high: its interval; its actual coverage is at least `level` where the method is exact.
+        low, high: its interval; its actual coverage is at least `level` where the method is exact. None where so few sessions cannot have
+            one of that level: even from the smallest difference of a pair to the largest it would cover less.
         level: coverage aimed at.
         superiority: share of pairs with x > y (ties one half), U / (n_x n_y).
     """
@@ -42,8 +48,8 @@ class RankSum:
     median_x: float
     median_y: float
     shift: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
     level: float
     superiority: float
 
@@ -68,7 +74,7 @@ def rank_sum(x: ArrayLike, y: ArrayLike, level: float = 0.95) -> RankSum:
     upper = _tail(x, y, u, null)
     lower = _tail(y, x, x.size * y.size - u, _null(y, x) if exact else None)
     differences = np.sort(np.subtract.outer(x, y).ravel())
-    low, high = _shift_interval(x, y, differences, level, null)
+    low, high = _shift_interval(x.size, y.size, differences, level) or (None, None)
     return RankSum(
         u=u,
         p_value=min(1.0, 2 * min(upper, lower)),
@@ -206,14 +212,17 @@ def _tail(x: NDArray[np.float64], y: NDArray[np.float64], u: float, null: NDArra
     return float(ndtr(-(u - x.size * y.size / 2 - 0.5) / sd))
 
 
-def _shift_interval(
-    x: NDArray[np.float64], y: NDArray[np.float64], differences: NDArray[np.float64], level: float, null: NDArray[np.float64] | None
-) -> tuple[float, float]:
-    """Interval of the shift: the k-th smallest and largest of the pairwise differences, k from the null distribution of U."""
+def _shift_interval(n_x: int, n_y: int, differences: NDArray[np.float64], level: float) -> tuple[float, float] | None:
+    """Interval of the shift: the k-th smallest and largest of the pairwise differences, sorted; None where no k has the level.
+
+    k is that of the distribution without ties. With ties the interval, its ends included, covers at least as often (Lehmann 1963).
+    """
     tail = (1 - level) / 2
-    if null is not None:
-        k = int(np.searchsorted(np.cumsum(null)[::2], tail, side="right"))
+    if n_x * n_y <= EXACT_UP_TO:
+        k = int(np.searchsorted(np.cumsum(u_distribution(n_x, n_y)), tail * (1 + ROUNDING), side="right"))
     else:
-        k = int(np.floor(x.size * y.size / 2 + float(ndtri(tail)) * _standard_deviation(x, y)))
-    k = min(max(k, 1), (differences.size + 1) // 2)
-    return float(differences[k - 1]), float(differences[-k])
+        k = int(np.floor(n_x * n_y / 2 + float(ndtri(tail)) * np.sqrt(n_x * n_y * (n_x + n_y + 1) / 12)))
+        if k < 1 and 1 / comb(n_x + n_y, n_x) <= tail:
+            k = 1  # the approximation knows no end of the distribution
+    k = min(k, (differences.size + 1) // 2)
+    return (float(differences[k - 1]), float(differences[-k])) if k >= 1 else None

@@ -1,13 +1,13 @@
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, product
 from math import comb
 
 import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from ml.statistics.ranksum import as_in_the_paper, p_greater, rank_sum, u_distribution
+from ml.statistics.ranksum import RankSum, as_in_the_paper, p_greater, rank_sum, u_distribution
 from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavailable
 
 
@@ -95,3 +95,43 @@ def test_the_two_one_sided_p_values_cover_everything_and_share_the_observed_rank
     x, y = [1.0, 4.0, 6.0], [2.0, 3.0, 5.0, 7.0]
     probability = u_distribution(3, 4)[round(rank_sum(x, y).u)]
     assert p_greater(x, y) + p_greater(y, x) == pytest.approx(1 + probability)
+
+
+SIZES = [(n, m) for n in range(1, 7) for m in range(1, 7)]
+
+
+def covers(found: RankSum, shift: float) -> bool:
+    """Whether the interval holds a shift; one that does not exist leaves every shift open."""
+    return found.low is None or found.high is None or found.low <= shift <= found.high
+
+
+@pytest.mark.parametrize("level", [0.8, 0.95, 0.99])
+@pytest.mark.parametrize(("n", "m"), SIZES)
+def test_the_interval_covers_as_often_as_its_label_says_over_all_rankings(n: int, m: int, level: float) -> None:
+    everyone = np.arange(n + m, dtype=float)
+    found = [rank_sum(everyone[list(own)], np.delete(everyone, own), level) for own in combinations(range(n + m), n)]
+    assert np.mean([covers(f, 0.0) for f in found]) >= level - 1e-12
+    # there is one exactly where the widest possible one has the level
+    widest = 1 - 2 / comb(n + m, n)
+    assert {f.low is not None for f in found} == {f.high is not None for f in found} == {widest >= level - 1e-12}
+
+
+@pytest.mark.parametrize(("n", "m"), [(2, 2), (2, 3), (3, 3), (2, 5), (3, 4)])
+def test_sizes_that_cannot_have_95_percent_have_no_interval(n: int, m: int) -> None:
+    found = rank_sum(np.arange(n), 0.5 + np.arange(m))
+    assert (found.low, found.high, found.shift) == (None, None, found.shift)
+    assert np.isfinite(found.shift)
+
+
+@pytest.mark.parametrize("level", [0.9, 0.95])
+def test_with_ties_the_interval_covers_at_least_as_often_over_all_outcomes(level: float) -> None:
+    # four sessions against four, each of three values with equal chances
+    hits = [covers(rank_sum(outcome[:4], outcome[4:], level), 0.0) for outcome in product((0.0, 1.0, 2.0), repeat=8)]
+    assert np.mean(hits) >= level
+
+
+def test_one_session_against_thousands_has_the_widest_interval_that_its_level_allows() -> None:
+    many = np.arange(3000, dtype=float)
+    found = rank_sum([1500.5], many)
+    assert (found.low, found.high) == (1500.5 - 2999, 1500.5)
+    assert rank_sum([1500.5], many, level=0.9999).low is None

@@ -322,3 +322,17 @@ def test_what_is_kept_gives_way_to_every_change(client: TestClient, add_visits: 
     assert changed["primary"]["estimate"] < before["primary"]["estimate"]
     assert client.patch(f"/api/v1/sessions/{session}", json={"excluded_reason": "cable", "reason": "x"}).status_code == 200
     assert session not in comparison(client.get(PRIMARY).json(), "rating")["by_visit"][0]["session_ids"]
+
+
+def test_so_few_sessions_have_no_interval_and_the_page_says_why(client: TestClient, add_session: AddSession) -> None:
+    for k in range(2):
+        add_session("rl", grasp=2.0 + 0.1 * k, visit=1)
+    for k in range(3):
+        add_session("cdbs", grasp=1.6 + 0.1 * k, visit=1)
+    behind = client.get("/participants/P1/analyses/visits/rl").text
+    # 0.35 is the median of the pairwise differences; the widest interval would cover 80 %
+    assert "(twice the smaller tail), shift 0.350 without an interval: 2 against 3 sessions are too few for one of 95 %, whatever" in behind
+    for k in range(4):
+        add_session("rl", grasp=2.2 + 0.1 * k, visit=1)
+        add_session("cdbs", grasp=1.9 + 0.1 * k, visit=1)
+    assert "without an interval" not in client.get("/participants/P1/analyses/visits/rl").text

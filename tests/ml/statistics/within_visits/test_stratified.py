@@ -176,3 +176,17 @@ def test_the_interval_of_shufflings_at_random_comes_near_the_exact_one(monkeypat
     drawn = shift_interval(data)
     assert drawn.method is Method.MONTE_CARLO
     assert (drawn.low, drawn.high) == pytest.approx((exact.low, exact.high), abs=0.15)
+
+
+@pytest.mark.parametrize(
+    "sizes", [[(n, m)] for n in range(1, 5) for m in range(1, 5)] + [[(1, 1), (2, 1)], [(2, 2), (1, 2)], [(1, 1), (1, 1), (2, 1)]]
+)
+def test_the_interval_covers_as_often_as_its_label_says_over_all_rankings_within_visits(sizes: list[tuple[int, int]]) -> None:
+    visit = np.concatenate([np.full(n + m, v) for v, (n, m) in enumerate(sizes)])
+    value = np.arange(visit.size, dtype=float)
+    hits = []
+    for chosen in product(*[list(combinations(range(n + m), n)) for n, m in sizes]):
+        tested = np.concatenate([np.isin(np.arange(n + m), own) for (n, m), own in zip(sizes, chosen, strict=True)])
+        found = shift_interval(Measurements.of(value, visit, tested), 0.95)
+        hits.append(found.low <= 0.0 <= found.high)
+    assert np.mean(hits) >= 0.95
