@@ -1,7 +1,8 @@
-"""The command `betaloop study simulate`."""
+"""The commands `betaloop study simulate` and `betaloop study demo-files`."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -36,6 +37,22 @@ def simulate(
         Console().print(table)
 
 
+def demo_files(
+    folder: Annotated[Path, typer.Argument(help="Where the files go: one for each participant.")],
+    participants: Annotated[str, typer.Option(help="Codes with commas between them.")] = "P2,P3,P4",
+    seed: Annotated[int | None, typer.Option(min=0, help="Of what is learned; the demo's own when left out.")] = None,
+) -> None:
+    """Learn the policies of the demo's participants on their earlier visits, and hold the sessions that tested them; takes minutes."""
+    from app.platform.tables import load_tables
+    from app.simulation.demo_making import make
+
+    load_tables()
+    out = Console(stderr=True)
+    for path in make(folder, tuple(participants.split(",")), lambda line: out.print(line, highlight=False), seed):
+        out.print(f"{path}: {path.stat().st_size / 1000:.0f} kB", highlight=False)
+
+
 def register(study: typer.Typer) -> None:
-    """Add the command."""
+    """Add the commands."""
     study.command("simulate", epilog="Example: betaloop study simulate --participants P1 --preset quick")(simulate)
+    study.command("demo-files", epilog="Example: betaloop study demo-files app/simulation/demo_files --participants P3")(demo_files)

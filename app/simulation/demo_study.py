@@ -9,15 +9,20 @@ from typing import Any
 
 from ml.designs import DesignedSession, DesignSettings, lay_out
 from ml.population import PARTICIPANTS, SimulatedSession, rcs_session_zip, run_session, session_table_csv
+from ml.trajectories import SessionTrajectory
 
-VISITS = 3
-"""Visits with data; one more is planned after them."""
+VISITS = {"P1": 3, "P2": 3, "P3": 2, "P4": 2}
+"""First visits, at which nothing but random sessions, cDBS and no DBS ran."""
+TESTED_VISITS = {"P3": 4, "P4": 4}
+"""Visits after them that tested policies; their sessions are stored with the package (`demo_data`)."""
 DAY = ("random", "cdbs", "random", "no_dbs", "cdbs", "random")
 MINUTES = {"random": 10, "cdbs": 10, "no_dbs": 5}
 BETWEEN_VISITS = dt.timedelta(days=28)
-NEXT_VISIT_IN = dt.timedelta(days=14)
+NEXT_VISIT_IN = {"P1": dt.timedelta(days=14), "P2": dt.timedelta(days=1), "P3": dt.timedelta(days=6), "P4": dt.timedelta(days=20)}
+"""From the day on which the demo is begun to the visit that has no sessions yet."""
 MORNING = dt.time(9, 0, tzinfo=dt.UTC)
 BETWEEN_SESSIONS = dt.timedelta(minutes=20)
+_FIRST_SESSION = dt.timedelta(minutes=5)
 DEVICE_PARTICIPANT = "P1"
 """This participant's sessions arrive as RC+S folders, the others' as tables."""
 _STEPS_PER_MINUTE = 30
@@ -70,6 +75,21 @@ class DemoSession:
         """Start of the session proper: a device's recording begins with the window before it; a table states it by its times."""
         return self.begins if device_session(self.code) else None
 
+    def trajectory(self, session_id: int) -> SessionTrajectory:
+        """The session as learning reads it."""
+        ran = self.simulated
+        return SessionTrajectory(
+            session_id=session_id,
+            visit=self.visit,
+            controller=self.controller,
+            lead_beta=ran.lead_beta,
+            beta=ran.beta,
+            amplitude=ran.amplitude,
+            qoc=ran.qoc,
+            random_lower_bound=PARTICIPANTS[self.code].mdp_settings().lower_bound if self.design else None,
+            holds=self.design.holds if self.design else (),
+        )
+
     def file(self) -> tuple[str, bytes]:
         """Name and bytes of the session's file."""
         return session_file(f"{self.code}-visit{self.visit}-session{self.ordinal}", self.simulated, self.begins)
@@ -90,11 +110,21 @@ class DemoSession:
 
 @dataclass(frozen=True)
 class DemoVisit:
-    """One visit; the last has no session yet: it waits for a plan."""
+    """One visit. Those that tested policies have no simulated sessions here; the last one has none at all: it waits for its day."""
 
     number: int
-    date: dt.date
+    begins: dt.datetime
     sessions: tuple[DemoSession, ...]
+
+    @property
+    def date(self) -> dt.date:
+        """The day of the visit."""
+        return self.begins.date()
+
+    @property
+    def first_session(self) -> dt.datetime:
+        """When its first session begins."""
+        return self.begins + _FIRST_SESSION
 
 
 def participant_body(code: str) -> dict[str, Any]:
@@ -114,35 +144,57 @@ def participant_body(code: str) -> dict[str, Any]:
     }
 
 
+def characteristics_body(code: str) -> dict[str, Any]:
+    """A participant's characteristics for the REST interface, as its model has them."""
+    model = PARTICIPANTS[code]
+    programme = model.programme
+    contacts = [("C" if number == 16 else str(number)) + "+" for number in programme.anodes] + [
+        f"{number}-" for number in programme.cathodes
+    ]
+    lead = {
+        "hemisphere": model.hemisphere,
+        "target": "stn",
+        "sensing": f"{programme.sense_plus}-{programme.sense_minus}",
+        "stimulating": "".join(contacts),
+    }
+    doses = [{"drug": "levodopa", "mg": 100, "at": f"{MORNING.hour + hour:02.0f}:00"} for hour in model.regimen.levodopa_h]
+    known = {"leads": [lead], "symptoms": ["tremor", "bradykinesia"], "hand": model.hand, "medication": doses}
+    return {"version": 0, "characteristics": known, "reason": "stated at enrolment"}
+
+
 def designs(code: str) -> tuple[DesignedSession, ...]:
     """What the participant's random sessions try: the stratified design of a new participant, over the demo's visits."""
     wanted = DesignSettings(
-        visits=VISITS, sessions=DAY.count("random"), steps=MINUTES["random"] * _STEPS_PER_MINUTE, seed=list(PARTICIPANTS).index(code)
+        visits=VISITS[code], sessions=DAY.count("random"), steps=MINUTES["random"] * _STEPS_PER_MINUTE, seed=list(PARTICIPANTS).index(code)
     )
     return lay_out(wanted)
 
 
 def demo_visits(code: str, today: dt.date) -> list[DemoVisit]:
-    """The participant's visits, a month apart; the next lies two weeks after `today`."""
+    """The participant's visits, a month apart; the next one lies `NEXT_VISIT_IN` after `today`."""
     visits = []
     designed = iter(designs(code))
-    first = dt.datetime.combine(today + NEXT_VISIT_IN - VISITS * BETWEEN_VISITS, MORNING)
-    for number in range(1, VISITS + 2):
+    held = VISITS[code] + TESTED_VISITS.get(code, 0)
+    first = dt.datetime.combine(today + NEXT_VISIT_IN[code] - held * BETWEEN_VISITS, MORNING)
+    for number in range(1, held + 2):
         day = first + BETWEEN_VISITS * (number - 1)
-        sessions = (
-            tuple(
-                DemoSession(
-                    code,
-                    number,
-                    i + 1,
-                    controller,
-                    day + BETWEEN_SESSIONS * i + dt.timedelta(minutes=5),
-                    next(designed) if controller == "random" else None,
-                )
-                for i, controller in enumerate(DAY)
+        sessions = tuple(
+            DemoSession(
+                code,
+                number,
+                i + 1,
+                controller,
+                day + _FIRST_SESSION + BETWEEN_SESSIONS * i,
+                next(designed) if controller == "random" else None,
             )
-            if number <= VISITS
-            else ()
+            for i, controller in enumerate(DAY if number <= VISITS[code] else ())
         )
-        visits.append(DemoVisit(number, day.date(), sessions))
+        visits.append(DemoVisit(number, day, sessions))
     return visits
+
+
+def trajectories(code: str) -> list[SessionTrajectory]:
+    """The sessions of the first visits as learning reads them."""
+    any_day = dt.date(2026, 1, 1)
+    sessions = [session for visit in demo_visits(code, any_day) for session in visit.sessions]
+    return [session.trajectory(number) for number, session in enumerate(sessions, start=1)]
