@@ -69,6 +69,7 @@ class Settings(BaseSettings):
     decode_seconds: int = Field(180, ge=5, description="Processor time that reading one uploaded file may take, s.")
     log_level: str = Field("INFO", description="DEBUG, INFO, WARNING or ERROR.")
     development: bool = Field(False, description="Show pages for those who build on betaloop, such as /styleguide.")
+    demo: bool = Field(False, description="Say on the first page that this is the demo, and where to begin; `betaloop demo` sets it.")
     log_json: bool = Field(False, description="Log lines as JSON.")
 
     files_url: str | None = Field(

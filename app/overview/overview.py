@@ -12,9 +12,11 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.repository import studies
 from app.overview import state, wording
+from app.overview.first_screen import offers
 from app.platform.database import Db
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
+from app.settings import get_settings
 from app.study import repository as study
 
 router = APIRouter()
@@ -46,6 +48,8 @@ def overview(
         progress=wording.progress,
         in_days=wording.in_days,
         total=total,
+        demo=get_settings().demo,
+        offers=offers(rows, states) if get_settings().demo else [],
         withdrawn=withdrawn == "yes",
         paging=paging,
         phases=state.PHASES,

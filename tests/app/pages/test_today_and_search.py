@@ -18,6 +18,7 @@ from app.overview.state import states
 from app.overview.tasks import Actor, Task
 from app.platform.jobs import service as jobs
 from app.platform.jobs.models import Job, JobStatus
+from app.settings import get_settings
 from app.study.enrolment.schemas import ParticipantIn
 from app.study.enrolment.service import enrol
 from app.study.models import Participant, Visit
@@ -177,6 +178,17 @@ def test_energy_saved_is_weighted_by_minutes() -> None:
     assert both is not None
     assert (both.share, both.minutes, both.sessions) == (pytest.approx(0.325), 40.0, 4)
     assert overall([]) is None
+
+
+def test_today_says_that_it_is_the_demo_there_alone(browser: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "This is the demo" not in browser.get("/").text
+    monkeypatch.setenv("BETALOOP_DEMO", "true")
+    get_settings.cache_clear()
+    page = browser.get("/").text
+    assert "This is the demo" in page
+    assert "simulated and not fitted to patients" in page
+    assert "What would you test at P1&#39;s next visit?" in page
+    assert "Participants still arrive" in page
 
 
 def _job(db: Session, status: JobStatus, number: int = 0) -> Job:
