@@ -115,7 +115,7 @@ class RecordedSession:
             lead_beta=self.lead_beta,
             beta=self.beta,
             amplitude=self.amplitude_ma / cdbs_ma,
-            qoc=Qoc(**self.qoc),  # type: ignore[arg-type]
+            qoc=Qoc(**self.qoc),
         )
 
 

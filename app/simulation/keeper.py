@@ -1,6 +1,6 @@
-"""The process of a running demo: it waits for the web service and the worker, and stops them.
+"""The process of a running demo: it waits for the web service, the worker and the loader of the study, and stops them.
 
-`betaloop demo` becomes this process once its study is loaded. The libraries it needed until then hold 0.3 GB, so this module imports none.
+`betaloop demo` becomes this process once its page is up. The libraries it needed until then hold 0.3 GB, so this module imports none.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -33,6 +33,8 @@ MODULE = "app.simulation.keeper"
 ENDING = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 STOP_TIMEOUT_S = 20.0
 ENDED_BY_ITSELF = "The web service or the worker ended by itself."
+NOT_LOADED = "The demo's study could not be loaded; started again, the demo goes on where it was."
+READY = "\n  Ready. Ctrl-C stops the demo and keeps its data; `make demo` starts it again."
 _POLL_S = 0.05
 _LOOK_S = 1.0
 
@@ -64,17 +66,18 @@ class OwnChild:
             os.kill(self._pid, number)
 
 
-def become_keeper(pids: Iterable[int], logs: Path) -> NoReturn:
+def become_keeper(pids: Sequence[int], logs: Path, loads: bool) -> NoReturn:
     """Replace the program of this process by the keeper of its children.
 
     Args:
         pids: the children, in the order of their start.
         logs: folder with their logs, named where one of them ends by itself.
+        loads: the last child loads the study and ends when it is loaded.
     """
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)  # the new program inherits the mask
     sys.stdout.flush()
     sys.stderr.flush()
-    os.execv(sys.executable, [sys.executable, "-m", MODULE, str(logs), *map(str, pids)])  # noqa: S606 - our own words, no shell
+    os.execv(sys.executable, [sys.executable, "-m", MODULE, str(logs), str(int(loads)), *map(str, pids)])  # noqa: S606 - our own words, no shell
 
 
 def stop(services: Sequence[Service]) -> None:
@@ -94,18 +97,32 @@ def main(arguments: Sequence[str]) -> int:
 
     Signals stay blocked and are asked for. A handler that raises can be lost where Python calls it within a destructor.
     """
-    logs, *pids = arguments
+    logs, loads, *pids = arguments
     services = [OwnChild(int(pid)) for pid in pids]
+    loader = services.pop() if loads == "1" else None
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
-    while all(service.poll() is None for service in services):
+    problem, ready = None, False
+    while problem is None:
         if signal.sigtimedwait(ENDING, _LOOK_S) is not None:
-            sys.stdout.write("\n  Stopping …\n")
-            sys.stdout.flush()
-            stop(services)
-            return 0
-    sys.stderr.write(f"betaloop: {ENDED_BY_ITSELF} See the files in {logs}.\n")
-    stop(services)
-    return 1
+            _say("\n  Stopping …")
+            break
+        if any(service.poll() is not None for service in services):
+            problem = ENDED_BY_ITSELF
+        elif loader is not None and (code := loader.poll()) is not None:
+            loader = None
+            problem = NOT_LOADED if code else None
+        elif loader is None and not ready:
+            _say(READY)
+            ready = True
+    if problem is not None:
+        sys.stderr.write(f"betaloop: {problem} See the files in {logs}.\n")
+    stop([*services, *([loader] if loader is not None else [])])
+    return 0 if problem is None else 1
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from app.simulation.keeper import MODULE
+from app.simulation.keeper import MODULE, READY
 
 SERVICE = """
 import signal, sys, time
@@ -36,14 +36,18 @@ folder = Path(sys.argv[1])
 started = [subprocess.Popen([sys.executable, "-c", {SERVICE!r}, name, str(folder)]) for name in ("web", "worker")]
 while not all((folder / name).exists() for name in ("web", "worker")):
     time.sleep(0.05)
-become_keeper((one.pid for one in started), folder / "log")
+loader = sys.argv[2:] and subprocess.Popen([sys.executable, "-c", sys.argv[2]])
+become_keeper([one.pid for one in [*started, *([loader] if loader else [])]], folder / "log", loads=bool(loader))
 """
 
 
 @pytest.fixture
-def demo(tmp_path: Path) -> Iterator[psutil.Popen]:
-    """A process that has two services and has become their keeper."""
-    process = psutil.Popen([sys.executable, "-c", PROGRAM, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def demo(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[psutil.Popen]:
+    """A process that became the keeper of two services, and of a loader where the test names its program."""
+    loader = getattr(request, "param", [])
+    process = psutil.Popen(
+        [sys.executable, "-c", PROGRAM, str(tmp_path), *loader], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     deadline = time.monotonic() + 60
     while MODULE not in process.cmdline():
         assert time.monotonic() < deadline
@@ -69,7 +73,7 @@ def test_a_signal_stops_the_services_and_then_itself(demo: psutil.Popen, tmp_pat
     assert len(services) == 2
     demo.send_signal(number)  # also one that comes before the keeper can handle it
     said, complained = demo.communicate(timeout=60)
-    assert (demo.returncode, said.strip(), complained) == (0, "Stopping …", "")
+    assert (demo.returncode, said.replace(READY, "").strip(), complained) == (0, "Stopping …", "")
     assert not [one for one in services if one.is_running()]
     assert set((tmp_path / "ended").read_text().split()) == {"web", "worker"}
 
@@ -78,7 +82,33 @@ def test_a_service_that_ends_by_itself_ends_the_demo_with_a_sentence(demo: psuti
     web, worker = demo.children()
     web.kill()
     said, complained = demo.communicate(timeout=60)
-    assert (demo.returncode, said) == (1, "")
+    assert (demo.returncode, said.replace(READY, "").strip()) == (1, "")
     assert complained == f"betaloop: The web service or the worker ended by itself. See the files in {tmp_path / 'log'}.\n"
     assert not worker.is_running()
     assert (tmp_path / "ended").read_text().split() == ["worker"]
+
+
+@pytest.mark.parametrize("demo", [["pass"]], indirect=True)
+def test_it_says_when_the_study_is_loaded_and_goes_on(demo: psutil.Popen) -> None:
+    assert demo.stdout is not None
+    assert "".join(demo.stdout.readline() for _ in range(2)).rstrip("\n") == READY
+    assert demo.poll() is None
+    demo.send_signal(signal.SIGINT)
+    assert demo.wait(60) == 0
+
+
+@pytest.mark.parametrize("demo", [["import sys; sys.exit(1)"]], indirect=True)
+def test_a_study_that_cannot_be_loaded_ends_the_demo_with_a_sentence(demo: psutil.Popen, tmp_path: Path) -> None:
+    _, complained = demo.communicate(timeout=60)
+    assert demo.returncode == 1
+    assert complained.startswith("betaloop: The demo's study could not be loaded; started again, the demo goes on where it was.")
+    assert set((tmp_path / "ended").read_text().split()) == {"web", "worker"}
+
+
+@pytest.mark.parametrize("demo", [["import time; time.sleep(600)"]], indirect=True)
+def test_a_signal_stops_the_loader_too(demo: psutil.Popen) -> None:
+    children = demo.children()
+    assert len(children) == 3
+    demo.send_signal(signal.SIGINT)
+    assert demo.wait(60) == 0
+    assert not [one for one in children if one.is_running()]
