@@ -18,7 +18,10 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="BETALOOP_", env_file=".env", extra="ignore")
 
     data_dir: Path = Field(Path("var"), description="Folder of the embedded database, stored files and job folders.")
-    database_url: str | None = Field(None, description="PostgreSQL URL; without one an embedded PostgreSQL runs in the data folder.")
+    database_url: str | None = Field(
+        None,
+        description="PostgreSQL URL, several hosts as HOST:PORT,HOST:PORT; without one an embedded PostgreSQL runs in the data folder.",
+    )
     owner_url: str | None = Field(
         None, description="PostgreSQL URL of the role that owns the tables, for migrate, backup and restore; database_url's when left out."
     )

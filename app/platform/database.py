@@ -16,6 +16,7 @@ from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.exc import DBAPIError, ProgrammingError
 from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 
+from app.platform.connection import NOTICED, connection_url
 from app.platform.embedded import place
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.errors import passing
@@ -57,7 +58,7 @@ def database_url(settings: Settings | None = None) -> str:
     """The SQLAlchemy URL; starts the embedded PostgreSQL when the settings name none."""
     settings = settings or get_settings()
     if settings.database_url:
-        return _external("BETALOOP_DATABASE_URL", settings.database_url)
+        return connection_url("BETALOOP_DATABASE_URL", settings.database_url)
     return _embedded_server(settings).url("betaloop")
 
 
@@ -65,15 +66,8 @@ def owner_url(settings: Settings | None = None) -> str:
     """The same for the role that owns the tables: migrations, backup, restore. The service's where the settings name none."""
     settings = settings or get_settings()
     if settings.database_url and settings.owner_url:
-        return _external("BETALOOP_OWNER_URL", settings.owner_url)
+        return connection_url("BETALOOP_OWNER_URL", settings.owner_url)
     return database_url(settings) if settings.database_url else _embedded_server(settings).owner_url("betaloop")
-
-
-def _external(setting: str, url: str) -> str:
-    scheme, _, rest = url.partition("://")
-    if scheme not in {"postgres", "postgresql", "postgresql+psycopg"}:
-        raise RuntimeError(f"{setting} must start with postgresql://, not {scheme}://: betaloop runs on PostgreSQL alone")
-    return f"postgresql+psycopg://{rest}"
 
 
 def _embedded_server(settings: Settings) -> EmbeddedPostgres:
@@ -120,7 +114,8 @@ def database_place(settings: Settings | None = None) -> str:
     """Where the database lies, for people: a folder, or the address of a PostgreSQL of one's own without its password. Starts nothing."""
     settings = settings or get_settings()
     if settings.database_url:
-        return make_url(database_url(settings)).render_as_string()
+        url = make_url(database_url(settings))
+        return url.difference_update_query(NOTICED).render_as_string()
     asked = settings.data_dir.resolve() / "postgres"
     return str(place.recorded(asked) or f"{asked} (made at the first start, outside if PostgreSQL's user cannot enter this folder)")
 

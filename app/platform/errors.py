@@ -129,6 +129,8 @@ class StorageFull(BetaloopError):
 
 
 _DISK_FULL = "53100"
+_READ_ONLY = "25006"
+"""Of a standby that is not promoted yet, or a server that was made read-only."""
 _IN_THE_WAY = {"40001", "40P01"}
 """Of a transaction that was given up for another one: the same request may be sent again."""
 _AWAY = {"08", "57P", "533"}
@@ -150,6 +152,10 @@ def passing(error: BaseException) -> BetaloopError | None:
         return no_room()
     if state in _IN_THE_WAY:
         return GivenUp("Another request changed the same at the same moment.", "Look at what is stored, then send this again.")
+    if state == _READ_ONLY:
+        return DatabaseAway(
+            "The database takes no writes for the moment.", "It does again by itself. Wait a few seconds, then send this again."
+        )
     invalidated = isinstance(error, DBAPIError) and error.connection_invalidated
     unreached = isinstance(error, PoolTimeout) or (isinstance(error, OperationalError) and not state)
     if invalidated or unreached or state[:2] in _AWAY or state[:3] in _AWAY:

@@ -215,6 +215,9 @@ def persist(action: Callable[[], Value], check: Callable[[], None]) -> Value:
 
 
 def _worth_repeating(error: DBAPIError) -> bool:
-    """The connection broke or the database restarts (class 08, 57P), or transactions got into each other's way (class 40)."""
+    """The connection broke or the database restarts (class 08, 57P), transactions got into each other's way (class 40), or the database
+    takes no writes for now: read-only before a standby is promoted (25006), its disk full (53100).
+    """
     state = getattr(error.orig, "sqlstate", None)
-    return error.connection_invalidated or state is None or state[:2] in {"08", "40"} or state[:3] == "57P"
+    waits = state in {"25006", "53100"}
+    return error.connection_invalidated or state is None or waits or state[:2] in {"08", "40"} or state[:3] == "57P"
