@@ -1,1 +1,1 @@
-"""Database, files, jobs, security, audit and charts: what every phase stands on."""
+"""Base of every phase: database, files, jobs, security, audit and charts."""

@@ -1,7 +1,7 @@
 """Stored files in a bucket (S3) that web and workers on any number of machines share; each machine holds copies of what it reads.
 
-The bucket holds an object `files/ab/abcd…` for each file, named by its hash as in the folder, and `keys/NAME` with a fingerprint of each
-key in `secrets/`: machines with other keys would encrypt what no other machine can open, so they do not start.
+The bucket has an object `files/ab/abcd…` for each file, named by its hash as in the folder. It also has `keys/NAME` with a fingerprint of
+each key in `secrets/`. Machines with other keys would encrypt what no other machine can open, so they do not start.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ class StoreAway(BetaloopError):
 
 
 def bucket() -> Bucket | None:
-    """The bucket of this installation; None where files lie in the data folder."""
+    """Open the bucket of this installation; None where files are in the data folder."""
     settings = get_settings()
     return _bucket(settings.files_url, settings.files_endpoint, os.getpid()) if settings.files_url else None
 
 
 @lru_cache(maxsize=2)
 def _bucket(url: str, endpoint: str | None, _process: int) -> Bucket:
-    """One for each process: what a parent has opened, its children cannot use."""
+    """Make a bucket for each process: what a parent has opened, its children cannot use."""
     return Bucket(url, endpoint)
 
 
@@ -71,7 +71,7 @@ class Bucket:
             raise RuntimeError("Files in a bucket need the packages of betaloop[s3].") from error
 
     def size(self, sha256: str) -> int | None:
-        """Bytes of an object; None where there is none."""
+        """Return the size of an object in bytes; None where there is none."""
         try:
             return int(self._asked(lambda: self._fs.info(self._name(sha256)))["size"])
         except FileNotFoundError:
@@ -97,7 +97,7 @@ class Bucket:
         return True
 
     def hash_of(self, sha256: str) -> str | None:
-        """SHA-256 of the bytes that an object really has, read whole; None where there is none."""
+        """Compute the SHA-256 of the bytes that an object really has, read whole; None where there is none."""
         try:
             with self.opened(sha256) as source:
                 return self._asked(lambda: hashlib.file_digest(source, "sha256").hexdigest())  # type: ignore[arg-type]
@@ -106,7 +106,7 @@ class Bucket:
 
     @contextmanager
     def opened(self, sha256: str) -> Iterator[BinaryIO]:
-        """An object to read from its begin on. Raises FileNotFoundError."""
+        """Open an object to read it from its beginning. Raises FileNotFoundError."""
         source = self._asked(lambda: self._fs.open(self._name(sha256), "rb", cache_type="readahead", block_size=8 * CHUNK))
         with source:
             yield source
@@ -119,11 +119,11 @@ class Bucket:
             return
 
     def empty(self) -> bool:
-        """Whether there is no object at all under the prefix."""
+        """Decide whether there is no object at all under the prefix."""
         return not self._asked(lambda: self._fs.find(self._root, maxdepth=3))
 
     def check_keys(self, settings: Settings) -> None:
-        """Hold this machine's keys against those of the other machines; the first machine makes them, and leaves their fingerprints.
+        """Compare this machine's keys with those of the other machines; the first machine makes them, and leaves their fingerprints.
 
         Raises:
             RuntimeError: a key is missing here, or another one.
@@ -148,7 +148,7 @@ class Bucket:
         return f"{self._root}/files/{sha256[:2]}/{sha256}"
 
     def _asked(self, ask: Callable[[], T]) -> T:
-        """What the bucket says. Raises FileNotFoundError, or StoreAway for all else that goes wrong there."""
+        """Call the bucket. Raises FileNotFoundError, or StoreAway for all else that goes wrong there."""
         from botocore.exceptions import BotoCoreError, ClientError
 
         try:

@@ -13,7 +13,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 """Of an OSError where no room is left, on the disk or for its user."""
 RETRY_S = 5
-"""Seconds after which somebody may try again what failed by a fault that passes."""
+"""Seconds after which a request may be retried that failed by a temporary fault."""
 
 
 class BetaloopError(Exception):
@@ -35,7 +35,7 @@ class BetaloopError(Exception):
         self.detail, self.hint, self.extra = detail, hint, extra
 
     def problem(self, instance: str) -> dict[str, Any]:
-        """The problem document."""
+        """Build the problem document."""
         body: dict[str, Any] = {"type": "about:blank", "title": self.title, "status": self.status}
         body |= {"detail": self.detail, "instance": instance}
         if self.hint:
@@ -65,13 +65,13 @@ class Conflict(BetaloopError):
 
 
 class EntriesOfAnother(Conflict):
-    """A form that somebody else had filled in before another person signed in."""
+    """A form that one person had filled in before another signed in."""
 
     title = "Entered by somebody else"
 
 
 class Unauthorized(BetaloopError):
-    """Nobody is signed in."""
+    """The caller is not signed in."""
 
     status = 401
     title = "Sign in first"
@@ -138,8 +138,8 @@ _AWAY = {"08", "57P", "533"}
 
 
 def passing(error: BaseException) -> BetaloopError | None:
-    """A fault beneath the service that is nobody's input and ends without a change of ours, in words: its disk is full (507), the
-    database or the store of files is away, or a transaction was given up (503). None for every other error.
+    """Return a temporary infrastructure fault: disk full (507), database or store of files away, or transaction given up (503). None for
+    every other error.
     """
     if isinstance(error, BetaloopError):
         return error if error.status in (503, 507) else None
@@ -167,7 +167,7 @@ def passing(error: BaseException) -> BetaloopError | None:
 
 
 def no_room() -> StorageFull:
-    """What is said where the disk is full."""
+    """Make the error for a full disk."""
     return StorageFull(
         "There is no room left on the disk.", "Ask your administrator to make room; what was stored before is safe. Then try again."
     )
@@ -175,7 +175,7 @@ def no_room() -> StorageFull:
 
 @contextmanager
 def about(field: str) -> Iterator[None]:
-    """What is wrong inside is wrong with one field, where it names none itself."""
+    """Assign an error inside to one field, where it names none itself."""
     try:
         yield
     except BetaloopError as error:

@@ -59,7 +59,7 @@ class MissingFile(BetaloopError):
 
 
 def path_of(sha256: str) -> Path:
-    """Where bytes of this hash can be read on this machine; with a bucket, they are copied here first. No such file: they are missing."""
+    """Locate bytes of this hash on this machine; with a bucket, they are copied here first. No such file: they are missing."""
     path = _place(sha256)
     store = bucket()
     if store is None:
@@ -93,7 +93,7 @@ def _copy_here(store: Bucket, sha256: str, path: Path) -> None:
 
 @contextmanager
 def borrowed(sha256: str) -> Iterator[Path]:
-    """Bytes of this hash for as long as the context lasts: with a bucket, no copy of them stays on this machine."""
+    """Lend bytes of this hash for as long as the context lasts: with a bucket, no copy of them stays on this machine."""
     store = bucket()
     if store is None:
         yield _place(sha256)
@@ -115,7 +115,7 @@ def remove(sha256: str) -> None:
 
 
 def is_whole(sha256: str, size: int | None = None, hashes: bool = True) -> bool:
-    """Whether the store has the bytes of a hash: of this size, where one is given, and with this hash, where they are to be read."""
+    """Check that the store has the bytes of a hash: of this size, where one is given. With `hashes` the bytes are read and hashed."""
     store = bucket()
     if store is not None:
         has = store.size(sha256)
@@ -129,7 +129,7 @@ def is_whole(sha256: str, size: int | None = None, hashes: bool = True) -> bool:
 def prune_copies() -> int:
     """Remove copies of a bucket's files that were used longest ago, beyond the room for them; how many.
 
-    Those of the last hour stay, and those that the bucket does not have: files of before there was a bucket are no copies.
+    Those of the last hour stay. So do those that the bucket does not have: files that are older than the bucket are no copies.
     """
     settings, store = get_settings(), bucket()
     if store is None or not settings.files_dir.is_dir():
@@ -156,7 +156,7 @@ def prune_copies() -> int:
 
 
 def prune_copies_beside() -> None:
-    """Prune in a thread of its own, one at a time: a bucket that hangs must hold nobody up."""
+    """Prune in a thread of its own, one at a time, so that a bucket that hangs delays no request."""
     if not get_settings().files_url:
         return
     with _pruning_guard:
@@ -174,10 +174,10 @@ _folder_guard = threading.Lock()
 
 
 def draft_path() -> Path:
-    """A fresh, empty file inside the store's folder, on the same file system, for bytes whose hash is not yet known.
+    """Make a fresh, empty file inside the store's folder, on the same file system, for bytes whose hash is not yet known.
 
-    It lies in a folder of this process, both readable by the owner only; what a killed process leaves there, `remove_abandoned` removes.
-    Bytes that may name a person do not belong here, but into `raw_bytes.raw_file`.
+    It is in a folder of this process, both readable by the owner only; `remove_abandoned` removes what a killed process leaves there. Bytes
+    that may name a person do not belong here, but into `raw_bytes.raw_file`.
     """
     path = _draft_folder() / secrets.token_hex(16)
     os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
@@ -189,7 +189,7 @@ def _incoming() -> Path:
 
 
 def _draft_folder() -> Path:
-    """This process's folder of drafts, locked as long as the process lives."""
+    """Return this process's folder of drafts, locked as long as the process lives."""
     incoming = _incoming().resolve()
     with _folder_guard:
         if _own_folder:
@@ -202,14 +202,14 @@ def _draft_folder() -> Path:
         while True:
             folder = incoming / secrets.token_hex(8)
             folder.mkdir(mode=0o700)
-            # somebody who clears up may look between any two of these lines: then this folder is theirs, and another one is made
+            # another process that clears up may look between any two of these lines: then this folder is theirs, and another one is made
             if (taken := _locked(folder)) is not None:
                 _own_folder.append((folder, taken))
                 return folder
 
 
 def _locked(folder: Path) -> int | None:
-    """A descriptor that holds the folder's lock; None where another process holds it, or has removed the folder."""
+    """Lock a folder and return the descriptor of the lock; None where another process has it, or has removed the folder."""
     try:
         lock = os.open(folder / _LOCK, os.O_CREAT | os.O_RDWR, 0o600)
     except FileNotFoundError:
@@ -246,7 +246,7 @@ def remove_abandoned() -> int:
 
 @contextmanager
 def draft_folder() -> Iterator[Path]:
-    """A fresh folder beside the drafts of this process, for work on one of them; it goes with all that is in it, as drafts do."""
+    """Make a fresh folder next to the drafts of this process, for work on one of them. It goes with its content, as drafts do."""
     folder = private_folder(_draft_folder() / secrets.token_hex(16))
     try:
         yield folder
@@ -256,9 +256,9 @@ def draft_folder() -> Iterator[Path]:
 
 @contextmanager
 def nameless_file() -> Iterator[tuple[BinaryIO, Path]]:
-    """A file without a name, and a path by which this process and its children, and no other user, can open it again.
+    """Make a file without a name, and a path by which this process and its children, and no other user, can open it again.
 
-    It is gone when the context ends and when the process is killed, at whatever moment: nobody has to clear up.
+    It is gone when the context ends and when the process is killed, at whatever moment: no cleaning up is needed.
     """
     draft = draft_path()
     with draft.open("w+b", buffering=0) as file:
@@ -274,7 +274,7 @@ def nameless_file() -> Iterator[tuple[BinaryIO, Path]]:
 
 @contextmanager
 def in_memory(content: bytes) -> Iterator[Path]:
-    """A path by which this process and its children can read a few bytes that are on no disk, as long as the context lasts.
+    """Make a path by which this process and its children can read a few bytes, as long as the context lasts. The bytes are on no disk.
 
     Where the system has no files in memory (it is not Linux), they are in a draft for the owner alone.
     """
@@ -289,7 +289,7 @@ def in_memory(content: bytes) -> Iterator[Path]:
 
 
 def _path_of_open(file: BinaryIO) -> Path:
-    """The path of an open file, with or without a name, where the system lists open files."""
+    """Return the path of an open file, with or without a name, where the system lists open files."""
     return _OPEN_FILES / str(os.getpid()) / "fd" / str(file.fileno())
 
 
@@ -338,7 +338,7 @@ def keep(draft: Path, *, copy: bool = True) -> str:
 
 
 def whole_at(path: Path, sha256: str) -> bool:
-    """Whether a file is there with the bytes of its hash. One that cannot be read is damaged."""
+    """Check that a file is there with the bytes of its hash. One that cannot be read is damaged."""
     try:
         return hash_file(path)[0] == sha256
     except FileNotFoundError:
@@ -349,7 +349,7 @@ def whole_at(path: Path, sha256: str) -> bool:
 
 
 def read(sha256: str) -> bytes:
-    """The bytes of a hash.
+    """Read the bytes of a hash.
 
     Raises:
         MissingFile: they are gone or damaged.
@@ -375,7 +375,7 @@ def close_to_others() -> None:
 
 
 def hash_file(path: Path) -> tuple[str, int]:
-    """SHA-256 in hex and size of a file."""
+    """Compute SHA-256 in hex and size of a file."""
     with path.open("rb") as f:
         return hashlib.file_digest(f, "sha256").hexdigest(), path.stat().st_size
 

@@ -24,7 +24,8 @@ class _Doubled(dict[str, Any]):
 
 
 def doubled_member(body: bytes) -> tuple[str, str] | None:
-    """Where a JSON document has an object with a member stated twice, and which; None where there is none, or this is no JSON."""
+    """Find an object of a JSON document with a member stated twice: where it is, and which. None where there is none, or this is no
+    JSON."""
     found: list[_Doubled] = []
 
     def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -44,7 +45,7 @@ def doubled_member(body: bytes) -> tuple[str, str] | None:
 
 
 def _place(document: Any) -> tuple[str, str]:
-    """Where the outermost doubled member stands, as errors of validation name places."""
+    """Locate the outermost doubled member, as errors of validation name places."""
     waiting: list[tuple[str, Any]] = [("body", document)]
     for where, part in waiting:
         if isinstance(part, _Doubled):
@@ -86,7 +87,7 @@ class UniqueMembers:
 
 
 async def _received(receive: Receive) -> tuple[list[Message], HTTPException | None]:
-    """The parts of a body; what broke it off is raised where it is read, whose handlers know it."""
+    """Receive the parts of a body. What broke it off is raised where it is read, whose handlers know it."""
     came: list[Message] = []
     try:
         while not came or came[-1].get("more_body", False):

@@ -17,7 +17,7 @@ _lock = Lock()
 
 
 def kept(key: Hashable, compute: Callable[[], T]) -> T:
-    """A result under a key that names everything it depends on; computed where this process has not kept it."""
+    """Return a result under a key that names everything it depends on; compute it where this process has not cached it."""
     known = recalled(key)
     return keep(key, compute()) if known is None else cast("T", known)
 
@@ -32,7 +32,7 @@ def keep(key: Hashable, result: T) -> T:
 
 
 def recalled(key: Hashable) -> Any:
-    """The result that this process has kept under a key, or None."""
+    """Return the result that this process has cached under a key, or None."""
     with _lock:
         if key in _kept:
             _kept.move_to_end(key)

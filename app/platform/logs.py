@@ -44,13 +44,13 @@ def _console() -> structlog.dev.ConsoleRenderer:
 
 
 def _to_standard_error(*_: Any) -> structlog.PrintLogger:
-    """Standard error as it is when a line is written: who redirects it later gets the lines too."""
+    """Log to standard error as it is when a line is written, so that a later redirection gets the lines too."""
     return structlog.PrintLogger(cast(TextIO, _Forgiving(sys.stderr)))
 
 
 class _Forgiving:
-    """A stream that loses lines where they cannot be written, as the standard library's loggers do: the log may lie on the disk that is
-    full, and whoever is told so must not get an error of ours instead."""
+    """A stream that loses lines where they cannot be written, as the standard library's loggers do. The log may be on a full disk. A caller
+    who gets that message must not get an error of ours instead."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

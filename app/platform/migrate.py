@@ -1,4 +1,4 @@
-"""Bring the database to the newest schema."""
+"""Migration of the database to the newest schema."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Raw bytes of uploads, which may name a person: in files without a name, encrypted with keys that never leave the memory.
 
-Whoever reads the disk, while the service runs or after it was killed, finds neither a file nor a byte that can be read. Each file has a key
-of its own (AES-256 in counter mode, which decrypts from any place on), drawn when the file is made and forgotten with it. Where the system
-has no files in memory (it is not Linux), a key lies beside its file as long as that is used (`files.in_memory`).
+No reader of the disk finds a file or a byte that can be read, neither while the service runs nor after it was killed. Each file has a key
+of its own (AES-256 in counter mode, which decrypts from any place on). The key is drawn when the file is made and forgotten with it. Where
+the system has no files in memory (it is not Linux), a key is on disk with its file as long as that is used (`files.in_memory`).
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _KEY_BYTES, _BLOCK = 32, 16
 class _Encrypted(io.RawIOBase):
     """The plain bytes of an encrypted file, at any place of it; holds no more of them than one call asks for.
 
-    A place that is written twice has the same key stream twice: that happens to a zip's frame alone, to lengths and checksums, which say
-    nothing of a person.
+    A place that is written twice has the same key stream twice. That happens to a zip's frame alone, to lengths and checksums, which
+    identify no person.
     """
 
     def __init__(self, file: BinaryIO, key: bytes) -> None:
@@ -69,7 +69,7 @@ class _Encrypted(io.RawIOBase):
         super().close()
 
     def _crypt(self, content: Any) -> bytes:
-        """Encrypt or decrypt what stands, or is to stand, at the present place."""
+        """Encrypt or decrypt the content for the present place."""
         block, within = divmod(self._at, _BLOCK)
         cipher = Cipher(algorithms.AES256(self._key), modes.CTR(block.to_bytes(_BLOCK, "big"))).encryptor()
         cipher.update(bytes(within))
@@ -90,26 +90,27 @@ class RawFile:
     name: str = "file"
 
     def open(self, mode: Literal["rb"] = "rb") -> BinaryIO:
-        """The plain bytes; a stream that is open outlives the context."""
+        """Open the plain bytes; a stream that is open outlives the context."""
         key = self.key.read_bytes()
         return io.BufferedReader(_Encrypted(self.encrypted.open("rb", buffering=0), key), BUFFER)
 
     def sha256(self) -> str:
-        """Hash of the plain bytes, in hex."""
+        """Compute the hash of the plain bytes, in hex."""
         with self.open() as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()  # type: ignore[arg-type]
 
 
 @contextmanager
 def raw_file() -> Iterator[tuple[BinaryIO, RawFile]]:
-    """An empty file for raw bytes: a stream to write them with, and the file as it can be opened again. It goes when the context ends."""
+    """Make an empty file for raw bytes: a stream to write them with, and the file as it can be opened again. It goes when the context
+    ends."""
     key = secrets.token_bytes(_KEY_BYTES)
     with files.nameless_file() as (file, path), files.in_memory(key) as kept:
         yield _stream(file, key), RawFile(path, kept)
 
 
 def raw_stream() -> BinaryIO:
-    """A stream into an empty file that nobody else can open, not even by a path; it goes when the stream is closed."""
+    """Open a stream into an empty file that no other process can open, not even by a path; it goes when the stream is closed."""
     draft = files.draft_path()
     file = draft.open("w+b", buffering=0)
     draft.unlink()

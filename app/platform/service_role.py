@@ -1,7 +1,7 @@
-"""What the service's database role may do: own nothing, write the audit trail through triggers alone, delete from a few tables.
+"""Rights of the service's database role: it owns nothing, writes the audit trail through triggers alone, and deletes from a few tables.
 
-`grant` is run by every migration as the owner of the tables; `excess` is what the doctor asks. Who holds the service's password cannot
-switch a trigger off, change the trail, drop or empty a table, or delete a row of clinical data that the service itself never deletes.
+Every migration runs `grant` as the owner of the tables; the doctor asks `excess`. With the service's password one cannot switch a trigger
+off, change the trail, or drop or empty a table. Nor can one delete a row of clinical data that the service itself never deletes.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ DELETED_FROM = frozenset(
         "worker",
     }
 )
-"""Tables of which the service deletes rows: proposals (a trigger refuses it of a confirmed session), drafts of plans and the planned visits
-in which nothing was done, its own upkeep. Rows of audited tables stay in the trail. What was entered or measured is marked as removed."""
+"""Tables of which the service deletes rows: proposals, drafts of plans, planned visits in which nothing was done, and its own upkeep. A
+trigger refuses to delete a confirmed session. Rows of audited tables stay in the trail. What was entered or measured is marked as
+removed."""
 
 ENGINE_SCHEMA = "dbos"
 SCHEMAS = ("public", ENGINE_SCHEMA)
@@ -59,12 +60,12 @@ and has_function_privilege(r.oid, p.oid, 'EXECUTE') order by 1
 
 
 def role_of(url: str) -> str:
-    """The role of a database URL; the name of the system's user where it names none."""
+    """Return the role of a database URL; the name of the system's user where it names none."""
     return make_url(url).username or getpass.getuser()
 
 
 def wanted(schema: str, table: str) -> frozenset[str]:
-    """The rights of the service's role on a table."""
+    """List the rights of the service's role on a table."""
     if table in KEPT:
         return KEPT[table]
     deletes = schema == ENGINE_SCHEMA or table in DELETED_FROM
@@ -74,7 +75,7 @@ def wanted(schema: str, table: str) -> frozenset[str]:
 def grant(connection: Connection, role: str, password: str | None) -> int:
     """Give the role exactly its rights, and make it where it is missing and the owner may. Returns on how many relations they changed.
 
-    What the role itself owns is left alone: the triggers that write the trail run with the owner's rights. `excess` tells of it.
+    What the role itself owns is left alone: the triggers that write the trail run with the owner's rights. `excess` reports it.
 
     Raises:
         RuntimeError: there is no such role and the owner may not make it.
@@ -103,7 +104,7 @@ def grant(connection: Connection, role: str, password: str | None) -> int:
 
 
 def excess(connection: Connection) -> list[str]:
-    """What the role of this connection may do beyond its rights, each in words; empty where all is well."""
+    """List what the role of this connection may do beyond its rights, each in words; empty where all is well."""
     found = []
     powers = connection.execute(
         text("select rolsuper, rolcreaterole, rolcreatedb, rolbypassrls, rolreplication from pg_roles where rolname = current_user")

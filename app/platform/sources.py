@@ -1,4 +1,4 @@
-"""How much one source may ask for in a span of time: failed sign-ins of a network address, bytes of files of an address and of a user.
+"""Limits of what one source may use in a span of time: failed sign-ins of a network address, bytes of files of an address or user.
 
 Kept in the memory of one process: several web processes each count for themselves, and a restart forgets.
 """
@@ -20,10 +20,10 @@ MOST_SOURCES = 10_000
 
 
 class Allowance:
-    """What every source may use up; it comes back evenly over the span.
+    """Allowance of every source; it comes back evenly over the span.
 
     Args:
-        most: what a source may use up at once, asked anew at each use (a setting).
+        most: what a source may use up at once, read at each use (a setting).
         span_s: seconds after which all of it has come back.
         clock: seconds.
     """
@@ -56,7 +56,7 @@ class Allowance:
             self._used[source] = (max(self._left_over(source, self._most(), present) - amount, 0.0), present)
 
     def forget(self) -> None:
-        """Begin anew with every source."""
+        """Reset the allowance of every source."""
         with self._lock:
             self._used.clear()
 
@@ -71,12 +71,12 @@ class Allowance:
 
 
 def network_address(request: Request) -> str:
-    """Where a request comes from; behind a proxy that uvicorn trusts (FORWARDED_ALLOW_IPS) the address that the proxy names."""
+    """Return the address of a request; behind a proxy that uvicorn trusts (FORWARDED_ALLOW_IPS) the address that the proxy names."""
     return request.client.host if request.client else "unknown"
 
 
 def from_this_machine(request: Request) -> bool:
-    """Whether a request comes from this machine and no proxy has passed it on."""
+    """Decide whether a request comes from this machine and no proxy has passed it on."""
     if any(name in request.headers for name in ("forwarded", "x-forwarded-for", "x-real-ip", "via")):
         return False
     try:
@@ -86,7 +86,7 @@ def from_this_machine(request: Request) -> bool:
 
 
 def in_words(seconds: int) -> str:
-    """A wait for people."""
+    """Format a wait for people."""
     if seconds < 90:
         return counted(seconds, "second")
     return f"{math.ceil(seconds / 60)} minutes"

@@ -1,4 +1,4 @@
-"""What a start needs of its machine, asked before anything else is done, and why a command could not be carried out, in a line."""
+"""Requirements of a start, checked before anything else is done, and the reason why a command failed, in a line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WHY = {
 
 
 def require_free(host: str, port: int) -> None:
-    """Raises Conflict where nobody can listen at this port of this machine: at each of the addresses that a name stands for here."""
+    """Raise Conflict where this port of this machine is taken, at each of the addresses that a name means here."""
     try:
         if not 0 <= port < 1 << 16:
             raise OverflowError("no port")  # which some systems would cut to 16 bits
@@ -55,7 +55,7 @@ _ABSENT = {errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT}
 
 
 def _refusal(family: int, address: tuple[str, int] | tuple[str, int, int, int] | tuple[int, bytes]) -> OSError | None:
-    """Why nobody can listen at an address; None where somebody can."""
+    """Return why listening at an address fails; None where it works."""
     try:
         with socket.socket(family, socket.SOCK_STREAM) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was left a moment ago is free
@@ -68,7 +68,7 @@ def _refusal(family: int, address: tuple[str, int] | tuple[str, int, int, int] |
 
 
 def require_data_folder() -> None:
-    """Make the data folder and try it, before somebody's first upload does. A full disk is no reason not to start: a start makes room.
+    """Make the data folder and try it, before the first upload does. A full disk is no reason not to start: a start makes room.
 
     Raises:
         OSError: it cannot be written to.
@@ -102,7 +102,7 @@ _FOLDER_HINTS = {
 
 
 def in_one_line(error: Exception) -> str | None:
-    """Why a command could not be carried out and what to do about it; None for what is a fault of ours."""
+    """Explain why a command failed and what to do about it; None for what is a fault of ours."""
     if isinstance(error, BetaloopError | RuntimeError):
         return str(error)
     if isinstance(error, OperationalError) and getattr(error.orig, "sqlstate", None) in _NOT_REACHED:
@@ -116,6 +116,6 @@ def in_one_line(error: Exception) -> str | None:
 
 
 def _last_line(error: BaseException | None) -> str:
-    """The last line of what a server or its library says, ending as a sentence does."""
+    """Return the last line of a message of a server or its library, ending as a sentence does."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip() and "Is the server running" not in line]
     return f"{lines[-1].rstrip('.') if lines else 'nothing'}."

@@ -1,6 +1,6 @@
 """Names of the modules that define tables; the migration environment and the test database load them all through here.
 
-A list of names and not of imports: the platform lies below the phases and may not import them.
+A list of names and not of imports: the platform is below the phases and may not import them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the commands of every phase share: options, who acts, and how they answer."""
+"""Common part of the commands of every phase: options, who acts, and how they answer."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ ACTOR = "command line"
 
 
 def _stated(text: str) -> str:
-    """A reason without blanks around it."""
+    """Check a reason, without blanks around it."""
     if not 1 <= len(text.strip()) <= 1000:
         raise typer.BadParameter("say why, in 1 to 1000 characters")
     return text.strip()
 
 
 def show(result: Any, as_json: bool, text: str) -> None:
-    """The answer of a command: its result as one line of JSON, or in words."""
+    """Show the answer of a command: its result as one line of JSON, or in words."""
     print_line(json.dumps(result, default=str) if as_json else text)
 
 
 def print_line(text: str) -> None:
-    """The answer of a command that has words alone."""
+    """Print the answer of a command that has words alone."""
     print(text)  # noqa: T201
 
 
 def say(text: str) -> None:
-    """A line beside the answer: what went wrong."""
+    """Print a line to standard error: what went wrong."""
     print(text, file=sys.stderr)  # noqa: T201
 
 
@@ -43,5 +43,5 @@ def bad_call(text: str) -> typer.Exit:
 
 
 def reason(error: Exception) -> str:
-    """Why a file could not be read or written, without its path."""
+    """Explain why a file could not be read or written, without its path."""
     return (error.strerror if isinstance(error, OSError) else None) or str(error)

@@ -1,7 +1,7 @@
-"""False times that somebody has looked into: `betaloop audit accept` writes a row of the trail, and `verify` tells them from breaks.
+"""Accepted false times of the trail: `betaloop audit accept` writes a row of the trail, and `verify` separates them from breaks.
 
-A clock that went fast leaves rows whose times lie ahead, and the first row after it was set right is named for ever, for nothing in the
-trail is changed. What was accepted stays listed, with who, when and why; no other kind of break can be accepted.
+A clock that went fast leaves rows with future times. The first row after it was set right is named for ever, since nothing in the trail is
+changed. What was accepted stays listed, with who, when and why; no other kind of break can be accepted.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ class Accepted:
 
 
 def accept(db: Session, event_id: int, reason: str) -> None:
-    """Put into the trail that somebody has looked into the time of one of its rows. The caller commits."""
+    """Record in the trail that a person has looked into the time of one of its rows. The caller commits."""
     set_reason(db, reason)
     record(db, ACCEPT, ENTITY, event_id)
 
 
 def acceptances(db: Session) -> dict[int, AuditEvent]:
-    """The newest row that accepts each row's time, by the number of the row; none that came before what it accepts."""
+    """Find the newest row that accepts each row's time, by the number of the row; none that came before what it accepts."""
     rows = db.scalars(select(AuditEvent).where(AuditEvent.entity == ENTITY, AuditEvent.action == ACCEPT).order_by(AuditEvent.id))
     return {int(e.entity_id): e for e in rows if e.entity_id.isdecimal() and e.id > int(e.entity_id)}

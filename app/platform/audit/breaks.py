@@ -1,4 +1,4 @@
-"""What can be wrong with the trail, with what writes it, and with the rows that it tells of; and the sentences about it."""
+"""Breaks of the trail, of what writes it, and of the rows that it covers; and the sentences about them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MOST_BREAKS = 100
 
 
 class BreakKind(StrEnum):
-    """What is wrong: with a link or a row of the trail, with what writes it, or with a row of an audited table."""
+    """Kind of a break: of a link or a row of the trail, of what writes it, or of a row of an audited table."""
 
     EDITED = "edited"
     REMOVED = "removed"
@@ -35,8 +35,8 @@ class Break:
     """One break, with what applies to it.
 
     Attributes:
-        position: its place in the chain. event_id: the number of the row of the trail. table: the audited table, or the one whose trigger
-            is wrong. row: the key of a row of that table. columns: those that differ. name: of a trigger, a rule or a function.
+        position: its place in the chain. event_id: the number of the row of the trail. table: the audited table, or that of a wrong
+            trigger. row: the key of a row of that table. columns: those that differ. name: of a trigger, a rule or a function.
     """
 
     kind: BreakKind
@@ -49,7 +49,7 @@ class Break:
 
 
 def sentence(b: Break) -> str:
-    """A break in words."""
+    """Describe a break in words."""
     where = f"table {b.table}, row {b.row}"
     return {
         BreakKind.EDITED: f"link {b.position}: row {b.event_id} is not what was written",

@@ -1,9 +1,9 @@
 """Hashes that chain the audit trail, and seals of the chain with a key that no SQL can read.
 
-A trigger at the end of each transaction gives every row of the trail a link: its place and a SHA-256 over the digest of the link before
-and the row. An edit, a gap, a row put in or links put into another order break it. Who owns the tables could compute the whole chain
-anew, or cut off its end: seals hold the digest at a place under an HMAC whose key lies in the data folder, in the database and in a
-file of that folder.
+A trigger at the end of each transaction gives every row of the trail a link. The link has its place and a SHA-256 over the digest of the
+link before and the row. An edit, a gap, an inserted row or links in another order break it. The owner of the tables could compute the whole
+chain again, or cut off its end. So seals record the digest at a place under an HMAC. Its key is in the data folder; the seals are in the
+database and in a file of that folder.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _A_DAY_US = 86_400_000_000
 class AuditLink(Base):
     """The place of a row of the trail in the chain. Insert only, and by the trigger alone.
 
-    There is no foreign key: a row that somebody took out of the trail must stay seen.
+    There is no foreign key: a row that was removed from the trail must stay seen.
     """
 
     __tablename__ = "audit_link"
@@ -66,11 +66,11 @@ class AuditSeal(Base):
 
 @dataclass(frozen=True)
 class Verified:
-    """What a look at the whole trail found.
+    """Findings of a check of the whole trail.
 
     Attributes:
-        links: how long the chain is. seals: how many seals were held against it. sealed_to: the last sealed place; 0 where there is none.
-        breaks: in the order of their places, at most MOST_BREAKS. accepted: false times that somebody has looked into; they are no breaks.
+        links: how long the chain is. seals: how many seals were compared with it. sealed_to: the last sealed place; 0 where there is none.
+        breaks: in the order of their places, at most MOST_BREAKS. accepted: false times that a person has looked into; they are no breaks.
     """
 
     links: int
@@ -81,12 +81,12 @@ class Verified:
 
     @property
     def whole(self) -> bool:
-        """Whether nothing is broken."""
+        """True where nothing is broken."""
         return not self.breaks
 
 
 def digest_of(previous: bytes, fields: Sequence[str | None]) -> bytes:
-    """The digest of a link: SHA-256 over the digest before it and the row's fields, each with its length (-1 where null)."""
+    """Compute the digest of a link: SHA-256 over the digest before it and the row's fields, each with its length (-1 where null)."""
     found = hashlib.sha256(previous)
     for field in fields:
         raw = b"" if field is None else field.encode()
@@ -97,7 +97,7 @@ def digest_of(previous: bytes, fields: Sequence[str | None]) -> bytes:
 def seal(db: Session) -> int:
     """Seal the chain at its end, in the database and in a file of the data folder; returns the place. The caller commits.
 
-    A chain that stands at its last seal is not sealed again.
+    A chain that ends at its last seal is not sealed again.
     """
     last = db.scalars(select(AuditLink).order_by(AuditLink.position.desc()).limit(1)).first()
     if last is None or db.get(AuditSeal, last.position) is not None:
@@ -124,7 +124,7 @@ def keep_sealing(stop: threading.Event) -> None:
 
 
 def verify(db: Session) -> Verified:
-    """Compute the whole chain again, hold every seal against it, and look at what writes it and at the rows that it tells of."""
+    """Verify the trail: compute the whole chain again, compare every seal with it, and check what writes it and the rows that it covers."""
     digests: dict[int, bytes] = {}
     wanted = [*_seals_of_database(db), *_seals_of_file()]
     places = {place for place, _, _ in wanted}
@@ -175,7 +175,7 @@ def _against_seals(wanted: Sequence[tuple[int, bytes, bytes]], digests: dict[int
 
 
 def _links(db: Session) -> Iterator[tuple[int, int, bytes, list[str | None] | None]]:
-    """Every link in order: its place, row, digest, and the row's fields as text; None where the row is gone."""
+    """Yield every link in order: its place, row, digest, and the row's fields as text; None where the row is gone."""
     rows = db.execute(
         text(
             "select l.position, l.event_id, l.digest, e.id::text, (extract(epoch from e.at) * 1000000)::bigint::text, e.actor,"
@@ -188,7 +188,7 @@ def _links(db: Session) -> Iterator[tuple[int, int, bytes, list[str | None] | No
 
 
 def _unlinked(db: Session) -> list[int]:
-    """Rows of the trail without a link: put in while the trigger was off."""
+    """Find rows of the trail without a link: inserted while the trigger was off."""
     statement = (
         "select e.id from audit_event e left join audit_link l on l.event_id = e.id where l.event_id is null order by e.id limit :most"
     )
@@ -200,7 +200,7 @@ def _seals_of_database(db: Session) -> list[tuple[int, bytes, bytes]]:
 
 
 def _seals_of_file() -> list[tuple[int, bytes, bytes]]:
-    """Seals of the file; a line that was cut by a crash while it was written is none."""
+    """Read the seals of the file; a line that was cut by a crash while it was written is none."""
     found = []
     path = _file()
     for line in path.read_text().splitlines() if path.exists() else ():
@@ -217,7 +217,7 @@ def _mac(position: int, digest: bytes) -> bytes:
 
 
 def _file() -> Path:
-    """Where seals are kept out of the reach of SQL."""
+    """Locate the file of seals, out of the reach of SQL."""
     return private_folder(get_settings().data_dir / "audit") / "seals.jsonl"
 
 

@@ -1,8 +1,8 @@
-"""Whether what writes the trail is what betaloop made: the functions by their source, the triggers by all that they do, and no others; and
-what stands in a column of the trail and of signatures that no statement names, their times among it.
+"""Guards of the trail: checks that what writes it is what betaloop made. They compare functions by their source and triggers by all that
+they do, and find others. They also check the defaults of columns in the trail and in signatures, among them the times.
 
-The owner of the tables could put a function that writes nothing in the place of one that does, or a trigger before it that lets nothing
-through. Migrations define both; what they define stands here, and a test holds the two against each other.
+The owner of the tables could replace a function by one that writes nothing, or add a trigger before it that lets nothing through.
+Migrations define both. Their definitions are repeated here, and a test compares the two.
 """
 
 from __future__ import annotations
@@ -79,12 +79,12 @@ where i.indisprimary and c.relnamespace = 'public'::regnamespace group by 1
 
 
 def keys(db: Session) -> dict[str, tuple[str, ...]]:
-    """The columns of each table's primary key, in order."""
+    """List the columns of each table's primary key, in order."""
     return {table: tuple(columns.split(",")) for table, columns in db.execute(text(_KEYS))}
 
 
 def what_writes(db: Session) -> list[Break]:
-    """Functions, triggers, rules and defaults that are missing, off, changed or not betaloop's."""
+    """Check what writes the trail: functions, triggers, rules and defaults that are missing, off, changed or not betaloop's."""
     return [*_functions(db), *_triggers(db), *_defaults(db)]
 
 
@@ -98,7 +98,7 @@ def _functions(db: Session) -> Iterator[Break]:
 
 
 def _defaults(db: Session) -> Iterator[Break]:
-    """Columns of the trail and of signatures in which another value stands by default: a time that is none, or somebody else's name."""
+    """Find columns of the trail and of signatures with another default value: a false time, or another person's name."""
     rows = db.execute(text(_DEFAULTS), {"tables": [*NEVER_CHANGED, "signature"]})
     there = {(table, column): None if of_others else expression for table, column, expression, of_others in rows}
     for table, column in sorted(there.keys() | DEFAULTS.keys()):
@@ -107,7 +107,7 @@ def _defaults(db: Session) -> Iterator[Break]:
 
 
 def _triggers(db: Session) -> Iterator[Break]:
-    """Triggers whose changes would not reach the trail, or not the chain, or that would let it be changed, and those of others."""
+    """Find triggers whose changes would not reach the trail or the chain, or that would let it be changed, and foreign ones."""
     arguments = {
         table: "".join(f"{part}\\000" for part in (",".join(AUDITED[table]), ",".join(key)))
         for table, key in keys(db).items()

@@ -1,8 +1,8 @@
-"""Rows of the audited tables against what the trail says of them: whoever wrote past the trail, with its triggers off, left a difference.
+"""Comparison of the audited tables with the trail: a write past the trail, with its triggers off, leaves a difference.
 
-Of each row the newest entry of the trail is held against the row as it is. Columns that the trail leaves out (secrets, bulk arrays, live
-progress) are not compared. A column that a later version added is not in an entry from before: the row must have what that version gave
-to every row, where the database still tells what that was, and else is not compared until its next entry.
+Each row is compared with its newest entry of the trail. Columns that the trail omits (secrets, bulk arrays, live progress) are not
+compared. A column that a later version added is not in an older entry. The row must then have what that version gave to every row, where
+the database still records it. Else the column is not compared until the row's next entry.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ select c.relname, a.attname, t.typname, case when a.atthasmissing then 'given' w
 from pg_attribute a join pg_class c on c.oid = a.attrelid join pg_type t on t.oid = a.atttypid
 where c.relnamespace = 'public'::regnamespace and c.relkind = 'r' and a.attnum > 0 and not a.attisdropped order by 1, a.attnum
 """
-# a row whose key was changed has a last entry under its former key too, which tells that it is gone from there; what the entry says is
-# read as the table's own types, so that neither the zone nor the spelling in which it was written counts
+# A row whose key was changed has a last entry under its former key too, which records that it is gone from there. Entries are read as the
+# table's own types, so that neither zone nor spelling counts.
 _DIFFERENCES = """
 with told as (
     select distinct on (key) key, id, after from (
@@ -45,7 +45,7 @@ _GIVEN = "(select (attmissingval::text::text[])[1] from pg_attribute where attre
 
 
 def past_the_trail(db: Session) -> Iterator[Break]:
-    """Rows that were altered, removed or put in without an entry of the trail, table by table; of each table at most MOST_BREAKS."""
+    """Find rows that were altered, removed or inserted without an entry of the trail, table by table; of each table at most MOST_BREAKS."""
     key_of: dict[str, tuple[str, ...]] = keys(db)
     columns_of: dict[str, dict[str, tuple[str, str]]] = {}
     for table, column, kind, first in db.execute(text(_COLUMNS)):
@@ -58,7 +58,7 @@ def past_the_trail(db: Session) -> Iterator[Break]:
 
 
 def _differences(table: str, key: Sequence[str], compared: dict[str, tuple[str, str]]) -> str:
-    """The query of a table, names as in the schema. Of each column its type, and what rows from before it have: `given` or `null`."""
+    """Write the query of a table, names as in the schema. Each column has its type, and what older rows have: `given` or `null`."""
 
     def side(alias: str, column: str) -> str:
         value = f'{alias}."{column}"'

@@ -17,7 +17,7 @@ from app.platform.database import Base, now, set_actor
 
 
 class AuditEvent(Base):
-    """Who changed which row, when, from what to what, and why. Insert only: a trigger refuses updates and deletions."""
+    """One change of a row: who, when, from what to what, and why. Insert only: a trigger refuses updates and deletions."""
 
     __tablename__ = "audit_event"
     __table_args__ = (Index("ix_audit_event_entity", "entity", "entity_id"),)
@@ -85,7 +85,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "day_entry": (),
     "job": ("progress", "message", "updated_at"),
 }
-"""Audited tables and the columns left out of what is shown: secrets, bulk arrays and live progress. Every change makes a row, except of
+"""Audited tables and the columns omitted from what is shown: secrets, bulk arrays and live progress. Every change makes a row, except of
 last-seen times and live progress alone."""
 
 
@@ -94,7 +94,7 @@ VIEW_EVERY = timedelta(minutes=15)
 
 
 def record(db: Session, action: str, entity: str, entity_id: str | int, details: dict[str, Any] | None = None) -> None:
-    """Put something into the trail that changed no row: who did it stands in the session (`set_actor`). The caller commits.
+    """Record something in the trail that changed no row; the session knows who did it (`set_actor`). The caller commits.
 
     Args:
         action: a verb of at most ten letters, e.g. `export`, `download`, `refuse`, `view`.
@@ -110,7 +110,8 @@ def record(db: Session, action: str, entity: str, entity_id: str | int, details:
 
 
 def record_once(db: Session, action: str, entity: str, entity_id: str, details: dict[str, Any], every: timedelta) -> bool:
-    """The same as `record`, but not where it stands there with these details and is younger than `every`; whether a row was written."""
+    """Record as `record` does, unless the trail has the same with these details and younger than `every`; returns whether a row was
+    written."""
     same = (AuditEvent.entity == entity) & (AuditEvent.entity_id == entity_id) & (AuditEvent.action == action)
     young = (AuditEvent.after == details) & (AuditEvent.at > now() - every)
     if db.scalar(select(AuditEvent.id).where(same, young).limit(1)) is not None:

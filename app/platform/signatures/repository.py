@@ -12,13 +12,13 @@ from app.platform.signatures.models import Signature
 
 
 def signatures_of(db: Session, kind: str, subject_id: int) -> Sequence[Signature]:
-    """Every signature under one thing, newest first."""
+    """List every signature under one thing, newest first."""
     mine = (Signature.subject_kind == kind) & (Signature.subject_id == subject_id)
     return db.scalars(select(Signature).where(mine).order_by(Signature.id.desc())).all()
 
 
 def newest_of_each(db: Session, kind: str, subject_ids: Collection[int]) -> dict[int, Signature]:
-    """The newest signature under each of several things of a kind; what nobody signed is left out."""
+    """Find the newest signature under each of several things of a kind; unsigned ones are omitted."""
     if not subject_ids:
         return {}
     mine = (Signature.subject_kind == kind) & Signature.subject_id.in_(subject_ids)
@@ -26,7 +26,7 @@ def newest_of_each(db: Session, kind: str, subject_ids: Collection[int]) -> dict
 
 
 def contents(db: Session) -> Iterator[tuple[int, str, dict[str, Any]]]:
-    """Of every signature its number, hash and content."""
+    """Yield number, hash and content of every signature."""
     rows = db.execute(select(Signature.id, Signature.sha256, Signature.content).order_by(Signature.id).execution_options(yield_per=100))
     for row in rows:
         yield row[0], row[1], row[2]

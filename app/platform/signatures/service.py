@@ -1,4 +1,4 @@
-"""Rules of signatures: what is hashed, and whether a signature still stands. The caller commits."""
+"""Rules of signatures: what is hashed, and whether a signature is still valid. The caller commits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _RECORDED = ("id", "subject_kind", "subject_id", "meaning", "sha256", "signed_by
 
 
 class SignatureState(StrEnum):
-    """What became of a signature."""
+    """State of a signature."""
 
     NONE = "none"  # nothing that wants one: a draft, an unlock, a policy that was not released
     STANDS = "stands"
@@ -38,10 +38,10 @@ class Signer:
 
 
 def content_hash(content: Mapping[str, Any]) -> str:
-    """SHA-256 of the canonical JSON of what is signed, 64 hexadecimal digits.
+    """Compute the SHA-256 of the canonical JSON of what is signed, 64 hexadecimal digits.
 
-    Canonical: members sorted by name, no spaces, UTF-8, and whole numbers without a fraction (10.0 as 10), so that what comes back from
-    the database has the hash of what went in; after RFC 8785.
+    Canonical, after RFC 8785: members sorted by name, no spaces, UTF-8, and whole numbers without a fraction (10.0 as 10). So what comes
+    back from the database has the hash of what went in.
 
     Raises:
         ValueError: a number that is not finite. TypeError: a value that JSON does not have.
@@ -51,7 +51,7 @@ def content_hash(content: Mapping[str, Any]) -> str:
 
 
 def record(db: Session, signer: Signer, *, kind: str, subject_id: int, meaning: str, content: Mapping[str, Any]) -> Signature:
-    """Store a signature of somebody whose password was checked. Raises as `content_hash`."""
+    """Store a signature of a person whose password was checked. Raises as `content_hash`."""
     signature = Signature(
         subject_kind=kind,
         subject_id=subject_id,
@@ -67,17 +67,17 @@ def record(db: Session, signer: Signer, *, kind: str, subject_id: int, meaning: 
 
 
 def covers(signature: Signature, content: Mapping[str, Any]) -> bool:
-    """Whether a signature was given for exactly this content, and its own record is whole and as the audit trail took it down."""
+    """Check that a signature was given for exactly this content, and that its own record is whole and matches the audit trail."""
     return signature.sha256 == content_hash(content) == content_hash(signature.content) and _as_recorded(signature)
 
 
 def changed_records(db: Session) -> list[int]:
-    """Numbers of the signatures whose content is not what was signed. Their other columns are for the audit trail to tell."""
+    """List the numbers of the signatures whose content is not what was signed. The audit trail covers their other columns."""
     return [number for number, sha256, content in repository.contents(db) if content_hash(content) != sha256]
 
 
 def _as_recorded(signature: Signature) -> bool:
-    """Whether the entry of the trail, in its place of the chain, tells of the same signature: hash, meaning, subject, who and when."""
+    """Check that the entry of the trail, in its place of the chain, has the same signature: hash, meaning, subject, who and when."""
     said = signature.recorded
     if said is None:
         return False
@@ -86,7 +86,7 @@ def _as_recorded(signature: Signature) -> bool:
 
 
 def state_of(signature: Signature | None, content: Mapping[str, Any]) -> SignatureState:
-    """What became of a signature that is wanted, given what is there now."""
+    """Determine the state of a signature that is wanted, given the current content."""
     if signature is None:
         return SignatureState.NOT_KEPT
     return SignatureState.STANDS if covers(signature, content) else SignatureState.BROKEN

@@ -1,8 +1,8 @@
-"""Backup and restore of a whole installation: database, stored files and keys, sealed with a key that does not lie beside them.
+"""Backup and restore of a whole installation: database, stored files and keys, sealed with a key that is stored elsewhere.
 
-The database is dumped first, in one snapshot; stored files are never changed, and none but quarantined ones are removed, so every other
-file that the dump names is there when the files are copied after it. Passwords of the embedded server stay out: a restored installation
-has its own.
+The database is dumped first, in one snapshot. Stored files are never changed, and only quarantined ones are removed. So every other file
+that the dump names is there when the files are copied after it. Passwords of the embedded server stay out: a restored installation has its
+own.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class BackupError(BetaloopError):
 
 @dataclass(frozen=True)
 class Restored:
-    """What came back.
+    """Result of a restore.
 
     Attributes:
         tables: rows by table. files: stored files, each with its hash checked. made_at: when the backup was made, ISO 8601.
@@ -75,10 +75,10 @@ def make_key(path: Path) -> None:
 
 
 def read_key(path: Path, *apart_from: Path) -> bytes:
-    """The key of a file.
+    """Read the key of a file.
 
     Raises:
-        BackupError: there is none, it holds no key, or it lies in the data folder or beside the backup.
+        BackupError: there is none, it has no key, or it is in the data folder or next to the backup.
     """
     for folder in apart_from:
         if path.resolve().is_relative_to(folder.resolve()):
@@ -95,8 +95,8 @@ def read_key(path: Path, *apart_from: Path) -> bytes:
 def backup(folder: Path, key_file: Path) -> dict[str, Any]:
     """Make a backup in a new folder and return its manifest; a backup that was cut off has no manifest.
 
-    A stored file that is missing or damaged is named in the manifest (`damaged`) and left out; all else is backed up. So is one that
-    somebody removed for good meanwhile (`removed`), as they may a quarantined one.
+    A stored file that is missing or damaged is named in the manifest (`damaged`) and omitted; all else is backed up. So is one that a
+    person removed for good during the backup (`removed`), as they may a quarantined one.
 
     Raises:
         BackupError: the folder exists, the key cannot be used, or the database cannot be dumped.
@@ -156,7 +156,7 @@ def restore(folder: Path, key_file: Path) -> Restored:
 
 
 def verify(folder: Path) -> dict[str, Any]:
-    """The manifest of a backup whose parts have their hashes; needs no key.
+    """Verify that the parts of a backup have their hashes, and return its manifest; needs no key.
 
     Raises:
         BackupError: it was cut off, parts are damaged, or a later betaloop made it.
@@ -178,7 +178,7 @@ def verify(folder: Path) -> dict[str, Any]:
 
 
 def _added(archive: tarfile.TarFile, sha256: str) -> bool:
-    """Put a stored file into the archive; whether it is whole, for what is not whole is left out."""
+    """Add a stored file to the archive if it is whole; returns whether it is."""
     with files.borrowed(sha256) as path:
         if not files.whole_at(path, sha256):
             return False
@@ -209,7 +209,7 @@ def _major_version(program: str) -> int:
 
 
 def _target() -> tuple[str, dict[str, str]]:
-    """Address of the database for libpq, and the environment with its password, which must not stand in a list of processes."""
+    """Return the address of the database for libpq, and the environment with its password, which must not be in a list of processes."""
     url = make_url(owner_url()).set(drivername="postgresql")
     password = {"PGPASSWORD": url.password} if isinstance(url.password, str) else {}
     return url.set(password=None).render_as_string(hide_password=False), os.environ | password
@@ -226,9 +226,9 @@ def _dump(out: SealedWriter) -> None:
 
 
 def _load(source: SealedReader) -> None:
-    """Archive to SQL to psql in one transaction, without the settings that the server, which may be older, does not have.
+    """Load an archive through SQL into psql in one transaction, without the settings that an older server does not have.
 
-    psql commits at the end of what it reads, so it sees an end only when the archive was read whole; else it is killed and nothing is kept.
+    psql commits at the end of its input. So it sees an end only when the archive was read whole; else it is killed and nothing is stored.
     """
     target, env = _target()
     unpack = [_program("pg_restore"), "--no-owner", "--no-privileges", "--file=-"]
@@ -287,7 +287,7 @@ def _server_settings(engine: Engine) -> frozenset[str]:
 
 
 def _for_server(sql: Iterator[bytes], known: frozenset[str]) -> Iterator[bytes]:
-    """The lines of a dump but for settings that the server does not have; settings stand before the first rows."""
+    """Filter the lines of a dump: settings that the server does not have are dropped. Settings come before the first rows."""
     for line in sql:
         setting = _SETTING.match(line)
         if setting is None or setting[1].decode() in known:

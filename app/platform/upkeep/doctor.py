@@ -1,4 +1,4 @@
-"""Whether an installation is in order: each check says what it found, and what to do where it is not."""
+"""Checks of an installation: each reports what it found, and what to do where something is wrong."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Finding:
 
 
 def examine(hashes: bool = False) -> list[Finding]:
-    """Every check; `hashes` reads every stored file and the audit trail whole."""
+    """Run every check; `hashes` reads every stored file and the audit trail whole."""
     found = [_disk(), _closed()]
     try:
         with new_session() as db:
@@ -58,14 +58,14 @@ def examine(hashes: bool = False) -> list[Finding]:
 
 
 def newest_revision() -> str:
-    """The schema that this betaloop needs."""
+    """Read the schema that this betaloop needs."""
     config = Config(str(ROOT / "alembic.ini"))
     config.set_main_option("script_location", str(ROOT / "migrations"))
     return ScriptDirectory.from_config(config).get_current_head() or ""
 
 
 def revision(db: Session) -> str:
-    """The schema that the database has."""
+    """Read the schema that the database has."""
     if db.scalar(text("select to_regclass('alembic_version')")) is None:
         return ""
     return db.scalar(text("select version_num from alembic_version")) or ""
@@ -122,7 +122,7 @@ def _files(db: Session, hashes: bool) -> Finding:
 
 
 def _named(db: Session, bad: list[str]) -> str:
-    """What names stored files, as tables and numbers: by these they can be looked up and sent again."""
+    """List what names stored files, as tables and numbers: by these they can be looked up and sent again."""
     load_tables()
     found = []
     for table in Base.metadata.sorted_tables:

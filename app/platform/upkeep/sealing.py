@@ -1,7 +1,7 @@
 """Encrypted streams of any length: AES-256-GCM in chunks, so that neither end holds the whole, and nothing can be cut off or reordered.
 
 Construction: STREAM (Hoang, Reyhanitabar, Rogaway, Vizar 2015). The nonce of a chunk is a random prefix, its number, and whether it is the
-last; so a file that ends early, lacks a chunk or has two exchanged does not open.
+last. So a file that ends early, lacks a chunk or has two exchanged does not open.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class SealedWriter(io.RawIOBase):
         out.write(MAGIC + self._prefix)
 
     def writable(self) -> bool:
-        """True."""
+        """Return True: it can be written."""
         return True
 
     def write(self, data: object) -> int:
@@ -62,7 +62,7 @@ class SealedWriter(io.RawIOBase):
 
 
 def opened(source: BinaryIO, key: bytes) -> Iterator[bytes]:
-    """The chunks of a sealed stream, each checked before it is given.
+    """Open a sealed stream and yield its chunks, each checked before it is given.
 
     Raises:
         NotOpened: it is damaged, cut off, no sealed stream, or the key is another.
@@ -92,7 +92,7 @@ class SealedReader(io.RawIOBase):
         self._chunks, self._waiting = opened(source, key), b""
 
     def readable(self) -> bool:
-        """True."""
+        """Return True: it can be read."""
         return True
 
     def readinto(self, buffer: object) -> int:

@@ -1,1 +1,1 @@
-"""What every request and page shares: middleware, API types, forms, templates, charts, static files."""
+"""Common part of every request and page: middleware, API types, forms, templates, charts, static files."""

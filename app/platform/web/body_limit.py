@@ -1,7 +1,7 @@
-"""What is judged before the body of a request is read: how large it may be, who sends it, and how much they have sent lately.
+"""Checks before the body of a request is read: its size, its sender, and how much they have sent lately.
 
-No body may be larger than its kind allows, stated or not: files up to the installation's upload limit, all else 1 MiB. Of callers alone
-who have signed in are read whatever the REST interface is sent, JSON wherever it is sent, and bodies beyond `UNJUDGED_LIMIT`; files count
+No body may be larger than its kind allows, stated or not: files up to the installation's upload limit, all else 1 MiB. Three kinds are read
+only from callers who have signed in: bodies to the REST interface, JSON to any address, and bodies beyond `UNJUDGED_LIMIT`. Files count
 against what a network address and a user may send in an hour. An answer to a request whose body was not read ends the connection, so that
 the rest of it is not received either.
 """
@@ -28,7 +28,7 @@ INTERFACE = "/api/"
 Refusal = Callable[[Request, Exception], Awaitable[Response]]
 """Makes the answer to a request that was refused for a reason; raises what it does not know."""
 Judge = Callable[[Request], Awaitable[str]]
-"""Tells who sends a request, as a word for a user. Raises Unauthorized where nobody is signed in."""
+"""Names the sender of a request, as a word for a user. Raises Unauthorized for a caller who is not signed in."""
 _FORM_ALLOWANCE = 1 << 20  # the form fields and boundaries around a file of the largest size
 
 sent = Allowance(lambda: get_settings().upload_gib_per_hour * (1 << 30), 3600.0)
@@ -84,7 +84,7 @@ class _Body:
         self._seen, self._whole = 0, False
 
     def require_size(self) -> None:
-        """Raises BodyTooLarge by the stated length."""
+        """Raise BodyTooLarge by the stated length."""
         if (self._stated or 0) > self._limit:
             raise BodyTooLarge(*_said(self._has_files))
 
@@ -95,7 +95,8 @@ class _Body:
             self._sources = sources if self._stated is None else []
 
     async def receive(self) -> Message:
-        """The next part; beyond the limits, an HTTPException, which those who read bodies let through to the error handlers."""
+        """Receive the next part; beyond the limits raise an HTTPException, which those who read bodies let through to the error
+        handlers."""
         message = await self._receive()
         part = len(message.get("body", b""))
         self._seen += part
@@ -116,7 +117,7 @@ class _Body:
 
 
 def is_json(scope: Scope) -> bool:
-    """Whether a request says that its body is a JSON document."""
+    """Decide whether a request states that its body is a JSON document."""
     kind = dict(scope["headers"]).get(b"content-type", b"").partition(b";")[0].strip().lower()
     return bool(kind == b"application/json" or kind.endswith(b"+json"))
 
@@ -134,7 +135,7 @@ def _take(sources: list[str], size: int) -> None:
 
 
 def _said(has_files: bool) -> tuple[str, str]:
-    """What is wrong and what to do about it."""
+    """Describe what is wrong and what to do about it."""
     if has_files:
         return (
             f"The request is larger than {get_settings().upload_limit_mb} MiB.",

@@ -26,7 +26,7 @@ class Bounded:
         self._present = 0  # changed by the event loop's thread alone
 
     async def run(self, work: Callable[..., Result], *arguments: object) -> Result:
-        """What `work(*arguments)` returns.
+        """Run `work(*arguments)` and return its result.
 
         Raises:
             TooMany: as many wait already as may.

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 CONTROLLERS = ("cdbs", "rl", "distilled", "no_dbs", "random", "other")
-"""Order in which controllers stand in every chart and table; cDBS is what the others are compared with."""
+"""Order of controllers in every chart and table; cDBS is what the others are compared with."""
 
 SYMBOLS = {"cdbs": "circle", "rl": "diamond", "distilled": "square", "no_dbs": "x", "random": "triangle-up", "other": "star"}
-"""A shape beside each colour, so that colour is never the only carrier."""
+"""A shape with each colour, so that colour is never the only carrier."""
 
 TEXT, MUTED, GRID, ACCENT, WARN, BAD = "token:text", "token:muted", "token:grid", "token:accent", "token:warn", "token:bad"
 
@@ -67,19 +67,19 @@ class Chart:
 
 
 def colour(controller: str, alpha: float | None = None) -> str:
-    """The colour token of a controller."""
+    """Return the colour token of a controller."""
     name = controller if controller in CONTROLLERS else "other"
     return f"token:{name}" + (f"/{alpha:g}" if alpha is not None else "")
 
 
 def marker(controller: str, size: float = 8, **more: Any) -> dict[str, Any]:
-    """Plotly marker of a controller: its colour and its shape."""
+    """Make the Plotly marker of a controller: its colour and its shape."""
     name = controller if controller in CONTROLLERS else "other"
     return {"color": colour(name), "symbol": SYMBOLS[name], "size": size, **more}
 
 
 def figure(data: Sequence[Mapping[str, Any]], **layout: Any) -> dict[str, Any]:
-    """A Plotly figure in the style of all charts; `layout` members override or add. NaN becomes null: a gap, never a zero."""
+    """Make a Plotly figure in the style of all charts; `layout` members override or add. NaN becomes null: a gap, never a zero."""
     base: dict[str, Any] = {
         "margin": {"l": 56, "r": 16, "t": 12, "b": 44},
         "paper_bgcolor": "rgba(0,0,0,0)",
@@ -98,7 +98,7 @@ def figure(data: Sequence[Mapping[str, Any]], **layout: Any) -> dict[str, Any]:
 
 
 def axis(title: str, unit: str = "", **more: Any) -> dict[str, Any]:
-    """An axis with its unit in the title."""
+    """Make an axis with its unit in the title."""
     text = f"{title} ({unit})" if title and unit else title or unit
     return {"title": {"text": text, "font": {"size": 13}}, **more}
 
@@ -106,7 +106,7 @@ def axis(title: str, unit: str = "", **more: Any) -> dict[str, Any]:
 def horizontal(
     at: float, name: str, colour_token: str = WARN, dash: str = "dash", yref: str = "y"
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A labelled horizontal line over the whole width: its `shapes` and its `annotations` entry."""
+    """Draw a labelled horizontal line over the whole width: its `shapes` and its `annotations` entry."""
     line = {
         "type": "line",
         "xref": "paper",
@@ -126,7 +126,7 @@ def horizontal(
 
 # dots of single sessions: as many sessions are as many dots, also where their values are equal
 def side_by_side(values: Sequence[float], close: float, half: float, step: float) -> list[float]:
-    """Sideways offsets of the dots of one box: those of about one height stand beside each other, evenly about its middle.
+    """Compute sideways offsets of the dots of one box: those of about one height are spread evenly about its middle.
 
     Args:
         values: their heights. close: heights that are no further apart would hide each other; in the unit of the values.
@@ -147,7 +147,7 @@ def side_by_side(values: Sequence[float], close: float, half: float, step: float
 
 
 def apart_where_equal(points: Sequence[tuple[float, float]], step: float) -> list[float]:
-    """Horizontal places of points of a plane: equal ones stand `step` from each other about their own place, all others where they are."""
+    """Compute horizontal places of points of a plane: equal ones are `step` apart about their own place, all others stay where they are."""
     same: defaultdict[tuple[float, float], list[int]] = defaultdict(list)
     for i, point in enumerate(points):
         same[point].append(i)
@@ -159,15 +159,15 @@ def apart_where_equal(points: Sequence[tuple[float, float]], step: float) -> lis
 
 
 def written(text: str) -> str:
-    """A text with units and contacts as people write them: device formats have `uV2` where a reader expects \u00b5V\u00b2, and `key 0 +2-0`
-    or `ONE_THREE_RIGHT` for the channel between two contacts. Two channels may lie between the same ones, so that the number stays."""
+    """Write a text with units and contacts as people do. Device formats have `uV2` where a reader expects \u00b5V\u00b2, and `key 0 +2-0`
+    or `ONE_THREE_RIGHT` for the channel between two contacts. Two channels may be between the same ones, so that the number stays."""
     text = _CONTACTS.sub("contacts +\\2\u2212\\3 (channel \\1)", text) if "key " in text else text
     text = _PAIR.sub(_pair, text) if "_" in text else text
     return _SQUARED.sub("\u00b5V\u00b2", _MICRO.sub("\u00b5\\1", text)) if "u" in text else text
 
 
 def counted(number: float, one: str, many: str = "") -> str:
-    """A number with its noun.
+    """Write a number with its noun.
 
     Args:
         number: how many, to six digits. one: the noun of one. many: of several; `one` with an s where it is empty.
@@ -177,7 +177,7 @@ def counted(number: float, one: str, many: str = "") -> str:
 
 
 def plain(value: Any) -> Any:
-    """JSON-ready copy: arrays become lists, numpy numbers Python's, what is not finite null; `_DIGITS` significant digits."""
+    """Copy a value for JSON: arrays become lists, numpy numbers Python's, what is not finite null; `_DIGITS` significant digits."""
     # numbers and lists of them first: they are nearly all that a figure holds
     if isinstance(value, float) and not isinstance(value, np.generic):
         return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
@@ -195,7 +195,7 @@ def plain(value: Any) -> Any:
 
 
 def _floats(values: np.ndarray[Any, Any]) -> list[Any]:
-    """As `plain`, of an array of floats: a spectrogram has forty thousand."""
+    """Convert an array of floats as `plain` does: a spectrogram has forty thousand."""
     if values.ndim > 1:
         return [_floats(row) for row in values]
     known = math.isfinite
@@ -208,7 +208,7 @@ _PAIR = re.compile(rf"\b({'|'.join(_NUMBERS)})_(?:AND_)?({'|'.join(_NUMBERS)})_(
 
 
 def _pair(found: re.Match[str]) -> str:
-    """A sensing channel as Percept reports name it: `ONE_THREE_RIGHT` lies between contacts 1 and 3 of the right lead."""
+    """Name a sensing channel of a Percept report: `ONE_THREE_RIGHT` is between contacts 1 and 3 of the right lead."""
     return f"contacts {_NUMBERS[found[1]]}\u2013{_NUMBERS[found[2]]} {found[3].lower()}"
 
 

@@ -1,9 +1,9 @@
 """Answers compressed on their way out: pages and JSON shrink to a fifth, and large scripts of packages are compressed once and kept.
 
-A page that holds a secret beside text that a stranger chooses tells the secret by its compressed length (BREACH). Such a stranger needs the
-reader's browser to send many requests from another site, and the browser says where a request comes from. What another site asked for is
-therefore sent as it is; so is an answer to a browser that does not say, where sign-in cookies travel over TLS. Pages hold no token of their
-own: requests from other sites are refused by the same header (`app.platform.web.middleware`).
+A page with a secret and with text that a stranger chooses reveals the secret by its compressed length (BREACH). Such a stranger needs the
+reader's browser to send many requests from another site, and the browser states where a request comes from. What another site requested is
+therefore sent uncompressed. So is an answer to a browser that does not state it, where sign-in cookies travel over TLS. Pages have no token
+of their own: the same header refuses requests from other sites (`app.platform.web.middleware`).
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ def _asked_by_ourselves(headers: Headers) -> bool:
 
 
 class CompressedFiles(StaticFiles):
-    """Static files of which large scripts are compressed once, kept in the data folder, and sent to whoever takes gzip."""
+    """Static files of which large scripts are compressed once, stored in the data folder, and sent to clients that accept gzip."""
 
     def file_response(self, full_path: Any, stat_result: os.stat_result, scope: Scope, status_code: int = 200) -> Response:
-        """The file, or its compressed twin under the file's own type."""
+        """Answer with the file, or with its compressed twin under the file's own type."""
         path = Path(full_path)
         takes = any("gzip" in part and "q=0" not in part for part in Headers(scope=scope).get("accept-encoding", "").split(","))
         response: Response

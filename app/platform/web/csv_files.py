@@ -13,17 +13,17 @@ CSV = "text/csv; charset=utf-8"
 
 
 def download(content: str, name: str) -> Response:
-    """A CSV file under a name."""
+    """Send a CSV file under a name."""
     return Response(content, media_type=CSV, headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
 
 def stream(pieces: Iterable[str], name: str) -> Response:
-    """A CSV file under a name, sent piece by piece while it is made."""
+    """Send a CSV file under a name, piece by piece while it is made."""
     return StreamingResponse(iter(pieces), media_type=CSV, headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
 
 def in_pieces(columns: Sequence[str], batches: Iterable[Iterable[Sequence[object]]]) -> Iterator[str]:
-    """A table as text: its header, then the rows of each batch; what is not there is empty."""
+    """Write a table as text: its header, then the rows of each batch; what is not there is empty."""
     yield _written([columns])
     for batch in batches:
         yield _written(batch)
@@ -40,7 +40,7 @@ _BEGINS_FORMULA = frozenset("=+-@\t\n＝＋－＠")
 
 
 def safe_cell(value: object) -> object:
-    """A cell that spreadsheets do not run as a formula.
+    """Make a cell safe, so that spreadsheets do not run it as a formula.
 
     Its line ends are line feeds: a carriage return alone, which the writer leaves without quotes, would begin a row of its own.
     """

@@ -1,4 +1,4 @@
-"""What a page of an error says beyond the error: what to do, and everything that had been typed, so that no entry is lost."""
+"""Additions to the page of an error: what to do, and everything that had been typed, so that no entry is lost."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ ADDRESS_ALONE = {404, 405}
 
 
 def writer_of(request: Request) -> int | None:
-    """Who entered what a form holds: as the form says, else who has signed in, else whose sign-in has just ended."""
+    """Find who entered the content of a form: as the form says, else who has signed in, else whose sign-in has just ended."""
     caller = getattr(request.state, "caller", None)
     last = getattr(request.state, "last_caller", None)
     return written_by(request) or (caller.user_id if caller is not None else last)
 
 
 def send_again_to(request: Request, writer: int) -> str:
-    """Where the page of an error sends what was entered: the form's own address with its query, and whose entries they are.
+    """Build the address to which the page of an error sends what was entered: the form's own with its query, and whose entries they are.
 
     It begins with one slash, because what begins with two is another host's.
     """
@@ -44,7 +44,7 @@ def send_again_to(request: Request, writer: int) -> str:
 
 
 def advised(status: int, title: str, has_entries: bool, writer: int | None) -> tuple[str, str]:
-    """The heading of an error's page, and what to do where the error itself does not say."""
+    """Choose the heading of an error's page, and what to do where the error itself does not say."""
     if status == 401:
         again = "Then send what you had entered from here." if writer else "Then open the form anew and enter this again."
         kept = f" {again}" if has_entries else ""
@@ -56,7 +56,8 @@ _WANTED = {"int_parsing": "a whole number", "int_type": "a whole number", "float
 
 
 def input_in_words(errors: Sequence[Mapping[str, Any]]) -> str:
-    """What is wrong with an address or a form, from the errors of its validation (pydantic's), without the names of types and members."""
+    """Describe what is wrong with an address or a form, from the errors of its validation (pydantic's), without the names of types and
+    members."""
     return " ".join(_said(error) for error in errors[:5])
 
 
@@ -69,7 +70,7 @@ def _said(error: Mapping[str, Any]) -> str:
 
 
 async def kept_entries(request: Request) -> list[tuple[str, str]]:
-    """Names and values of a plain form that was sent, in its order; passwords are left out. Empty for other requests."""
+    """List names and values of a plain form that was sent, in its order, without passwords. Empty for other requests."""
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if request.method != "POST" or media_type != _PLAIN_FORM:
         return []

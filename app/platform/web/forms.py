@@ -23,7 +23,7 @@ WRITTEN_BY = "written_by"
 
 
 def written_by(request: Request) -> int | None:
-    """Who had signed in when a form was filled in, where its sender says so."""
+    """Find who had signed in when a form was filled in, where its sender states it."""
     text = request.query_params.get(WRITTEN_BY, "")
     return int(text) if request.method == "POST" and text.isascii() and text.isdigit() and len(text) < 20 else None
 
@@ -37,7 +37,7 @@ FormValues = Annotated[FormData, Depends(_form)]
 
 
 def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] | None = None, names: Mapping[str, str] | None = None) -> M:
-    """Read a model from form text. An empty field is null; a field that the form does not have is left out.
+    """Read a model from form text. An empty field is null; a field that the form does not have is omitted.
 
     Args:
         model: the API type; only its fields are read.
@@ -72,7 +72,8 @@ def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] |
 
 
 def _said(error: Mapping[str, Any]) -> str:
-    """What is wrong with a field; a pattern is no sentence, and the field's name or help says what it takes. An empty one needs a value."""
+    """Describe what is wrong with a field. A pattern is no sentence: the field's name or help says what it takes. An empty one needs a
+    value."""
     if error["input"] is None:
         return "give a value"
     if error["type"] == "string_pattern_mismatch":
@@ -82,7 +83,7 @@ def _said(error: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class FieldNote:
-    """What stands at a field of a refused form.
+    """Note at a field of a refused form.
 
     Attributes:
         text: what is wrong, or what is asked.
@@ -98,13 +99,13 @@ class FieldNote:
 def field_notes(
     error: BetaloopError | None, typed: Mapping[str, str], name_of: Callable[[Mapping[str, Any]], str] | None = None
 ) -> dict[str, FieldNote]:
-    """By field of a form, what its refusal says of it.
+    """Assign the parts of a refusal to the fields of its form.
 
-    That are the problem's `errors` with a `name`, its `questions` with a `field`, and the whole of it where it names its own `field`.
-    What is wrong with one value of a list (`methods.1`) stands at the list.
+    These are the problem's `errors` with a `name`, its `questions` with a `field`, and the whole of it where it names its own `field`. An
+    error of one value of a list (`methods.1`) is shown at the list.
 
     Args:
-        error: why the form was refused. typed: what its fields held.
+        error: why the form was refused. typed: the text of its fields.
         name_of: the form's field that a question is about, where it is not called like the question's.
     """
     extra = error.extra if error else {}
@@ -122,7 +123,7 @@ def field_notes(
 
 
 def renamed(error: BetaloopError, names: Mapping[str, str]) -> BetaloopError:
-    """The same error with fields called as the form calls them; `names` maps the rule's name of a field to the form's."""
+    """Rename the fields of an error as the form calls them; `names` maps the rule's name of a field to the form's."""
     if named := error.extra.get("field"):
         error.extra["field"] = names.get(named, named)
     error.extra |= (
@@ -134,7 +135,7 @@ def renamed(error: BetaloopError, names: Mapping[str, str]) -> BetaloopError:
 
 
 def confirmed(values: FormData, typed: Mapping[str, str]) -> list[str]:
-    """Fields of a form whose present text a person confirmed; a text that was changed after the question is asked about again."""
+    """List the fields of a form whose present text a person confirmed; a text that was changed after the question is asked about again."""
     given = {str(answer) for answer in values.getlist("sure")}
     return [name for name, text in typed.items() if _answer(name, text) in given]
 
@@ -170,7 +171,7 @@ def _value(text: str, annotation: Any, required: bool) -> Any:
 
 
 def _kinds(annotation: Any) -> set[Any]:
-    """The plain types inside unions and `Annotated`."""
+    """Collect the plain types inside unions and `Annotated`."""
     origin = get_origin(annotation)
     if origin is Annotated:
         return _kinds(get_args(annotation)[0])

@@ -1,4 +1,4 @@
-"""What every request passes: request id, security headers, cross-site check, one place for errors."""
+"""Middleware of every request: request id, security headers, cross-site check, one place for errors."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _seconds = Histogram("betaloop_request_seconds", "Time to answer by route.", ["r
 
 
 def install(app: FastAPI, judge: Judge) -> None:
-    """Add middleware and error handlers to the service; `judge` tells who sends a request before its body is read."""
+    """Add middleware and error handlers to the service; `judge` names the sender of a request before its body is read."""
     app.add_middleware(UniqueMembers, refusal=_refused_unread)
     app.add_middleware(BodyLimit, refusal=_refused_unread, judge=judge)  # inside the other: its refusals have the headers of every answer
     app.middleware("http")(_around)
@@ -70,7 +70,7 @@ async def _around(request: Request, call_next: RequestResponseEndpoint) -> Respo
 
 
 def _secured(request: Request, response: Response) -> Response:
-    """The answer with the headers that every answer has, a server error's among them."""
+    """Add the headers that every answer has, a server error's among them."""
     response.headers["X-Request-ID"] = getattr(request.state, "request_id", "")
     response.headers["Content-Security-Policy"] = CONTENT_SECURITY_POLICY
     response.headers["X-Content-Type-Options"] = "nosniff"
@@ -83,9 +83,9 @@ def _secured(request: Request, response: Response) -> Response:
 
 
 def _cross_site(request: Request) -> BetaloopError | None:
-    """A browser states where a request comes from; what changes data must come from our own pages.
+    """Refuse a change from another site: a browser states where a request comes from, and changes must come from our own pages.
 
-    A request with a bearer token and no cookie has no rights but the token's, which no other site can know: it may come from anywhere.
+    A request with a bearer token and no cookie has no rights but the token's, which no other site can know. So it may come from anywhere.
     """
     scheme, _, token = request.headers.get("authorization", "").partition(" ")
     by_token_alone = scheme.lower() == "bearer" and bool(token.strip()) and not request.cookies
@@ -100,7 +100,7 @@ def _cross_site(request: Request) -> BetaloopError | None:
 
 
 def wants_page(request: Request) -> bool:
-    """Whether a person at a browser page asks, not a program."""
+    """Decide whether a person at a browser page asks, not a program."""
     return not request.url.path.startswith("/api/") and "text/html" in request.headers.get("accept", "")
 
 
@@ -123,7 +123,7 @@ async def _answer(request: Request, error: BetaloopError) -> Response:
 
 
 async def _refused_unread(request: Request, error: Exception) -> Response:
-    """The answer to a request whose body was not read: refusals stand outside the handlers of errors."""
+    """Answer a request whose body was not read: refusals are outside the handlers of errors."""
     if isinstance(error, BetaloopError):
         return await _answer(request, error)
     if isinstance(error, DBAPIError | PoolTimeout):
@@ -169,7 +169,7 @@ async def _http_error(request: Request, error: Exception) -> Response:
     if isinstance(error.__cause__, OSError):  # what the framework calls a body that cannot be read, where our disk could not take it
         return await _fault_beneath(request, error.__cause__)
     if wants_page(request) and getattr(request.state, "caller", None) is None:
-        # no route asked who this is: the page of the error still has the way back for somebody who has signed in, if the database answers
+        # no route asked who this is: for a signed-in person the page of the error still has the way back, if the database answers
         with suppress(BetaloopError, DBAPIError, PoolTimeout):
             await request.app.state.judge(request)
     hint = _HINTS.get(error.status_code, "") if not wants_page(request) else ""
@@ -181,7 +181,8 @@ async def _http_error(request: Request, error: Exception) -> Response:
 
 
 def _methods(request: Request) -> list[str]:
-    """Every method that some route takes at a request's address (RFC 9110, 10.2.1); the router names those of the first route alone."""
+    """List every method that some route takes at a request's address (RFC 9110, 10.2.1); the router names those of the first route
+    alone."""
     found: set[str] = set()
     for context in iter_route_contexts(request.app.routes):
         if context.path and compile_path(context.path)[0].match(request.url.path):
@@ -190,18 +191,18 @@ def _methods(request: Request) -> list[str]:
 
 
 async def _gone(request: Request, error: Exception) -> Response:
-    """Nobody is there any more to read an answer; no fault of ours, and nothing that strangers should fill the log with."""
+    """Log that the reader of the answer is gone: no fault of ours, and nothing that strangers should fill the log with."""
     log.debug("the caller left before the whole request had come", path=request.url.path)
     return await _answer(request, _PlainError(400, "The request ended before it was whole."))
 
 
 _FIRST = {"23505", "23503"}
-"""Of a row that is there already, or is gone: somebody did it at the same moment, after both had looked."""
+"""A row is there already, or is gone: another person did it at the same moment, after both had looked."""
 
 
 async def _fault_beneath(request: Request, error: Exception) -> Response:
-    """503 where the database is away or gave the request up for another, 507 where a disk is full, 409 where somebody else was first;
-    anything else is an error of ours.
+    """Answer 503 where the database is away or gave the request up for another, 507 where a disk is full, 409 where another person was
+    first. Anything else is an error of ours.
     """
     state = getattr(getattr(error, "orig", None), "sqlstate", None)
     if state in _FIRST:
@@ -214,7 +215,7 @@ async def _fault_beneath(request: Request, error: Exception) -> Response:
 
 
 async def _second(request: Request, error: Exception) -> Response:
-    """Two requests did the same at the same moment, and this one came second."""
+    """Refuse the second of two requests that did the same at the same moment."""
     told = getattr(error, "orig", None)
     constraint = getattr(getattr(told, "diag", None), "constraint_name", None)
     log.warning("two requests at the same moment", path=request.url.path, sqlstate=getattr(told, "sqlstate", None), constraint=constraint)

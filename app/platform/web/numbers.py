@@ -1,4 +1,4 @@
-"""How pages write numbers, lengths of time, sizes and dates: the filters of the templates, and for words that Python makes."""
+"""Formats of numbers, lengths of time, sizes and dates on pages: the filters of the templates, and for words that Python makes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _RAISED = str.maketrans("0123456789", "\u2070\u00b9\u00b2\u00b3\u2074\u2075\u207
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number for people: significant digits, an em dash where there is none."""
+    """Format a number for people: significant digits, an em dash where there is none."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "—"
     if value == 0:
@@ -21,12 +21,12 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def fixed(value: float | None, decimals: int = 1) -> str:
-    """A number with a fixed count of decimals; what rounds to nothing has no sign."""
+    """Format a number with a fixed count of decimals; what rounds to nothing has no sign."""
     return "—" if value is None or math.isnan(value) else f"{value:z.{decimals}f}".replace("-", "\u2212")
 
 
 def stated(value: float | None, digits: int = 6) -> str:
-    """A number that somebody stated or a device has, in as few digits as it needs: 2.5 mA stays 2.5, 20 min stay 20.
+    """Format a number that a person stated or a device has, in as few digits as it needs: 2.5 mA stays 2.5, 20 min stay 20.
 
     Args:
         value: the number; an em dash where there is none. digits: significant ones at most.
@@ -34,33 +34,33 @@ def stated(value: float | None, digits: int = 6) -> str:
     if value is None or math.isnan(value):
         return "\u2014"
     if abs(value) >= 10**digits:
-        return number(value, digits)  # in digits: nobody reads 1.2e+03
+        return number(value, digits)  # in digits: 1.2e+03 is unreadable
     shown, _, power = f"{value:z.{digits}g}".partition("e")
     return (f"{shown}\u00d710\u207b{power.lstrip('-0').translate(_RAISED)}" if power else shown).replace("-", "\u2212")
 
 
 def whole(value: float) -> int:
-    """The nearest whole number, to count with."""
+    """Round to the nearest whole number, to count with."""
     return round(value)
 
 
 def rate(value: float) -> str:
-    """A learning rate as people write it: 3e-4."""
+    """Format a learning rate as people write it: 3e-4."""
     return f"{value:.0e}".replace("e-0", "e-")
 
 
 def place(value: float) -> str:
-    """A coordinate of a drawing; nobody reads it."""
+    """Format a coordinate of a drawing."""
     return f"{value:.2f}"
 
 
 def typed(value: float | None, digits: int = 4) -> str:
-    """A number as it stands in a field, for a form to send back: so many significant digits, nothing where there is none."""
+    """Format a number for a form's field: so many significant digits, nothing where there is none."""
     return "" if value is None else f"{value:.{digits}g}"
 
 
 def hover(axis: str = "y", digits: int = 3) -> str:
-    """The part of a chart's hover text that shows a value of the point in significant digits; plotly.js fills it in.
+    """Write the part of a chart's hover text that shows a value of the point in significant digits; plotly.js fills it in.
 
     Args:
         axis: `x`, `y` or `customdata`. digits: significant ones at most; no exponent is shown.
@@ -69,7 +69,7 @@ def hover(axis: str = "y", digits: int = 3) -> str:
 
 
 def p_text(p: float | None) -> str:
-    """A p-value for people, without the zero that every p has before its point; one that rounds to nothing is said to be below .001."""
+    """Format a p-value for people, without the zero before its point; one that rounds to nothing is shown as below .001."""
     if p is None or math.isnan(p):
         return "\u2014"
     if p < 0.001:
@@ -78,7 +78,7 @@ def p_text(p: float | None) -> str:
 
 
 def minutes(seconds: float | None) -> str:
-    """A length of time for people: 10 min 20 s."""
+    """Format a length of time for people: 10 min 20 s."""
     if seconds is None:
         return "—"
     whole = round(seconds)
@@ -86,19 +86,19 @@ def minutes(seconds: float | None) -> str:
 
 
 def minutes_left(seconds: float) -> str:
-    """A remaining time for people, no finer than it can be known."""
+    """Format a remaining time for people, no finer than it can be known."""
     if seconds < 60:
         return "less than a minute left"
     return f"about {math.ceil(seconds / 60)} min left" if seconds <= 7200 else f"about {seconds / 3600:.0f} h left"
 
 
 def time_left(seconds: float | None) -> str:
-    """The remaining time of a job in words, also where it cannot be told yet: on pages, in events and in the terminal."""
+    """Describe the remaining time of a job in words, also where it is unknown: on pages, in events and in the terminal."""
     return "time left not known yet" if seconds is None else minutes_left(seconds)
 
 
 def size(value: int) -> str:
-    """Bytes for people."""
+    """Format a number of bytes for people."""
     if value < 1024:
         return f"{value} B"
     amount, unit = float(value), "B"
@@ -109,7 +109,7 @@ def size(value: int) -> str:
 
 
 def when(value: datetime | date | None) -> str:
-    """A date, or a time to the minute (UTC)."""
+    """Format a date, or a time to the minute (UTC)."""
     if value is None:
         return "—"
     return value.strftime("%Y-%m-%d %H:%M UTC") if isinstance(value, datetime) else value.isoformat()

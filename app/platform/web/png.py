@@ -15,19 +15,19 @@ STOPS = ((24, 16, 66), (56, 44, 128), (40, 92, 150), (28, 138, 138), (86, 182, 9
 
 
 def palette(stops: Sequence[tuple[int, int, int]] = STOPS) -> NDArray[np.uint8]:
-    """255 colours between the stops, [255, 3]."""
+    """Compute 255 colours between the stops, [255, 3]."""
     at = np.linspace(0, len(stops) - 1, 255)
     channels = [np.interp(at, np.arange(len(stops)), [stop[c] for stop in stops]) for c in range(3)]
     return np.stack(channels, axis=1).round().astype(np.uint8)
 
 
 def colour_scale() -> list[list[float | str]]:
-    """The same colours for a chart: [share, colour]."""
+    """List the same colours for a chart: [share, colour]."""
     return [[i / (len(STOPS) - 1), "rgb({}, {}, {})".format(*stop)] for i, stop in enumerate(STOPS)]
 
 
 def picture(values: NDArray[np.floating], low: float, high: float) -> str:
-    """The matrix as a `data:` address of a PNG, row 0 at the top; what is not finite is transparent.
+    """Draw the matrix as a `data:` address of a PNG, row 0 at the top; what is not finite is transparent.
 
     Args:
         values: [rows, columns]. low, high: values of the first and the last colour; beyond them the colours stay.

@@ -20,7 +20,7 @@ LABEL = 12.0
 
 
 def token(name: str) -> str:
-    """A colour of the page's theme, e.g. "accent"."""
+    """Name a colour of the page's theme, e.g. "accent"."""
     return f"var(--c-{name})"
 
 
@@ -53,16 +53,16 @@ class Plane:
     parts: list[str] = field(default_factory=list)
 
     def at_x(self, value: float) -> float:
-        """Where a value of the horizontal axis lies."""
+        """Compute the place of a value of the horizontal axis."""
         return self.left + (value - self.x[0]) / ((self.x[1] - self.x[0]) or 1.0) * self.width
 
     def at_y(self, value: float) -> float:
-        """Where a value of the vertical axis lies; beyond the axis at its end."""
+        """Compute the place of a value of the vertical axis; beyond the axis at its end."""
         share = (value - self.y[0]) / ((self.y[1] - self.y[0]) or 1.0)
         return self.top + self.height * (1 - min(max(share, 0.0), 1.0))
 
     def axes(self, x_title: str, y_title: str, x_ticks: int = 5, y_ticks: int = 5) -> None:
-        """Grid lines, tick numbers and titles."""
+        """Draw grid lines, tick numbers and titles."""
         bottom = self.top + self.height
         for value in nice_ticks(*self.y, y_ticks):
             y = self.at_y(value)
@@ -75,7 +75,7 @@ class Plane:
         self.text(self.left - 36 if y_ticks else self.left, self.top - 10, y_title, "start")
 
     def cell(self, x0: float, x1: float, y0: float, y1: float, colour: str, opacity: float) -> None:
-        """A filled rectangle."""
+        """Draw a filled rectangle."""
         left, top = self.at_x(x0), self.at_y(y1)
         self.parts.append(
             f'<rect x="{left:.1f}" y="{top:.1f}" width="{self.at_x(x1) - left:.1f}" height="{self.at_y(y0) - top:.1f}" '
@@ -91,7 +91,8 @@ class Plane:
         step: bool = False,
         words: str = "",
     ) -> None:
-        """A line through (x, y); it breaks where y is None. `step` holds each value until the next x; `words` are shown at a pointer."""
+        """Draw a line through (x, y); it breaks where y is None. `step` keeps each value until the next x; `words` are shown at a
+        pointer."""
         drawn: list[str] = []
         down, last = False, 0.0
         for x, y in points:
@@ -110,21 +111,21 @@ class Plane:
             self.parts.append(f'<path d="{"".join(drawn)}" {look}{end}')
 
     def level(self, value: float, words: str, colour: str, dash: str = "5 4") -> None:
-        """A horizontal line over the whole width, with its words above its left end."""
+        """Draw a horizontal line over the whole width, with its words above its left end."""
         y = self.at_y(value)
         self.parts.append(_line(self.left, y, self.left + self.width, y, token(colour), dash))
         self.text(self.left + 4, y - 4, words, "start", colour)
 
     def interval(self, x: float, low: float, high: float, colour: str) -> None:
-        """A vertical line from `low` to `high`."""
+        """Draw a vertical line from `low` to `high`."""
         self.parts.append(_line(self.at_x(x), self.at_y(low), self.at_x(x), self.at_y(high), token(colour), width=1.5))
 
     def dot(self, x: float, y: float, colour: str, shape: str = "circle", words: str = "") -> None:
-        """A mark at a value; see `mark`."""
+        """Draw a mark at a value; see `mark`."""
         self.mark(self.at_x(x), self.at_y(y), colour, shape, words)
 
     def mark(self, px: float, py: float, colour: str, shape: str = "circle", words: str = "") -> None:
-        """A mark at a place of the figure; `shape` is circle, square, diamond, up, down or ring. `words` are its tooltip."""
+        """Draw a mark at a place of the figure; `shape` is circle, square, diamond, up, down or ring. `words` are its tooltip."""
         paint = token(colour)
         title = f"<title>{escape(words)}</title>" if words else ""
         if shape == "square":
@@ -141,7 +142,7 @@ class Plane:
             )
 
     def text(self, x: float, y: float, words: str, anchor: str = "start", colour: str = "text", weight: int = 400) -> None:
-        """Words at a place of the figure, not of the axes."""
+        """Write words at a place of the figure, not of the axes."""
         bold = f' font-weight="{weight}"' if weight != 400 else ""
         look = f'text-anchor="{anchor}" fill="{token(colour)}" font-size="{LABEL:g}"{bold}'
         halo = f'paint-order="stroke" stroke="{token("surface")}" stroke-width="3"'  # words stay readable over cells and lines
@@ -149,7 +150,7 @@ class Plane:
 
 
 def apart(wanted: Sequence[float], gap: float = LABEL + 2, low: float = -math.inf, high: float = math.inf) -> list[float]:
-    """Places near the wanted ones that keep a gap from each other, in the given order; within [low, high] where they fit."""
+    """Choose places near the wanted ones that keep a gap from each other, in the given order; within [low, high] where they fit."""
     order = sorted(range(len(wanted)), key=lambda i: wanted[i])
     placed = [0.0] * len(wanted)
     last = low - gap
@@ -163,7 +164,7 @@ def apart(wanted: Sequence[float], gap: float = LABEL + 2, low: float = -math.in
 
 
 def drawing(width: float, height: float, title: str, description: str, planes: Sequence[Plane]) -> Markup:
-    """The figure.
+    """Draw the figure.
 
     Args:
         width, height: of the `viewBox`. title: a short noun phrase. description: what there is to see. planes: what was drawn.

@@ -32,7 +32,7 @@ _environment = Environment(
 
 
 def render(request: Request, template: str, **values: Any) -> str:
-    """A page as text. `me` (who is signed in, or None) and `path` are there for every template.
+    """Render a page as text. `me` (who is signed in, or None) and `path` are there for every template.
 
     Not `caller`: that word belongs to Jinja inside `call` blocks, where it would silently mean something else.
     """
@@ -42,17 +42,17 @@ def render(request: Request, template: str, **values: Any) -> str:
 
 
 def render_part(template: str, **values: Any) -> Markup:
-    """A part of a page, made of its values alone: it knows neither the request nor who is signed in, so that it may be kept."""
+    """Render a part of a page from its values alone. It knows neither the request nor who is signed in, so that it may be cached."""
     return Markup(_environment.get_template(template).render(**values))  # noqa: S704
 
 
 def static_url(name: str) -> str:
-    """URL of a file under static/, with its hash, so that browsers may keep it for ever."""
+    """Build the URL of a file under static/, with its hash, so that browsers may keep it for ever."""
     return f"/static/{name}?v={_hash(name, (STATIC / name).stat().st_mtime_ns)}"
 
 
 def plotly_url() -> str:
-    """URL of plotly.js, which comes from plotly's own package; charts.js loads it only where there is a chart."""
+    """Build the URL of plotly.js, which comes from plotly's own package; charts.js loads it only where there is a chart."""
     return f"/static/plotly/plotly.min.js?v={plotly.__version__}"
 
 
@@ -62,7 +62,7 @@ def _hash(name: str, _changed: int) -> str:
 
 
 def sign_on_name() -> str:
-    """What the hospital's sign-on is called; empty where there is none."""
+    """Name the hospital's sign-on; empty where there is none."""
     settings = get_settings()
     return settings.oidc_name if settings.oidc_issuer else ""
 
