@@ -225,7 +225,7 @@ def near_session(level: float, steps: int, period_s: float, lower_bound: float, 
     if not lower_bound <= level < 1:
         raise ValueError(f"a session is held near an amplitude from B, {lower_bound:g}, to below 1, not near {level:g}")
     rng = np.random.default_rng([seed, 0x6E6561, number])
-    decisions = _held(steps, period_s, lower_bound, rng, lambda low: near_density(level, low))
+    decisions = _sustained_draws(steps, period_s, lower_bound, rng, lambda low: near_density(level, low))
     return DesignedSession("near", 1, number, level, seed, decisions)
 
 
@@ -272,11 +272,11 @@ def _paper_session(settings: DesignSettings, visit: int, number: int, rng: np.ra
 
 
 def _held_session(settings: DesignSettings, visit: int, number: int, level: float, rng: np.random.Generator) -> DesignedSession:
-    decisions = _held(settings.steps, settings.period_s, settings.lower_bound, rng, lambda low: DrawDensity(level, low))
+    decisions = _sustained_draws(settings.steps, settings.period_s, settings.lower_bound, rng, lambda low: DrawDensity(level, low))
     return DesignedSession("stratified", visit, number, level, settings.seed, decisions)
 
 
-def _held(
+def _sustained_draws(
     steps: int, period_s: float, lower_bound: float, rng: np.random.Generator, law: Callable[[float], DrawDensity]
 ) -> tuple[Decision, ...]:
     """Draw sustained amplitudes by a density that depends on the bound in force."""

@@ -140,14 +140,14 @@ class SessionTrajectory:
     @property
     def padded_beta(self) -> Floats:
         """Lead and session, with imputed values in gaps of up to `most_imputed`, shape [W + T]; s_k is `padded_beta[k : k + W]`."""
-        return self._filled()[0]
+        return self._fill_gaps()[0]
 
     @property
     def imputed(self) -> Mask:
         """Mark which of `padded_beta` are imputed, shape [W + T]."""
-        return self._filled()[1]
+        return self._fill_gaps()[1]
 
-    def _filled(self) -> tuple[Floats, Mask]:
+    def _fill_gaps(self) -> tuple[Floats, Mask]:
         beta = self.measured_beta
         known = np.flatnonzero(~np.isnan(beta))
         imputed = np.zeros(beta.size, dtype=bool)
@@ -165,7 +165,7 @@ class SessionTrajectory:
 
     def states(self) -> Floats:
         """Return s_0 ... s_T, shape [T + 1, W], oldest beta first; NaN where a window has an invalid beta that may not be imputed in it."""
-        filled, imputed = self._filled()
+        filled, imputed = self._fill_gaps()
         window = self.lead_beta.size
         states = sliding_window_view(filled, window)
         if not imputed.any():

@@ -73,7 +73,7 @@ class Bucket:
     def size(self, sha256: str) -> int | None:
         """Return the size of an object in bytes; None where there is none."""
         try:
-            return int(self._asked(lambda: self._fs.info(self._name(sha256)))["size"])
+            return int(self._ask(lambda: self._fs.info(self._name(sha256)))["size"])
         except FileNotFoundError:
             return None
 
@@ -82,7 +82,7 @@ class Bucket:
         size = path.stat().st_size
         if self.size(sha256) == size and self.hash_of(sha256) == sha256:
             return
-        self._asked(lambda: self._fs.put_file(str(path), self._name(sha256)))
+        self._ask(lambda: self._fs.put_file(str(path), self._name(sha256)))
         if self.size(sha256) != size:
             raise StoreAway(f"The bucket has not taken all of {sha256}.", "Try again; nothing that was stored before is lost.")
 
@@ -90,7 +90,7 @@ class Bucket:
         """Copy an object into a file; whether there was one. The bytes are not judged here. Raises OSError where the disk is full."""
         try:
             with self.opened(sha256) as source, target.open("wb") as out:
-                while piece := self._asked(lambda: source.read(CHUNK)):
+                while piece := self._ask(lambda: source.read(CHUNK)):
                     out.write(piece)
         except FileNotFoundError:
             return False
@@ -100,27 +100,27 @@ class Bucket:
         """Compute the SHA-256 of the bytes that an object really has, read whole; None where there is none."""
         try:
             with self.opened(sha256) as source:
-                return self._asked(lambda: hashlib.file_digest(source, "sha256").hexdigest())  # type: ignore[arg-type]
+                return self._ask(lambda: hashlib.file_digest(source, "sha256").hexdigest())  # type: ignore[arg-type]
         except FileNotFoundError:
             return None
 
     @contextmanager
     def opened(self, sha256: str) -> Iterator[BinaryIO]:
         """Open an object to read it from its beginning. Raises FileNotFoundError."""
-        source = self._asked(lambda: self._fs.open(self._name(sha256), "rb", cache_type="readahead", block_size=8 * CHUNK))
+        source = self._ask(lambda: self._fs.open(self._name(sha256), "rb", cache_type="readahead", block_size=8 * CHUNK))
         with source:
             yield source
 
     def remove(self, sha256: str) -> None:
         """Remove an object, if it is there."""
         try:
-            self._asked(lambda: self._fs.rm_file(self._name(sha256)))
+            self._ask(lambda: self._fs.rm_file(self._name(sha256)))
         except FileNotFoundError:
             return
 
     def empty(self) -> bool:
         """Decide whether there is no object at all under the prefix."""
-        return not self._asked(lambda: self._fs.find(self._root, maxdepth=3))
+        return not self._ask(lambda: self._fs.find(self._root, maxdepth=3))
 
     def check_keys(self, settings: Settings) -> None:
         """Compare this machine's keys with those of the other machines; the first machine makes them, and leaves their fingerprints.
@@ -129,7 +129,7 @@ class Bucket:
             RuntimeError: a key is missing here, or another one.
         """
         folder = settings.data_dir / "secrets"
-        known = {name.rsplit("/", 1)[-1] for name in self._asked(lambda: self._fs.find(f"{self._root}/keys"))}
+        known = {name.rsplit("/", 1)[-1] for name in self._ask(lambda: self._fs.find(f"{self._root}/keys"))}
         for name in SHARED_KEYS:
             place = f"{self._root}/keys/{name}"
             if name in known and not (folder / name).exists():
@@ -138,8 +138,8 @@ class Bucket:
                 )
             said = hashlib.sha256(_FINGERPRINT + settings.secret(name)).hexdigest().encode()
             if name not in known:
-                self._asked(lambda place=place, said=said: self._fs.pipe_file(place, said))  # type: ignore[misc]
-            elif self._asked(lambda place=place: self._fs.cat_file(place)) != said:  # type: ignore[misc]
+                self._ask(lambda place=place, said=said: self._fs.pipe_file(place, said))  # type: ignore[misc]
+            elif self._ask(lambda place=place: self._fs.cat_file(place)) != said:  # type: ignore[misc]
                 raise RuntimeError(
                     f"{folder / name} is not the key that the other machines of this installation have. Copy their folder `secrets` here."
                 )
@@ -147,7 +147,7 @@ class Bucket:
     def _name(self, sha256: str) -> str:
         return f"{self._root}/files/{sha256[:2]}/{sha256}"
 
-    def _asked(self, ask: Callable[[], T]) -> T:
+    def _ask(self, ask: Callable[[], T]) -> T:
         """Call the bucket. Raises FileNotFoundError, or StoreAway for all else that goes wrong there."""
         from botocore.exceptions import BotoCoreError, ClientError
 

@@ -203,12 +203,12 @@ def _draft_folder() -> Path:
             folder = incoming / secrets.token_hex(8)
             folder.mkdir(mode=0o700)
             # another process that clears up may look between any two of these lines: then this folder is theirs, and another one is made
-            if (taken := _locked(folder)) is not None:
+            if (taken := _lock_folder(folder)) is not None:
                 _own_folder.append((folder, taken))
                 return folder
 
 
-def _locked(folder: Path) -> int | None:
+def _lock_folder(folder: Path) -> int | None:
     """Lock a folder and return the descriptor of the lock; None where another process has it, or has removed the folder."""
     try:
         lock = os.open(folder / _LOCK, os.O_CREAT | os.O_RDWR, 0o600)
@@ -233,7 +233,7 @@ def remove_abandoned() -> int:
             entry.unlink(missing_ok=True)
             removed += 1
             continue
-        lock = _locked(entry)
+        lock = _lock_folder(entry)
         if lock is None:
             continue
         try:

@@ -67,11 +67,11 @@ class UniqueMembers:
         if scope["type"] != "http" or not is_json(scope):
             await self.app(scope, receive, send)
             return
-        came, failure = await _received(receive)
+        came, failure = await _receive_body(receive)
         body = b"".join(message.get("body", b"") for message in came)
         doubled = await run_in_threadpool(doubled_member, body) if len(body) > AT_ONCE_BYTES else doubled_member(body)
         if doubled is not None:
-            response = await self.refusal(Request(scope), _refused(*doubled))
+            response = await self.refusal(Request(scope), _refusal(*doubled))
             await response(scope, receive, send)
             return
         again = iter(came)
@@ -86,7 +86,7 @@ class UniqueMembers:
         await self.app(scope, receive_again, send)
 
 
-async def _received(receive: Receive) -> tuple[list[Message], HTTPException | None]:
+async def _receive_body(receive: Receive) -> tuple[list[Message], HTTPException | None]:
     """Receive the parts of a body. What broke it off is raised where it is read, whose handlers know it."""
     came: list[Message] = []
     try:
@@ -97,7 +97,7 @@ async def _received(receive: Receive) -> tuple[list[Message], HTTPException | No
     return came, None
 
 
-def _refused(where: str, name: str) -> Invalid:
+def _refusal(where: str, name: str) -> Invalid:
     shown = name[:80]
     return Invalid(
         f"{where} has the member '{shown}' more than once.",

@@ -81,25 +81,25 @@ def grant(connection: Connection, role: str, password: str | None) -> int:
         RuntimeError: there is no such role and the owner may not make it.
     """
     _ensure_role(connection, role, password)
-    name = _quoted(connection, role)
+    name = _quote(connection, role)
     changed = 0
     for schema, relation, kind, has in connection.execute(text(_TABLES), {"role": role, "schemas": list(SCHEMAS)}).all():
         rights = frozenset({"SELECT", "USAGE"}) if kind == "S" else wanted(schema, relation)
         if frozenset(has) == rights:
             continue
-        target = f"{'sequence' if kind == 'S' else 'table'} {_quoted(connection, schema)}.{_quoted(connection, relation)}"
+        target = f"{'sequence' if kind == 'S' else 'table'} {_quote(connection, schema)}.{_quote(connection, relation)}"
         connection.exec_driver_sql(f"revoke all on {target} from {name}, public")
         connection.exec_driver_sql(f"grant {', '.join(sorted(rights))} on {target} to {name}")
         changed += 1
     for function in connection.scalars(text(_WRITERS), {"role": role}).all():
         connection.exec_driver_sql(f"revoke execute on function {function} from {name}, public")
     if changed:
-        database = _quoted(connection, str(connection.scalar(text("select current_database()"))))
+        database = _quote(connection, str(connection.scalar(text("select current_database()"))))
         connection.exec_driver_sql(f"grant connect on database {database} to {name}")
         connection.exec_driver_sql(f"revoke temporary on database {database} from public")
         for schema in SCHEMAS:
-            connection.exec_driver_sql(f"grant usage on schema {_quoted(connection, schema)} to {name}")
-            connection.exec_driver_sql(f"revoke create on schema {_quoted(connection, schema)} from {name}, public")
+            connection.exec_driver_sql(f"grant usage on schema {_quote(connection, schema)} to {name}")
+            connection.exec_driver_sql(f"revoke create on schema {_quote(connection, schema)} from {name}, public")
     return changed
 
 
@@ -135,10 +135,10 @@ def _ensure_role(connection: Connection, role: str, password: str | None) -> Non
     if not may:
         raise RuntimeError(f"There is no database role {role}. Have it made: create role {role} login password '...';")
     secret = "" if password is None else f" password {_literal(connection, password)}".replace("%", "%%")
-    connection.exec_driver_sql(f"create role {_quoted(connection, role)} login{secret}")
+    connection.exec_driver_sql(f"create role {_quote(connection, role)} login{secret}")
 
 
-def _quoted(connection: Connection, name: str) -> str:
+def _quote(connection: Connection, name: str) -> str:
     return connection.dialect.identifier_preparer.quote_identifier(name)
 
 

@@ -10,11 +10,11 @@ import typer
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Code = Annotated[str, typer.Argument(help="Code of the participant, e.g. P1.")]
-Why = Annotated[str, typer.Option("--reason", help="Why; kept in the audit trail.", callback=lambda text: _stated(text))]
+Why = Annotated[str, typer.Option("--reason", help="Why; kept in the audit trail.", callback=lambda text: _check_reason(text))]
 ACTOR = "command line"
 
 
-def _stated(text: str) -> str:
+def _check_reason(text: str) -> str:
     """Check a reason, without blanks around it."""
     if not 1 <= len(text.strip()) <= 1000:
         raise typer.BadParameter("say why, in 1 to 1000 characters")

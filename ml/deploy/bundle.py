@@ -95,7 +95,7 @@ def build_bundle(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDA
         PolicyFileError: the network is no policy of this window.
         BundleError: test windows of another shape, or not finite.
     """
-    manifest, network, policy, windows = _described(policy_onnx, manifest, test_windows)
+    manifest, network, policy, windows = _complete(policy_onnx, manifest, test_windows)
     expected = policy.act(windows)
     steps = vectors.session(manifest, make_controller(manifest, network or PolicyWindow(policy, manifest.window)), windows)
     files = {MODEL: policy_onnx, VECTORS: vectors.to_json(windows, expected, steps)}
@@ -156,10 +156,10 @@ def pack_whole(manifest: BundleManifest, files: dict[str, bytes]) -> bytes:
 
 def describe(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDArray[Any]) -> BundleManifest:
     """Describe the bundle by the manifest that `build_bundle` would write, all but the files; arguments and errors as there."""
-    return _described(policy_onnx, manifest, test_windows)[0]
+    return _complete(policy_onnx, manifest, test_windows)[0]
 
 
-def _described(
+def _complete(
     policy_onnx: bytes, manifest: BundleManifest, test_windows: NDArray[Any]
 ) -> tuple[BundleManifest, MlpNetwork | None, OnnxPolicy, NDArray[np.float64]]:
     """Complete the manifest from the network. Also return its layers where it is a plain one, the policy, and test windows with the
@@ -235,11 +235,11 @@ def open_bundle(content: bytes, public_key: Ed25519PublicKey | None = None) -> O
             raise BundleError(f"{name} is not the file that the manifest names: SHA-256 {found[:12]}... instead of {digest[:12]}...")
     digest = hashlib.sha256(raw).hexdigest()
     if manifest.sealed is not None:
-        manifest, raw, files = _opened(manifest, files[SEALED], manifest.sealed)
-    return _loaded(manifest, raw, files, digest)
+        manifest, raw, files = _open_sealed(manifest, files[SEALED], manifest.sealed)
+    return _load(manifest, raw, files, digest)
 
 
-def _opened(outer: BundleManifest, sealed: bytes, nonce: str) -> tuple[BundleManifest, bytes, dict[str, bytes]]:
+def _open_sealed(outer: BundleManifest, sealed: bytes, nonce: str) -> tuple[BundleManifest, bytes, dict[str, bytes]]:
     """Open the sealed manifest and files of a blinded bundle."""
     try:
         files = unseal(sealed, nonce)
@@ -253,7 +253,7 @@ def _opened(outer: BundleManifest, sealed: bytes, nonce: str) -> tuple[BundleMan
     return inner, raw, files
 
 
-def _loaded(manifest: BundleManifest, raw: bytes, files: dict[str, bytes], digest: str) -> OpenBundle:
+def _load(manifest: BundleManifest, raw: bytes, files: dict[str, bytes], digest: str) -> OpenBundle:
     """Load the network of a bundle, and check it with the test vectors. `raw`: of the manifest. `digest`: by which logs name the bundle."""
     if manifest.schedule is not None:
         _check_decisions(raw, None, files[VECTORS], "the schedule")

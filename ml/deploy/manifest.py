@@ -270,16 +270,16 @@ class BundleManifest:
         if not isinstance(activations, list) or not all(isinstance(name, str) for name in activations):
             raise BundleError("activations in manifest.json must be a list of names")
         signed = tuple(Approval(**item) for item in approvals)
-        values["slot"] = _nested("slot", values.get("slot"), lambda stored: Slot(**stored))
-        values["schedule"] = _nested("schedule", values.get("schedule"), Schedule.from_json)
-        values["card"] = _nested("card", values.get("card"), PlanCard.from_json)
+        values["slot"] = _read_object("slot", values.get("slot"), lambda stored: Slot(**stored))
+        values["schedule"] = _read_object("schedule", values.get("schedule"), Schedule.from_json)
+        values["card"] = _read_object("card", values.get("card"), PlanCard.from_json)
         return BundleManifest(**values, layers=tuple(layers), activations=tuple(activations), approvals=signed)
 
 
 Made = TypeVar("Made")
 
 
-def _nested(name: str, stored: Any, make: Callable[[dict[str, Any]], Made]) -> Made | None:
+def _read_object(name: str, stored: Any, make: Callable[[dict[str, Any]], Made]) -> Made | None:
     """Read an object inside the manifest. Raises BundleError where it has another shape."""
     if stored is None:
         return None

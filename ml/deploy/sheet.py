@@ -51,7 +51,7 @@ def render(manifest: BundleManifest, model_sha256: str | None) -> str:
         model_sha256: of the ONNX file; None where a schedule runs.
     """
     if manifest.card is not None and manifest.card.blinded:
-        return _blinded(manifest, manifest.card)
+        return _blinded_sheet(manifest, manifest.card)
     number = "" if manifest.policy_id is None else f" · policy {manifest.policy_id}"
     what = "Network" if manifest.schedule is None else "Schedule"
     expected = "Amplitude" if manifest.card is not None and manifest.schedule is None else "Amplitude, energy, battery"
@@ -64,21 +64,21 @@ def render(manifest: BundleManifest, model_sha256: str | None) -> str:
 <div class="kind">Closed-loop DBS controller<br>one-page sheet of the bundle</div></header>
 {_approval(manifest)}
 {_session(manifest)}
-{_planned(manifest)}
-{_warned(manifest)}
+{_plan_card(manifest)}
+{_warnings(manifest)}
 <h2>Stimulation limits</h2>
 <div class="big"><div><small>Lowest</small><b>{manifest.min_ma:g} mA</b></div><div><small>Highest</small><b>{manifest.max_ma:g} mA</b></div>
 <div><small>cDBS = fraction 1</small><b>{manifest.cdbs_ma:g} mA</b></div>
 <div><small>Ramp</small><b>{manifest.ramp_ma_per_s:g} mA/s</b></div></div>
 {_scale(manifest)}
-<p class="muted">{_stated(manifest)} {_device(manifest)}</p>
+<p class="muted">{_source_of_limits(manifest)} {_device(manifest)}</p>
 <div class="columns"><div>
 <h2>Signal</h2><table>{_rows(_signal(manifest))}</table>
 </div><div>
 <h2>{what}</h2><table>{_rows(_network(manifest))}</table>
 </div></div>
 <h2>{expected}</h2>
-<table class="wide">{_rows(_expected(manifest))}</table>
+<table class="wide">{_rows(_expectations(manifest))}</table>
 <h2>When the controller gives way</h2>
 <p style="margin:2px 0">Every {manifest.period_s:g} s it decides anew. In the same decision, and without a ramp, it returns to the cDBS
 amplitude of <b>{manifest.cdbs_ma:g}&nbsp;mA</b> when beta has not come when it was due (older than {manifest.limits().stale_after_s:g} s),
@@ -98,7 +98,7 @@ _SIGNED_BY = """<div class="lines"><div>Clinician, date: limits checked against 
 <div>Engineer, date: bundle verified on the tablet</div></div>"""
 
 
-def _blinded(m: BundleManifest, card: PlanCard) -> str:
+def _blinded_sheet(m: BundleManifest, card: PlanCard) -> str:
     """Render the sheet of a session of a blinded plan: its letter, common limits and stop rules, and nothing that reveals what runs."""
     code = escape(m.participant)
     taken = f"First taken by {escape(re.sub(r'[.][0-9]{6} ', ' ', m.taken_by))}. " if m.taken_by else ""
@@ -109,7 +109,7 @@ def _blinded(m: BundleManifest, card: PlanCard) -> str:
 <div class="kind">Closed-loop DBS controller<br>one-page sheet of a blinded session</div></header>
 {_approval(m)}
 {_session(m)}
-{_planned(m)}
+{_plan_card(m)}
 <h2>Stop rules</h2><p>{escape(card.stop_rules)}</p>
 {_before_use(code)}
 {_SIGNED_BY}
@@ -118,7 +118,7 @@ def _blinded(m: BundleManifest, card: PlanCard) -> str:
 """
 
 
-def _planned(m: BundleManifest) -> str:
+def _plan_card(m: BundleManifest) -> str:
     """Repeat what the sheet of the signed plan says of this session, word for word."""
     if m.card is None or m.slot is None:
         return ""
@@ -182,12 +182,12 @@ def _when(text: str) -> str:
         return text
 
 
-def _warned(m: BundleManifest) -> str:
+def _warnings(m: BundleManifest) -> str:
     texts = warning_sentences(m)
     return f'<div class="warn">{"<br>".join(escape(text) for text in texts)}</div>' if texts else ""
 
 
-def _stated(m: BundleManifest) -> str:
+def _source_of_limits(m: BundleManifest) -> str:
     if m.limits_stated_by is None:
         return "Nobody stated these limits: they are defaults, to be confirmed by the clinician."
     return f"Stated by {escape(m.limits_stated_by)}."
@@ -257,7 +257,7 @@ def _network(m: BundleManifest) -> list[tuple[str, str]]:
     return rows
 
 
-def _expected(m: BundleManifest) -> list[tuple[str, str]]:
+def _expectations(m: BundleManifest) -> list[tuple[str, str]]:
     """List what the policy requests on logged beta, or the schedule delivers, and what follows for energy and battery."""
     if m.schedule is not None:
         fractions = [hold.amplitude for hold in m.schedule.holds for _ in range(hold.steps)]

@@ -59,7 +59,7 @@ class StreamingBeta:
             ValueError: the band does not fit below half of a stretch's rate.
         """
         begin_s = end_s - self._period_s
-        kept = [_since(piece, begin_s - CONTEXT_S) for piece in self._pieces]
+        kept = [_cut_before(piece, begin_s - CONTEXT_S) for piece in self._pieces]
         self._pieces = [piece for piece in kept if piece[2].size]
         rows = band_rows(self._pieces, 1, self._period_s, self._low_hz, self._high_hz, t0_s=begin_s)
         enough = rows.reached[0] >= self._min_valid - 1e-9
@@ -79,7 +79,7 @@ def split_by_period(stretches: Sequence[Stretch], period_s: float, periods: int)
     yield from arrivals
 
 
-def _since(piece: Stretch, t_s: float) -> Stretch:
+def _cut_before(piece: Stretch, t_s: float) -> Stretch:
     """Cut a stretch to the part from a time on."""
     start_s, rate_hz, samples = piece
     skip = max(0, math.ceil((t_s - start_s) * rate_hz))

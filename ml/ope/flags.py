@@ -54,7 +54,7 @@ class Flag:
     @property
     def rounded(self) -> tuple[object, ...]:
         """Equal for two flags that differ by less than anyone would be shown: to two decimals, whatever steps they are about."""
-        return (self.code, self.refuses, _rounded(self.value), tuple((name, _rounded(v)) for name, v in self.facts))
+        return (self.code, self.refuses, _round(self.value), tuple((name, _round(v)) for name, v in self.facts))
 
     def to_json(self) -> dict[str, Any]:
         """Every field, JSON-able."""
@@ -113,5 +113,5 @@ def distinct(flags: Iterable[Flag]) -> tuple[Flag, ...]:
     return tuple(seen.values())
 
 
-def _rounded(value: Fact) -> Fact:
+def _round(value: Fact) -> Fact:
     return round(value, 2) if isinstance(value, float) else value

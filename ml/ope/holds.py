@@ -27,7 +27,7 @@ def abstention(session: SessionTrajectory, steps: NDArray[np.int64], target: Flo
         session: its holds. steps: usable steps, rising, [k]. target: what the policy does there, [k].
         bandwidth: of the kernel around the target: amplitudes closer than this are one and the same decision.
     """
-    for own, log_density in _held(session, steps):
+    for own, log_density in _usable_holds(session, steps):
         if log_density is None:
             return "hold_density_unknown"
         if np.ptp(target[own]) > bandwidth:
@@ -43,7 +43,7 @@ def held_log_ratios(session: SessionTrajectory, steps: NDArray[np.int64], target
         log_density_at: log density of amplitudes under the target, elementwise.
     """
     result = np.zeros(len(steps))
-    for own, log_density in _held(session, steps):
+    for own, log_density in _usable_holds(session, steps):
         if log_density is None:
             raise ValueError(f"session {session.session_id} has a hold of unknown density")
         first = own[:1]

@@ -208,10 +208,10 @@ def train_on(
             device=device,
         )
         records = run(learner, data.to(device), schedule, fingerprint=fingerprint, report=report, checkpoint=checkpoint, held_out=held_out)
-        return [_finished(learner, k, record) for k, record in enumerate(records)]
+        return [_result_of(learner, k, record) for k, record in enumerate(records)]
 
 
-def _finished(learner: StackedLearner[Any], member: int, record: MemberRecord) -> TrainedPolicy:
+def _result_of(learner: StackedLearner[Any], member: int, record: MemberRecord) -> TrainedPolicy:
     networks = learner.modules(record.best_rows or learner.rows(member))
     policy = networks.pop("policy")
     curve, held_out = as_curve(record.points), as_curve(record.held_out)

@@ -168,7 +168,7 @@ def band_rows(
         if run.measured.sum() < MIN_CYCLES * run.rate_hz / low_hz:
             continue
         filtered = band_pass(run.bridged, run.rate_hz, low_hz, high_hz)[run.measured]
-        share = _passed(run, low_hz, high_hz)
+        share = _passed_share(run, low_hz, high_hz)
         piece = row_of(run.t_s - t0_s, period_s / bins)
         inside = (piece >= 0) & (piece < rows * bins)
         row = piece[inside] // bins
@@ -290,7 +290,7 @@ def _bridge(x: NDArray[np.float64], measured: NDArray[np.bool_], cycle: int) -> 
     x[gap] = np.interp(gap, middles, np.stack([head, tail], axis=1).ravel())
 
 
-def _passed(run: _Run, low_hz: float, high_hz: float) -> NDArray[np.float64]:
+def _passed_share(run: _Run, low_hz: float, high_hz: float) -> NDArray[np.float64]:
     """Compute the share of the band's power that reaches each measured sample, 0..1; 1 far from gaps. Beyond the run's ends nothing is
     missing."""
     if run.measured.all():

@@ -66,7 +66,7 @@ def within_visits(x: Floats, y: Floats, visit: Integers, level: float = 0.95) ->
     parts = np.array(sums)
     if not _varies(x[known], parts[:, 0]) or not _varies(y[known], parts[:, 2]):
         return Unavailable(Reason.ALL_EQUAL)
-    return _jackknifed(parts.sum(0), parts.sum(0) - parts, n, sessions, level)
+    return _jackknife(parts.sum(0), parts.sum(0) - parts, n, sessions, level)
 
 
 def between_visits(x: Floats, y: Floats, visit: Integers, level: float = 0.95) -> Association | Unavailable:
@@ -92,7 +92,7 @@ def between_visits(x: Floats, y: Floats, visit: Integers, level: float = 0.95) -
     return Association(slope, *ends, level, p, float(r), float(np.tanh(z - half)), float(np.tanh(z + half)), n, sessions)
 
 
-def _jackknifed(total: Floats, without: Floats, visits: int, sessions: int, level: float) -> Association | Unavailable:
+def _jackknife(total: Floats, without: Floats, visits: int, sessions: int, level: float) -> Association | Unavailable:
     """Compute slope and correlation of sums (xx, xy, yy), with intervals from the sums without each visit."""
     if (without[:, [0, 2]] <= 1e-12 * total[[0, 2]]).any():
         return Unavailable(Reason.ONE_VISIT)

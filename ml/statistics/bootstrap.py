@@ -113,7 +113,7 @@ def bca_interval(values: NDArray[Any], estimate: float, jackknife: NDArray[Any],
     share = float(np.clip(share, 0.5 / values.size, 1 - 0.5 / values.size))
     bias = float(ndtri(share))
     # The acceleration has no unit: values near the largest number are scaled down before their powers are taken.
-    scaled, _ = _scaled(jackknife)
+    scaled, _ = _scale_down(jackknife)
     centred = scaled.mean() - scaled
     spread = float(np.sum(centred**2) ** 1.5)
     acceleration = float(np.sum(centred**3) / (6 * spread)) if spread > 0 else 0.0
@@ -128,16 +128,16 @@ def bca_interval(values: NDArray[Any], estimate: float, jackknife: NDArray[Any],
 
 
 def _spread(values: NDArray[Any]) -> float:
-    scaled, factor = _scaled(values)
+    scaled, factor = _scale_down(values)
     return float(np.std(scaled, ddof=1)) * factor if values.size > 1 else 0.0
 
 
 def _quantiles(values: NDArray[Any], shares: list[float]) -> Floats:
-    scaled, factor = _scaled(values)
+    scaled, factor = _scale_down(values)
     return np.asarray(np.quantile(scaled, shares) * factor)
 
 
-def _scaled(values: NDArray[Any]) -> tuple[Floats, float]:
+def _scale_down(values: NDArray[Any]) -> tuple[Floats, float]:
     """Scale values to at most 2, so that neither sums nor squares overflow; also return the power of two that they were divided by."""
     exponent = min(int(np.frexp(np.abs(values).max(initial=0.0))[1]), 1023)
     return np.ldexp(np.asarray(values, dtype=np.float64), -exponent), float(np.ldexp(1.0, exponent))

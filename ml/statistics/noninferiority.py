@@ -225,7 +225,7 @@ def assess(
     saving = energy_saving(spent, level, seed=seed)
     verdict = _verdict(results, saving, alpha)
     if plan and isinstance(verdict, Inconclusive):
-        verdict = _planned(verdict, outcomes, spent, alpha, sessions_per_arm, seed)
+        verdict = _with_plan(verdict, outcomes, spent, alpha, sessions_per_arm, seed)
     others = []
     failed = bool(stopped.any()) or any(o.stopped.any() for o in outcomes)
     for other in (FailureRule.BOTH_ARMS, FailureRule.AS_MEASURED, FailureRule.END_OF_SCALE):
@@ -299,7 +299,7 @@ def _verdict(results: Sequence[OutcomeResult], saving: Saving | Unavailable, alp
     return NonInferiorAndSaving(saving.percent, saving.low, saving.high)
 
 
-def _planned(
+def _with_plan(
     verdict: Inconclusive, outcomes: Sequence[Outcome], energy: Measurements, alpha: float, sessions: int, seed: int
 ) -> Inconclusive:
     """Add the fewest further visits after which all is shown with the wanted probability. Outcomes count as independent. The number is

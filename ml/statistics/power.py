@@ -89,7 +89,7 @@ def posterior(data: Measurements, scale: Scale = "difference", *, draws: int = 1
     if isinstance(contrasts, Unavailable):
         return contrasts
     spread = 1 / contrasts.n_tested + 1 / contrasts.n_cdbs
-    squares, degrees = _within(data, contrasts, scale)
+    squares, degrees = _within_squares(data, contrasts, scale)
     total = degrees + contrasts.visits - 1
     if total < 1:
         return Unavailable(Reason.TOO_FEW_SESSIONS)
@@ -174,7 +174,7 @@ def first_reaching(chances: Floats, wanted: float) -> int | None:
     return int(reached[0]) + 1 if reached.size else None
 
 
-def _within(data: Measurements, contrasts: VisitContrasts, scale: Scale) -> tuple[float, int]:
+def _within_squares(data: Measurements, contrasts: VisitContrasts, scale: Scale) -> tuple[float, int]:
     """Compute the sum of squares within arms of visits, and its degrees of freedom."""
     if scale != "difference":
         # One session adds to a share of pairs the share that it wins alone (DeLong, DeLong and Clarke-Pearson 1988). Where every session

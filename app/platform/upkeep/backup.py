@@ -111,20 +111,20 @@ def backup(folder: Path, key_file: Path) -> dict[str, Any]:
     manifest: dict[str, Any] = {"form": FORM, "betaloop": __version__, "made_at": now().isoformat(), "revision": revision, "parts": {}}
     with transaction("backup") as db:
         seal(db)
-    before = _stored()
-    with _sealed(folder / DATABASE, key) as out:
+    before = _stored_hashes()
+    with _sealing(folder / DATABASE, key) as out:
         _dump(out)
-    names = sorted({*before, *_stored()})
-    with _sealed(folder / FILES, key) as out, tarfile.open(fileobj=out, mode="w|") as archive:
+    names = sorted({*before, *_stored_hashes()})
+    with _sealing(folder / FILES, key) as out, tarfile.open(fileobj=out, mode="w|") as archive:
         absent = [sha256 for sha256 in names if not _added(archive, sha256)]
-    with _sealed(folder / KEYS, key) as out, tarfile.open(fileobj=out, mode="w|") as archive:
+    with _sealing(folder / KEYS, key) as out, tarfile.open(fileobj=out, mode="w|") as archive:
         for path in sorted((settings.data_dir / "secrets").glob("*")):
             if path.is_file() and path.name not in SERVER_PASSWORDS:
                 archive.add(path, arcname=path.name, recursive=False)
     for name in (DATABASE, FILES, KEYS):
         sha256, size = files.hash_file(folder / name)
         manifest["parts"][name] = {"sha256": sha256, "bytes": size}
-    manifest["files"], named = len(names) - len(absent), set(_stored())
+    manifest["files"], named = len(names) - len(absent), set(_stored_hashes())
     manifest |= {"damaged": [s for s in absent if s in named], "removed": [s for s in absent if s not in named]}
     draft = folder / f"{MANIFEST}.new"
     draft.write_text(json.dumps(manifest, indent=1) + "\n")
@@ -149,7 +149,7 @@ def restore(folder: Path, key_file: Path) -> Restored:
     migrate()
     damaged = manifest.get("damaged", [])
     known = {*damaged, *manifest.get("removed", [])}
-    missing = [sha256 for sha256 in _stored() if sha256 not in known and not files.is_whole(sha256)]
+    missing = [sha256 for sha256 in _stored_hashes() if sha256 not in known and not files.is_whole(sha256)]
     if missing:
         raise BackupError(f"{len(missing)} of the stored files are missing or damaged, the first {missing[0]}.", "Use another backup.")
     return Restored(_rows(get_engine()), count, manifest["made_at"], damaged)
@@ -187,7 +187,7 @@ def _added(archive: tarfile.TarFile, sha256: str) -> bool:
 
 
 @contextmanager
-def _sealed(path: Path, key: bytes) -> Iterator[SealedWriter]:
+def _sealing(path: Path, key: bytes) -> Iterator[SealedWriter]:
     with path.open("wb") as out:
         writer = SealedWriter(out, key)
         yield writer
@@ -350,7 +350,7 @@ def _content(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
     return extracted.read() if extracted is not None else b""
 
 
-def _stored() -> list[str]:
+def _stored_hashes() -> list[str]:
     with get_engine().connect() as connection:
         return list(connection.scalars(text("select sha256 from stored_file order by sha256")))
 

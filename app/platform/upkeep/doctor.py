@@ -46,7 +46,7 @@ class Finding:
 
 def examine(hashes: bool = False) -> list[Finding]:
     """Run every check; `hashes` reads every stored file and the audit trail whole."""
-    found = [_disk(), _closed()]
+    found = [_disk(), _check_closed_folders()]
     try:
         with new_session() as db:
             trail = [_trail(db)] if hashes else []
@@ -112,7 +112,7 @@ def _files(db: Session, hashes: bool) -> Finding:
     bad = [row.sha256 for row in rows if not files.is_whole(row.sha256, row.size, hashes)]
     checked = "hashes" if hashes else "sizes"
     if bad:
-        detail = f"{len(bad)} of {len(rows)} stored files are missing or damaged, the first {bad[0]}{_named(db, bad)}"
+        detail = f"{len(bad)} of {len(rows)} stored files are missing or damaged, the first {bad[0]}{_owners_of(db, bad)}"
         hint = (
             "What was uploaded is made anew when the same file is uploaded once more for its participant, "
             "a buffer snapshot by the next job on the data that it was made of; the rest comes back from a backup (`betaloop restore`)."
@@ -121,7 +121,7 @@ def _files(db: Session, hashes: bool) -> Finding:
     return Finding("files", True, f"{len(rows)} stored files, {checked} checked")
 
 
-def _named(db: Session, bad: list[str]) -> str:
+def _owners_of(db: Session, bad: list[str]) -> str:
     """List what names stored files, as tables and numbers: by these they can be looked up and sent again."""
     load_tables()
     found = []
@@ -155,7 +155,7 @@ def _free_mb(folder: Path) -> float:
     return shutil.disk_usage(folder).free / (1 << 20)
 
 
-def _closed() -> Finding:
+def _check_closed_folders() -> Finding:
     settings = get_settings()
     folders = [settings.files_dir, settings.jobs_dir, settings.data_dir / "secrets"]
     standing_open = [str(f) for f in folders if f.is_dir() and f.stat().st_mode & 0o077]

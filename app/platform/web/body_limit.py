@@ -86,7 +86,7 @@ class _Body:
     def require_size(self) -> None:
         """Raise BodyTooLarge by the stated length."""
         if (self._stated or 0) > self._limit:
-            raise BodyTooLarge(*_said(self._has_files))
+            raise BodyTooLarge(*_advice(self._has_files))
 
     def count_for(self, sources: list[str]) -> None:
         """Count the files that are to come for their sources. Raises TooMany where one has sent too much."""
@@ -102,7 +102,7 @@ class _Body:
         self._seen += part
         self._whole = not message.get("more_body", False)
         if self._seen > self._limit:
-            raise HTTPException(413, _said(self._has_files)[0])
+            raise HTTPException(413, _advice(self._has_files)[0])
         try:
             _take(self._sources, part)
         except TooMany as error:
@@ -134,7 +134,7 @@ def _take(sources: list[str], size: int) -> None:
             )
 
 
-def _said(has_files: bool) -> tuple[str, str]:
+def _advice(has_files: bool) -> tuple[str, str]:
     """Describe what is wrong and what to do about it."""
     if has_files:
         return (

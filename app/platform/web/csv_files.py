@@ -24,12 +24,12 @@ def stream(pieces: Iterable[str], name: str) -> Response:
 
 def in_pieces(columns: Sequence[str], batches: Iterable[Iterable[Sequence[object]]]) -> Iterator[str]:
     """Write a table as text: its header, then the rows of each batch; what is not there is empty."""
-    yield _written([columns])
+    yield _write_rows([columns])
     for batch in batches:
-        yield _written(batch)
+        yield _write_rows(batch)
 
 
-def _written(rows: Iterable[Sequence[object]]) -> str:
+def _write_rows(rows: Iterable[Sequence[object]]) -> str:
     sink = io.StringIO()
     csv.writer(sink, lineterminator="\n").writerows([safe_cell(cell) for cell in row] for row in rows)
     return sink.getvalue()

@@ -58,10 +58,10 @@ _WANTED = {"int_parsing": "a whole number", "int_type": "a whole number", "float
 def input_in_words(errors: Sequence[Mapping[str, Any]]) -> str:
     """Describe what is wrong with an address or a form, from the errors of its validation (pydantic's), without the names of types and
     members."""
-    return " ".join(_said(error) for error in errors[:5])
+    return " ".join(_sentence(error) for error in errors[:5])
 
 
-def _said(error: Mapping[str, Any]) -> str:
+def _sentence(error: Mapping[str, Any]) -> str:
     given, name = str(error.get("input"))[:80], str(error["loc"][-1]).replace("_", " ")
     wanted = _WANTED.get(str(error["type"]))
     if error["loc"][0] == "path":

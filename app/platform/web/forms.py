@@ -67,11 +67,11 @@ def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] |
             for e in (e for e in error.errors() if e["type"] != "default_factory_not_called"):  # follows from another field's error
                 # a check of the model as a whole names its field by the error's type
                 name = ".".join(map(str, e["loc"])) or (e["type"] if e["type"] in model.model_fields else "")
-                errors.append({"where": labels.get(name, name), "what": _said(e), "name": names.get(name, name)})
+                errors.append({"where": labels.get(name, name), "what": _sentence(e), "name": names.get(name, name)})
     raise Invalid("Some fields cannot be used.", "Correct them and send the form again.", errors=errors)
 
 
-def _said(error: Mapping[str, Any]) -> str:
+def _sentence(error: Mapping[str, Any]) -> str:
     """Describe what is wrong with a field. A pattern is no sentence: the field's name or help says what it takes. An empty one needs a
     value."""
     if error["input"] is None:

@@ -45,7 +45,7 @@ def install(app: FastAPI, judge: Judge) -> None:
     """Add middleware and error handlers to the service; `judge` names the sender of a request before its body is read."""
     app.add_middleware(UniqueMembers, refusal=_refused_unread)
     app.add_middleware(BodyLimit, refusal=_refused_unread, judge=judge)  # inside the other: its refusals have the headers of every answer
-    app.middleware("http")(_around)
+    app.middleware("http")(_serve)
     app.add_middleware(Compression)  # outermost: what it shrinks is whole
     app.state.judge = judge
     app.add_exception_handler(BetaloopError, _known_error)
@@ -54,11 +54,11 @@ def install(app: FastAPI, judge: Judge) -> None:
     app.add_exception_handler(DBAPIError, _fault_beneath)
     app.add_exception_handler(PoolTimeout, _fault_beneath)
     app.add_exception_handler(OSError, _fault_beneath)
-    app.add_exception_handler(ClientDisconnect, _gone)
+    app.add_exception_handler(ClientDisconnect, _caller_left)
     app.add_exception_handler(Exception, _unknown_error)
 
 
-async def _around(request: Request, call_next: RequestResponseEndpoint) -> Response:
+async def _serve(request: Request, call_next: RequestResponseEndpoint) -> Response:
     request.state.request_id = secrets.token_hex(8)
     started = time.perf_counter()
     refused = _cross_site(request)
@@ -66,10 +66,10 @@ async def _around(request: Request, call_next: RequestResponseEndpoint) -> Respo
     route = getattr(request.scope.get("route"), "path", "none")
     _requests.labels(request.method, route, response.status_code).inc()
     _seconds.labels(route).observe(time.perf_counter() - started)
-    return _secured(request, response)
+    return _add_headers(request, response)
 
 
-def _secured(request: Request, response: Response) -> Response:
+def _add_headers(request: Request, response: Response) -> Response:
     """Add the headers that every answer has, a server error's among them."""
     response.headers["X-Request-ID"] = getattr(request.state, "request_id", "")
     response.headers["Content-Security-Policy"] = CONTENT_SECURITY_POLICY
@@ -190,7 +190,7 @@ def _methods(request: Request) -> list[str]:
     return sorted(found)
 
 
-async def _gone(request: Request, error: Exception) -> Response:
+async def _caller_left(request: Request, error: Exception) -> Response:
     """Log that the reader of the answer is gone: no fault of ours, and nothing that strangers should fill the log with."""
     log.debug("the caller left before the whole request had come", path=request.url.path)
     return await _answer(request, _PlainError(400, "The request ended before it was whole."))
@@ -233,4 +233,4 @@ async def _unknown_error(request: Request, error: Exception) -> Response:
     problem: Any = _PlainError(500, "Something went wrong on our side.")
     number = getattr(request.state, "request_id", "?")
     problem.hint = f"Tell your administrator the request id {number}. Look at what is stored before you send anything again."
-    return _secured(request, await _answer(request, problem))
+    return _add_headers(request, await _answer(request, problem))

@@ -145,7 +145,7 @@ class LogFile:
                 raise LogFailed(f"the log {path} is there already: name a new file, no decision is written over")
             self._stream = path.open("w", newline="", encoding="utf-8")
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._failure(error) from error
         self._writer = csv.writer(self._stream)
         self._lines(kind_line(period_s), description_line(facts))
         self._row(COLUMNS)
@@ -160,7 +160,7 @@ class LogFile:
         try:
             self._stream.close()
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._failure(error) from error
 
     def discard(self) -> None:
         """Take the file away again, before any decision."""
@@ -172,14 +172,14 @@ class LogFile:
             self._stream.write("".join(f"{line}\r\n" for line in lines))
             self._stream.flush()
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._failure(error) from error
 
     def _row(self, row: Any) -> None:
         try:
             self._writer.writerow(row)
             self._stream.flush()
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._failure(error) from error
 
-    def _failed(self, error: OSError) -> LogFailed:
+    def _failure(self, error: OSError) -> LogFailed:
         return error if isinstance(error, LogFailed) else LogFailed(f"the log {self._path} cannot be written: {error.strerror}")

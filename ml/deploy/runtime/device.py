@@ -64,7 +64,7 @@ def main(port: int, participant: str, side: str, unit: str, source: str) -> int:
         link.settimeout(0.05)
         head, rest = b"", b""
         while not head.endswith(b"\n"):
-            head += _received(link)
+            head += _receive(link)
         device = DeviceSide(participant, side, float(head.split()[5]), float(head.split()[6]), float(head.split()[7]))
         device.hear(head.decode("ascii"), time.monotonic())
         period_s, shown = float(head.split()[4]) / 1000, ""
@@ -74,7 +74,7 @@ def main(port: int, participant: str, side: str, unit: str, source: str) -> int:
             if time.monotonic() >= began + seq * period_s and (beta := sys.stdin.readline().strip()):
                 link.sendall(f"beta {seq} {1000 * (time.monotonic() - began):.0f} {beta} {unit} {source}\n".encode())
                 seq += 1
-            *lines, rest = (rest + _received(link)).split(b"\n")
+            *lines, rest = (rest + _receive(link)).split(b"\n")
             for line in lines:
                 device.hear(line.decode("ascii") + "\n", time.monotonic())
             now = f"{device.look(time.monotonic()):g} mA {device.why}"
@@ -85,7 +85,7 @@ def main(port: int, participant: str, side: str, unit: str, source: str) -> int:
     return 0
 
 
-def _received(link: socket.socket) -> bytes:
+def _receive(link: socket.socket) -> bytes:
     """Receive what has come within a moment; nothing where the runner is gone, too: the watchdog sees to that."""
     try:
         content = link.recv(4096)

@@ -270,7 +270,7 @@ class Envelope:
         fraction: float | None = None
         detail = ""
         if not trouble:
-            fraction, trouble, detail = _asked(ask)
+            fraction, trouble, detail = _ask(ask)
         most = self._most_ma(now_s)
         reasons |= trouble
         if trouble:
@@ -305,7 +305,7 @@ def _float32(value: float) -> float:
     return float(struct.unpack("<f", struct.pack("<f", value))[0])
 
 
-def _asked(ask: Callable[[], float]) -> tuple[float | None, int, str]:
+def _ask(ask: Callable[[], float]) -> tuple[float | None, int, str]:
     """Ask the network for its fraction; or return why it cannot be used."""
     try:
         fraction = float(ask())

@@ -68,7 +68,7 @@ class Ledger:
             lines = self._file(participant, slot).read_text("utf-8").splitlines()
         except FileNotFoundError:
             return
-        raise _used(slot, lines)
+        raise _refusal_of_run(slot, lines)
 
     def begin(self, participant: str, slot: Slot, now: datetime, log: Path, manifest_sha256: str) -> None:
         """Note that a slot runs from now on. Raises NotAllowed where it was begun already, by another process too."""
@@ -110,7 +110,7 @@ class Ledger:
         _sync_folder(self.folder)
 
 
-def _used(slot: Slot, lines: list[str]) -> NotAllowed:
+def _refusal_of_run(slot: Slot, lines: list[str]) -> NotAllowed:
     """Describe what is known of a run that was begun."""
     try:
         notes: dict[str, Any] = {}

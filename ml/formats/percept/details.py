@@ -229,7 +229,7 @@ DatedEvent = tuple[datetime, str, str, dict[str, Any]]
 
 def dated_events(report: dict[str, Any], annotations: Iterable[Annotation] = ()) -> list[DatedEvent]:
     """List the device's event log, the patient's events and the annotations, in time order."""
-    out: list[DatedEvent] = [_noted(a) for a in annotations]
+    out: list[DatedEvent] = [_event_of(a) for a in annotations]
     for entry in _log_entries(report):
         when = moment(entry.get("DateTime", entry.get("EventDateTime")))
         if when is None:
@@ -242,7 +242,7 @@ def dated_events(report: dict[str, Any], annotations: Iterable[Annotation] = ())
     return sorted(out, key=lambda e: e[0])[-MAX_EVENTS:]
 
 
-def _noted(a: Annotation) -> DatedEvent:
+def _event_of(a: Annotation) -> DatedEvent:
     if a.value is None:
         return a.at, "annotation", a.label, {"under": a.under}
     return a.at, "rating", a.label, {"under": a.under, "value": a.value}

@@ -42,7 +42,7 @@ def _inner(value: Any) -> list[dict[str, Any]]:
     return [inner for entry in entries(value) for held in entry.values() if isinstance(held, list) for inner in entries(held)]
 
 
-def _counted(dated: Sequence[details.DatedEvent]) -> list[str]:
+def _counts(dated: Sequence[details.DatedEvent]) -> list[str]:
     """Count events, annotations and ratings, in words."""
     kinds = Counter({"annotation": "annotations", "rating": "ratings"}.get(kind, "events") for _, kind, _, _ in dated)
     return [f"{kinds[name]} {name}" for name in ("events", "annotations", "ratings") if kinds[name]]
@@ -72,7 +72,7 @@ def history_recording(
     battery = {k: v for k, v in details.battery(report).items() if v is not None}
     started = moment(inside(report, "DeviceInformation", "Initial", "DeviceDateTime")) or (dated[0][0] if dated else None)
     origin = started or datetime.fromisoformat("2000-01-01T00:00:00+00:00")
-    counts = [f"{len(v)} {name.replace('_', ' ')}" for name, v in kept.items()] + _counted(dated)
+    counts = [f"{len(v)} {name.replace('_', ' ')}" for name, v in kept.items()] + _counts(dated)
     if undated := details.undated_events(report):
         entries_of = f"{undated} entr{'y' if undated == 1 else 'ies'} of PatientEvents"
         said.ignored.append(f"{entries_of} without a time: names of events, none that was marked")

@@ -205,11 +205,11 @@ class _Scrubber:
         }
         lost = [f"{reason} ({count}×)" for reason, count in self._lost.items()]
         return [
-            *(f"{text} ({self._gone[name]}×{self._called(name)})" for name, text in said.items() if self._gone[name]),
+            *(f"{text} ({self._gone[name]}×{self._names_of(name)})" for name, text in said.items() if self._gone[name]),
             *([f"of annotations and ratings: {', '.join(lost)}"] if lost else []),
         ]
 
-    def _called(self, what: str) -> str:
+    def _names_of(self, what: str) -> str:
         """Name what was removed, as far as the names are technical."""
         names = [name for name, _ in self._named.get(what, Counter()).most_common() if name != "…"]
         more = f" and {len(names) - MOST_NAMED} others" if len(names) > MOST_NAMED else ""

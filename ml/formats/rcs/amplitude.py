@@ -72,14 +72,14 @@ def amplitude_steps(settings: Settings, adaptive: Adaptive | None, times: Packet
     order = use[np.argsort(times.last_ms[use], kind="stable")]
     t_ms = times.last_ms[order]
     interval_ms = 1000.0 / adaptive.headers.rate_hz[order]
-    values = _masked(adaptive.amplitude_ma[order], t_ms, settings)
+    values = _mask_idle(adaptive.amplitude_ma[order], t_ms, settings)
     if not states:
         programs, assumed = (0,), True
     knots_t, knots_v = _with_adaptive(base_t, base_v, t_ms, interval_ms, values, settings)
     return AmplitudeSteps(knots_t, knots_v, programs, True, assumed)
 
 
-def _masked(values: NDArray[np.float64], t_ms: NDArray[np.float64], settings: Settings) -> NDArray[np.float64]:
+def _mask_idle(values: NDArray[np.float64], t_ms: NDArray[np.float64], settings: Settings) -> NDArray[np.float64]:
     """Set adaptive amplitudes to 0 for programs that do not stimulate, and at times with therapy off."""
     out = values.copy()
     out[(out < 0) | (out >= UPPER_PLAUSIBLE_MA)] = np.nan

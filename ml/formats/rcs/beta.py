@@ -94,15 +94,15 @@ def _join(pieces: Iterator[Stretch]) -> Iterator[Stretch]:
     for piece in pieces:
         start_ms, rate_hz, x = piece
         if run and (rate_hz != run[0][1] or start_ms - due_ms > 500.0 / rate_hz):
-            yield _joined(run)
+            yield _concatenate(run)
             run = []
         run.append(piece)
         due_ms = start_ms + 1000.0 * x.size / rate_hz
     if run:
-        yield _joined(run)
+        yield _concatenate(run)
 
 
-def _joined(pieces: list[Stretch]) -> Stretch:
+def _concatenate(pieces: list[Stretch]) -> Stretch:
     start_ms, rate_hz, x = pieces[0]
     return start_ms, rate_hz, x if len(pieces) == 1 else np.concatenate([piece[2] for piece in pieces])
 

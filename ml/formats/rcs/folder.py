@@ -206,7 +206,7 @@ def _elements(session: SessionFiles, files: Files, stem: str, infos: list[dict[s
         report.understood.append(f"{notes.elements} {one}{'' if notes.elements == 1 else 's'}")
 
 
-def _limited(elements: Iterable[Any], report: FileReport) -> Iterator[Any]:
+def _limit(elements: Iterable[Any], report: FileReport) -> Iterator[Any]:
     """Yield elements up to the memory limit of one file; the report counts those beyond."""
     packets = numbers = beyond = 0
     for element in elements:
@@ -261,4 +261,4 @@ def _stream(session: SessionFiles, files: Files, stem: str, infos: list[dict[str
         return None
     report = session.report(stem)
     elements = _elements(session, files, stem, infos)
-    return read(_limited(_batches(elements) if stem in KEY_OF else elements, report))
+    return read(_limit(_batches(elements) if stem in KEY_OF else elements, report))

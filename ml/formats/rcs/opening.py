@@ -85,7 +85,7 @@ def read_opening(head: bytes) -> Opening:
     if _START.match(text) is not None:
         stream = _STREAM.search(text)
         stem = STEM_OF[stream[1]] if stream else next((name for name, shape in _RECORDS if shape.search(text)), None)
-    return Opening(stem, _named(info, "DeviceId"), _named(info, "SessionId"))
+    return Opening(stem, _name_in(info, "DeviceId"), _name_in(info, "SessionId"))
 
 
 def stem_in_name(name: str) -> str | None:
@@ -135,6 +135,6 @@ def _values(text: str) -> dict[str, object]:
     return found if isinstance(found, dict) else {}
 
 
-def _named(info: dict[str, object], key: str) -> str | None:
+def _name_in(info: dict[str, object], key: str) -> str | None:
     value = info.get(key)
     return value.strip().upper() if isinstance(value, str) and NAMED.fullmatch(value.strip()) else None

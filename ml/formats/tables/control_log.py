@@ -184,13 +184,13 @@ def _cell(value: Any) -> str:
 
 
 @contextmanager
-def _opened(path: Source) -> Iterator[Iterator[str]]:
+def _open_lines(path: Source) -> Iterator[Iterator[str]]:
     with path.open("rb") as raw, io.TextIOWrapper(raw, encoding="utf-8-sig", errors="replace", newline="") as stream:
         yield iter(stream)
 
 
 def _read(path: Source, options: DecodeOptions) -> Log:
-    with _opened(path) as lines:
+    with _open_lines(path) as lines:
         period_s, ran, head, nonce = read_head(lines, options)
         before = head.count("\n") + 1
         reader = csv.reader(lines)

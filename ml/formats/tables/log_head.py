@@ -118,7 +118,7 @@ def read_head(lines: Iterator[str], options: DecodeOptions) -> tuple[float, Ran 
         raise _cut("line 1")
     if version == 1:
         return options.period_s, None, first, None
-    ran, nonce = _described(next(lines, "").strip().removeprefix('"').removesuffix('"'))
+    ran, nonce = _parse_description(next(lines, "").strip().removeprefix('"').removesuffix('"'))
     kept = {_SAID_AS.get(name, name): value for name, value in asdict(ran).items() if value is not None}
     return options.period_s, ran, f"{first}\n# {json.dumps(kept, sort_keys=True)}", nonce
 
@@ -127,7 +127,7 @@ def _cut(where: str) -> UndecodableFile:
     return UndecodableFile("the first line of this controller's log is not whole", where, MEND)
 
 
-def _described(line: str) -> tuple[Ran, str | None]:
+def _parse_description(line: str) -> tuple[Ran, str | None]:
     """Parse the JSON line of version 3, entry by entry, and the nonce of a blinded log. An entry of the wrong kind is ignored: no runner
     wrote it."""
     try:
@@ -138,7 +138,7 @@ def _described(line: str) -> tuple[Ran, str | None]:
         raise _cut("line 2")
     nonce = None
     if said.get("sealed") is not None:
-        nonce, kept = _unsealed(said["sealed"])
+        nonce, kept = _unseal(said["sealed"])
         said = {**kept, **{name: value for name, value in said.items() if name != "sealed"}}
     found: dict[str, Any] = {}
     for name, kind in _ENTRIES.items():
@@ -154,7 +154,7 @@ def _described(line: str) -> tuple[Ran, str | None]:
     return Ran(**{"policy_id": None, "network_sha256": None, "side": None} | found), nonce
 
 
-def _unsealed(text: Any) -> tuple[str, dict[str, Any]]:
+def _unseal(text: Any) -> tuple[str, dict[str, Any]]:
     try:
         return facts_of(str(text))
     except ValueError as error:

@@ -52,7 +52,7 @@ def decode_columns(columns: Columns, options: DecodeOptions, name: str) -> Decod
     t_s = _times(columns, options)
     row, t_first = _grid(t_s, columns, options)
     n = int(row[-1]) + 1
-    given = {role: _checked(role, columns, report) for role in columns.values if role != "t_s"}
+    given = {role: _check_column(role, columns, report) for role in columns.values if role != "t_s"}
     if "amplitude_ma" in given and "amplitude_fraction" in given:
         compare_amplitudes(given["amplitude_ma"], given.pop("amplitude_fraction"), report)
     traces = tuple(_trace(role, values, columns, row, n, t_first, options) for role, values in given.items())
@@ -100,7 +100,7 @@ def _grid(t_s: NDArray[np.float64], columns: Columns, options: DecodeOptions) ->
     return (steps - steps[0]).astype(np.int64), float(steps[0] * period)
 
 
-def _checked(role: str, columns: Columns, report: FileReport) -> NDArray[np.float64]:
+def _check_column(role: str, columns: Columns, report: FileReport) -> NDArray[np.float64]:
     """Check a column's numbers [rows] in mA, as a fraction, or beta as it is; NaN where there is none or it cannot be true."""
     if role != "beta":
         return checked_amplitude(role, columns, report)

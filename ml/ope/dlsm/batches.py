@@ -94,9 +94,9 @@ def make_batch(buffer: ReplayBuffer, scale: Scale, dtype: torch.dtype = torch.fl
     first_known = np.zeros(n)
     for i, s in enumerate(sessions):
         t = s.steps
-        filled = _held(scale.beta(s.padded_beta), start=0.0)
+        filled = _fill_gaps(scale.beta(s.padded_beta), start=0.0)
         states[: t + 1, i] = np.lib.stride_tricks.sliding_window_view(filled, w)
-        actions[:t, i] = _held(s.amplitude, start=0.0)
+        actions[:t, i] = _fill_gaps(s.amplitude, start=0.0)
         alive[:t, i] = 1.0
         ok = s.usable()
         usable[:t, i] = ok

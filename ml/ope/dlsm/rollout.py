@@ -132,7 +132,7 @@ def _roll_block(
         mean, log_std = networks.first(torch.as_tensor(starts, dtype=dtype).repeat(p, 1))
         z = mean + log_std.exp() * shared(config.latent)
         window = scale.raw_beta(np.tile(starts, (p, 1)))
-    window = _within(window, scale)
+    window = _limit_beta(window, scale)
     h = torch.zeros(p * m, config.hidden, dtype=dtype)
     c = torch.zeros_like(h)
     pooled = torch.zeros_like(z)
@@ -153,9 +153,9 @@ def _roll_block(
         if linear is not None:
             drawn = linear.noise * drawn + linear.predicted(scale.beta(window), a)[:, None]
         if config.decode_all_window:
-            window = _within(scale.raw_beta(drawn), scale)
+            window = _limit_beta(scale.raw_beta(drawn), scale)
         else:
-            newest = _within(scale.raw_beta(drawn[:, -1:]), scale)
+            newest = _limit_beta(scale.raw_beta(drawn[:, -1:]), scale)
             window = np.concatenate([window[:, 1:], newest], axis=1)
         discount = settings.gamma**t
         head = networks.reward(seen)[0].squeeze(1).numpy().astype(np.float64)

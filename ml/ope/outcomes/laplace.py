@@ -86,7 +86,7 @@ class Solved:
             group[members] = g
         each = np.zeros((len(self.mode), len(p.y)))
         for k in range(len(self.mode)):
-            theta, surprise[k] = self._without(p.only(k), k, _padded(groups))
+            theta, surprise[k] = self._leave_group_out(p.only(k), k, _pad(groups))
             eta = np.einsum("nmq,nq->nm", at[k], theta[group])
             each[k] = mean_of(p.kind, eta, p.parts, float(self.dispersion[k]), float(extra[k]))
         left = self.log_evidence[:, None] - surprise

@@ -90,10 +90,10 @@ def rcs_session_zip(
     files |= {name: [{"RecordInfo": begun, key: []}] for name, key in _UNUSED_STREAMS.items()}
     files["AdaptiveLog"] = []
     files["ErrorLog"] = []
-    files["DiagnosticsLog"] = _timed(info, [(started_ms + 2_500, _latency_test())])
-    files["DeviceSettings"] = _timed(info, _settings_records(participant, serial, blocks, started_ms, clock_ms))
-    files["StimLog"] = _timed(info, stim_records(participant, blocks, started_ms))
-    files["EventLog"] = _timed(info, _event_records(blocks))
+    files["DiagnosticsLog"] = _with_times(info, [(started_ms + 2_500, _latency_test())])
+    files["DeviceSettings"] = _with_times(info, _settings_records(participant, serial, blocks, started_ms, clock_ms))
+    files["StimLog"] = _with_times(info, stim_records(participant, blocks, started_ms))
+    files["EventLog"] = _with_times(info, _event_records(blocks))
     return _zip(f"Session{started_ms}/Device{serial}", files)
 
 
@@ -272,7 +272,7 @@ def _latency_test() -> Json:
     return {"LatencyResultsDiagnostic": result}
 
 
-def _timed(info: Json, records: list[tuple[int, Json]]) -> list[Json]:
+def _with_times(info: Json, records: list[tuple[int, Json]]) -> list[Json]:
     return [{"RecordInfo": info | {"HostUnixTime": t}, **body} for t, body in sorted(records, key=lambda record: record[0])]
 
 

@@ -121,7 +121,7 @@ def saturation(a: float, a50: float, hill: float) -> float:
 
 
 @compiled()
-def _filtered(sample: float, state: Any, sos: Any) -> float:
+def _filter_sample(sample: float, state: Any, sos: Any) -> float:
     for j in range(sos.shape[0]):
         out = sos[j, 0] * sample + state[_FILTER + 2 * j]
         state[_FILTER + 2 * j] = sos[j, 1] * sample - sos[j, 4] * out + state[_FILTER + 2 * j + 1]
@@ -173,7 +173,7 @@ def _one_period(state: Any, counters: Any, c: Any, amplitude: float, k_period: f
         sample = _LFP_UV_PER_HZ * (state[_S + now] - 15.0) + _BACKGROUND_UV * (background + _WHITE * g_white)
         if lfp.shape[0] > 0:
             lfp[n] = sample * 1e-3
-        beta = _filtered(sample, state, sos)
+        beta = _filter_sample(sample, state, sos)
         power += beta * beta
     state[_XI], state[_X], state[_BACKGROUND] = xi, x, background
     state[_AT_ONCE], state[_LASTING] = at_once, lasting

@@ -117,7 +117,7 @@ def step(
     depth = p.depth * constants[:, GAIN]
     size = p.noise * np.exp(p.noise_slope * (a - 0.65))
     state[:, NOISE] = p.ar * state[:, NOISE] + size * z[:, Z_NOISE]
-    beta = _beta(p, state, x, effect, depth, d, z, before_delay=_delayed(p, amplitude, k - 1), reached=reached)
+    beta = _beta(p, state, x, effect, depth, d, z, before_delay=_delayed_amplitude(p, amplitude, k - 1), reached=reached)
     out[0][:, k] = beta * (1 + p.leak * a)
     _symptoms(p, xi, constants, state, a, m, beta, z, k, out)
 
@@ -129,7 +129,7 @@ def _ringing(p: Patient, state: Floats, change: Floats) -> Floats:
     return np.asarray(ring)
 
 
-def _delayed(p: Patient, amplitude: Floats, k: int) -> Floats:
+def _delayed_amplitude(p: Patient, amplitude: Floats, k: int) -> Floats:
     return amplitude[:, max(k - p.delay, 0)]
 
 
@@ -139,7 +139,7 @@ def _reaching_dose(p: Patient, state: Floats, amplitude: Floats, k: int) -> Floa
         a = amplitude[:, k]
         state[:, MECHANISM] = np.minimum(np.maximum(state[:, MECHANISM], a - p.play), a + p.play)
         return np.clip(state[:, MECHANISM], 0.0, 1.0)
-    return _delayed(p, amplitude, k)
+    return _delayed_amplitude(p, amplitude, k)
 
 
 def _beta(
@@ -151,28 +151,28 @@ def _beta(
         high = state[:, MODE] > 0.5
         chance = np.where(high, p.burst_out + BURST_OUT_GAIN * bounded, p.burst_in * (1 - bounded))
         state[:, MODE] = np.where(z[:, U_MODE] < chance, 1.0 - state[:, MODE], state[:, MODE])
-        return _scaled(p, x - 0.2 * depth * effect + p.burst_jump * state[:, MODE] + state[:, NOISE])
+        return _scale_beta(p, x - 0.2 * depth * effect + p.burst_jump * state[:, MODE] + state[:, NOISE])
     if p.kind == VOLATILITY:
         state[:, MECHANISM] += -p.vol_rate * state[:, MECHANISM] + p.vol_sd * np.sqrt(2 * p.vol_rate) * z[:, Z_OTHER]
-        return _scaled(p, x - 0.25 * depth * effect + 2 * state[:, NOISE] * np.exp(state[:, MECHANISM]) * (1 - p.vol_dose * bounded))
+        return _scale_beta(p, x - 0.25 * depth * effect + 2 * state[:, NOISE] * np.exp(state[:, MECHANISM]) * (1 - p.vol_dose * bounded))
     if p.kind == DELAYED:
         state[:, MECHANISM] = p.rebound_decay * state[:, MECHANISM] + p.rebound * np.maximum(before_delay - reached, 0.0)
-        return _scaled(p, x - depth * effect + state[:, MECHANISM] + state[:, NOISE])
+        return _scale_beta(p, x - depth * effect + state[:, MECHANISM] + state[:, NOISE])
     if p.kind == REGIMES:
         state[:, MODE] = np.where(z[:, U_MODE] < p.regime_rate, 1.0 - state[:, MODE], state[:, MODE])
         gain = np.where(state[:, MODE] > 0.5, p.regime_gain, 1.0)
-        return _scaled(p, x - depth * gain * effect + p.regime_level * state[:, MODE] + state[:, NOISE])
+        return _scale_beta(p, x - depth * gain * effect + p.regime_level * state[:, MODE] + state[:, NOISE])
     if p.kind == TOLERANCE:
         state[:, MECHANISM] += p.habit_rate * (1 + 2 * d) * (d - state[:, MECHANISM])
-        return _scaled(p, x - depth * (effect - p.habit * state[:, MECHANISM]) + state[:, NOISE])
+        return _scale_beta(p, x - depth * (effect - p.habit * state[:, MECHANISM]) + state[:, NOISE])
     if p.kind == OSCILLATOR:
         r, growth = state[:, MECHANISM], p.osc_base - p.osc_drop * effect * depth / p.depth
         state[:, MECHANISM] = np.minimum(np.abs(r + 0.25 * (growth * r - r**3) + state[:, NOISE]), 2.5)
         return np.asarray(p.unit * (0.3 + state[:, MECHANISM]) * np.exp(x))
-    return _scaled(p, x - depth * effect + state[:, NOISE])
+    return _scale_beta(p, x - depth * effect + state[:, NOISE])
 
 
-def _scaled(p: Patient, x: Floats) -> Floats:
+def _scale_beta(p: Patient, x: Floats) -> Floats:
     return np.asarray(p.unit * (np.exp(np.minimum(x, 3.0)) if p.log_scale else np.maximum(1 + x, 0.05)))
 
 

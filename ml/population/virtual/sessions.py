@@ -122,7 +122,7 @@ def simulate(
         if k >= WARM_STEPS:
             t = k - WARM_STEPS
             asked = controller[:, t] if isinstance(controller, np.ndarray) else controller.act(beta[:, k - window : k])
-            amplitude[:, k] = _checked(np.asarray(asked, dtype=np.float64), n)
+            amplitude[:, k] = _check_answer(np.asarray(asked, dtype=np.float64), n)
         if readable:
             equations.step(patient, xi, constants, state, amplitude, k, noise, (beta, brady, tremor, overload))
         else:
@@ -149,14 +149,14 @@ def quality(patient: Patient, noise: Floats, amplitude: Floats, brady: Floats, t
     minutes = np.arange(0, tremor.shape[1], STEPS_PER_MINUTE)
     lengths = np.diff(np.append(minutes, tremor.shape[1]))
     complaint = 3.0 * brady + 4.0 * np.minimum(tremor / 2.5, 1.0) + 3.0 * patient.side * overload
-    felt = _remembered(patient.rating_form, complaint, np.add.reduceat(complaint, minutes, axis=1) / lengths)
+    felt = _rated_complaint(patient.rating_form, complaint, np.add.reduceat(complaint, minutes, axis=1) / lengths)
     felt += np.abs(np.diff(amplitude, axis=1)).mean(axis=1)
     score = patient.rating_top - patient.rating_scale * felt + patient.rating_noise * noise[:, 1]
     counted = np.add.reduceat(tremor, minutes, axis=1) / lengths >= MILD
     return np.clip(grasp, 0.1, 4.5), np.clip(np.round(score), 1, 10), 100 * (counted @ lengths) / tremor.shape[1]
 
 
-def _remembered(form: int, complaint: Floats, minutes: Floats) -> Floats:
+def _rated_complaint(form: int, complaint: Floats, minutes: Floats) -> Floats:
     """Summarise the complaint that a rating follows, [n], from that of every step, [n, T], and of every minute, [n, M]; see
     `patient.RATINGS`."""
     if form == LATE_RATING:
@@ -203,7 +203,7 @@ def _start(patient: Patient, constants: Floats, own: Floats) -> Floats:
     return state
 
 
-def _checked(asked: Floats, n: int) -> Floats:
+def _check_answer(asked: Floats, n: int) -> Floats:
     if asked.shape != (n,):
         raise ValueError(f"the controller answered with shape {asked.shape} to {n} sessions; it must give one amplitude for each")
     if not bool(np.all((asked >= -1e-6) & (asked <= 1 + 1e-6))):

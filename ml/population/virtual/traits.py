@@ -59,7 +59,7 @@ def _drifting(_: Patient, u: _Draws) -> Changes:
     }
 
 
-def _overstimulated(_: Patient, u: _Draws) -> Changes:
+def _overstimulating(_: Patient, u: _Draws) -> Changes:
     """Make full amplitude more than is good: the answer of beta turns round, and side effects are felt."""
     best = u(0.5, 0.75)
     return {
@@ -129,7 +129,7 @@ def _artefact(p: Patient, u: _Draws) -> Changes:
 TRAITS: Final[dict[str, Callable[[Patient, _Draws], Changes]]] = {
     "saturating": _saturating,
     "drifting": _drifting,
-    "overstimulated": _overstimulated,
+    "overstimulated": _overstimulating,
     "unsteady": _unsteady,
     "silent": _silent,
     "faint": _faint,

@@ -146,7 +146,7 @@ class StackedLearner(abc.ABC, Generic[C]):
         values = [getattr(config, name) for config in self.configs]
         return torch.tensor(values, dtype=torch.float32, device=self.device).view(-1, 1, 1)
 
-    def _counted(self) -> None:
+    def _count_update(self) -> None:
         self._updates += 1
         self._since_measure += 1
 

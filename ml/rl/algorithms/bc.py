@@ -38,4 +38,4 @@ class CloningLearner(StackedLearner[CloningConfig]):
         self._note("cloning_loss", error.square())
         self.policy_stack.backward_from_actions(error.mul_(2.0 / self.config.batch), actions)
         self.adams["policy"].step()
-        self._counted()
+        self._count_update()

@@ -57,4 +57,4 @@ class DdpgLearner(CriticLearner[DdpgConfig]):
             actor.backward_from_actions(critic.action_gradient(self._uphill), actions)
             self.adams["policy"].step()
         self._follow()
-        self._counted()
+        self._count_update()

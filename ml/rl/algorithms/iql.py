@@ -71,7 +71,7 @@ class IqlLearner(CriticLearner[IqlConfig]):
         for name in ("critic", "critic_2"):
             self._descend_on_target(name, batch, targets)
         self._follow()
-        self._counted()
+        self._count_update()
 
     def _clone_the_better(self, batch: TransitionBatch, advantage: Any) -> None:
         weight = torch.exp(advantage * self.member_setting("temperature")).clamp_(max=_LARGEST_WEIGHT)

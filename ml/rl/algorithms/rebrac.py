@@ -57,7 +57,7 @@ class RebracLearner(Td3Learner):
                 actions = self.policy_stack.act(batch.states)
                 self._actor_step(batch, actions, self._penalty, *self._smaller_value_slope(batch.critic_states, actions))
             self._follow()
-        self._counted()
+        self._count_update()
 
     def _smaller_value_slope(self, states: Any, actions: Any) -> tuple[Any, Any]:
         """Compute the slope by the action of min(Q_1, Q_2), and its value, both [K, B, 1]."""

@@ -49,4 +49,4 @@ class Td3BcLearner(Td3Learner):
                 values = critic.forward(batch.critic_states, actions).clone()
                 self._actor_step(batch, actions, self._penalty, critic.action_gradient(self._ones), values)
             self._follow()
-        self._counted()
+        self._count_update()

@@ -200,14 +200,14 @@ class Critic(nn.Module):
 
     def forward(self, scores: Any, actions: Any) -> Any:
         """Compute values [N, 1] of actions [N, 1] in z-scored windows [N, W], tensors of float32."""
-        hidden = self._rectified(self.layers[0](scores))
+        hidden = self._rectify(self.layers[0](scores))
         # The action's column of the second layer is separate: the actor's gradient then needs no product with the other columns.
-        hidden = self._rectified(self.layers[1](hidden) + self.action(2.0 * actions - 1.0))
+        hidden = self._rectify(self.layers[1](hidden) + self.action(2.0 * actions - 1.0))
         for layer in self.layers[2:-1]:
-            hidden = self._rectified(layer(hidden))
+            hidden = self._rectify(layer(hidden))
         return self.layers[-1](hidden)
 
-    def _rectified(self, outputs: Any) -> Any:
+    def _rectify(self, outputs: Any) -> Any:
         hidden = torch.relu(outputs)
         return nn.functional.layer_norm(hidden, hidden.shape[-1:]) if self.layer_norm else hidden
 

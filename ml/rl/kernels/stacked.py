@@ -91,16 +91,16 @@ class Stack:
             if i == 1 and memory.signed is not None:
                 torch.bmm(slope.transpose(1, 2), memory.signed, out=self._grad_action_w)
             if i > 0:
-                slope = self._through(i, slope, memory)
+                slope = self._slope_below(i, slope, memory)
 
     def action_gradient(self, slope: Any) -> Any:
         """Compute d loss / d actions [K, B, 1], from d loss / d output of the last `forward`; the weights' gradient does not change."""
         memory = self._required_memory(slope)
         for i in reversed(range(2, len(self._w))):
-            slope = self._through(i, slope, memory)
+            slope = self._slope_below(i, slope, memory)
         return torch.bmm(slope, self._action_w).mul_(2.0)
 
-    def _through(self, i: int, slope: Any, memory: _Memory) -> Any:
+    def _slope_below(self, i: int, slope: Any, memory: _Memory) -> Any:
         """Compute the slope before layer i's input was rectified, from the slope at layer i's output."""
         below = torch.bmm(slope, self._w[i], out=memory.slopes[i - 1])
         if self._norm:

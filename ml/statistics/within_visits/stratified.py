@@ -343,10 +343,10 @@ class _Inversion:
         return self._outer_edge(inside, upper)
 
     def _accepted(self, place: int, upper: bool) -> bool:
-        test = self._at(place)
+        test = self._test_at(place)
         return (test.p_less if upper else test.p_greater) > self.tail + ROUNDING
 
-    def _at(self, place: int) -> StratifiedTest:
+    def _test_at(self, place: int) -> StratifiedTest:
         if place not in self.tested:
             shift = self._shift(place)
             moved = [(self._snap(x - shift, y), y) for x, y in self.strata]

@@ -97,8 +97,8 @@ class PcClock:
 
 def levels(at_ms: NDArray[np.float64], value_ms: NDArray[np.float64], step_ms: float) -> Levels:
     """Find where a quantity, [n] in rising order of `at_ms` [n], steps by more than `step_ms` and stays there."""
-    bins, centre = _binned(at_ms, value_ms)
-    before, after = _around(centre)
+    bins, centre = _bins(at_ms, value_ms)
+    before, after = _medians_around(centre)
     pause = np.diff(at_ms[bins[:-1]], prepend=at_ms[0]) if at_ms.size else np.empty(0)
     jump = np.abs(after - before) - step_ms - LARGEST_DRIFT * pause
     cuts: list[int] = []
@@ -116,7 +116,7 @@ def levels(at_ms: NDArray[np.float64], value_ms: NDArray[np.float64], step_ms: f
     return Levels(at_ms[bounds[1:]], np.array([*bounds, at_ms.size], dtype=np.int64))
 
 
-def _binned(at_ms: NDArray[np.float64], value_ms: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _bins(at_ms: NDArray[np.float64], value_ms: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Find the beginning of every second with packets, and the end, [m + 1]; the median of each, [m]."""
     if at_ms.size == 0:
         return np.zeros(1, dtype=np.int64), np.empty(0)
@@ -127,7 +127,7 @@ def _binned(at_ms: NDArray[np.float64], value_ms: NDArray[np.float64]) -> tuple[
     return bins, ordered[begins + (np.diff(bins) - 1) // 2]
 
 
-def _around(centre: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _medians_around(centre: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Compute the median of the seconds before each and of those from it on, [m] each; the first has none before it and steps nowhere."""
     padded = np.concatenate((np.full(BINS_AROUND, np.nan), centre, np.full(BINS_AROUND, np.nan)))
     if centre.size == 0:
@@ -172,7 +172,7 @@ def _gain(at_ms: NDArray[np.float64], ahead_ms: NDArray[np.float64], pieces: lis
         at, ahead = at_ms[piece], ahead_ms[piece]
         if at.size < 2 or at[-1] - at[0] < DRIFT_SPAN_MS:
             continue
-        bins, centre = _binned(at, ahead)
+        bins, centre = _bins(at, ahead)
         middle, half = at[(bins[:-1] + bins[1:] - 1) // 2], (bins.size - 1) // 2
         apart, rise = middle[half:] - middle[:-half], centre[half:] - centre[:-half]
         far = apart > DRIFT_SPAN_MS / 2

@@ -42,12 +42,12 @@ class PacketHeaders:
     @property
     def made_ms(self) -> NDArray[np.float64]:
         """PacketGenTime where the PC knew it, else NaN, [n]."""
-        return _known(self.gen_ms)
+        return _plausible_times(self.gen_ms)
 
     @property
     def arrived_ms(self) -> NDArray[np.float64]:
         """Time of arrival where it is known, else NaN, [n]."""
-        return _known(self.rx_ms)
+        return _plausible_times(self.rx_ms)
 
     @property
     def length_ms(self) -> NDArray[np.float64]:
@@ -59,5 +59,5 @@ class PacketHeaders:
         return PacketHeaders(*(getattr(self, name)[index] for name in PacketHeaders.__slots__))
 
 
-def _known(pc_ms: NDArray[np.float64]) -> NDArray[np.float64]:
+def _plausible_times(pc_ms: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where((pc_ms > 0) & (pc_ms < LATEST_MS), pc_ms, np.nan)

@@ -164,11 +164,11 @@ def _place(
     rejected: dict[Rejected, int] = {}
     order = np.argsort(elapsed, kind="stable")
     reordered = int(np.sum(elapsed < np.maximum.accumulate(elapsed)))
-    order = _without(order, _repeats(headers, elapsed, order, same), Rejected.DUPLICATE, rejected)
-    order = _without(order, _astray(headers, elapsed, order, residual, implant_off), Rejected.UNPLACEABLE, rejected)
+    order = _drop(order, _repeats(headers, elapsed, order, same), Rejected.DUPLICATE, rejected)
+    order = _drop(order, _astray(headers, elapsed, order, residual, implant_off), Rejected.UNPLACEABLE, rejected)
     kept = headers.take(order)
-    at, moved = _untangled(elapsed[order], kept)
-    order, at, kept = _sorted(order, at, kept)
+    at, moved = _untangle(elapsed[order], kept)
+    order, at, kept = _sort(order, at, kept)
     gaps = find_gaps(at, kept, clock.shift_ms)
     last_ms, chunk = np.full(headers.size, np.nan), np.full(headers.size, -1, dtype=np.int64)
     last_ms[order], chunk[order] = _equidistant(clock.timeline_ms(at), kept, gaps)
@@ -179,13 +179,13 @@ def _place(
     return PacketTimes(last_ms, chunk, device_clock, missing, gaps, received, rejected, reordered, late, moved, residual)
 
 
-def _without(order: NDArray[np.int64], hit: NDArray[np.bool_], reason: Rejected, rejected: dict[Rejected, int]) -> NDArray[np.int64]:
+def _drop(order: NDArray[np.int64], hit: NDArray[np.bool_], reason: Rejected, rejected: dict[Rejected, int]) -> NDArray[np.int64]:
     if hit.any():
         rejected[reason] = int(hit.sum())
     return order[~hit]
 
 
-def _sorted(
+def _sort(
     order: NDArray[np.int64], at: NDArray[np.float64], kept: PacketHeaders
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], PacketHeaders]:
     again = np.argsort(at, kind="stable")
@@ -224,7 +224,7 @@ def _astray(
     return np.asarray(doubtful & ~np.concatenate(([False], joins)) & ~np.concatenate((joins, [False])))
 
 
-def _untangled(at: NDArray[np.float64], kept: PacketHeaders) -> tuple[NDArray[np.float64], int]:
+def _untangle(at: NDArray[np.float64], kept: PacketHeaders) -> tuple[NDArray[np.float64], int]:
     """Correct device times, [n] in rising order, where packets carry the tick of the packet after them; also return how many those are.
 
     Now and then the recording program writes a packet under the header of the next one. Two packets then share a tick, and a gap of one
@@ -260,7 +260,7 @@ def _equidistant(at_ms: NDArray[np.float64], kept: PacketHeaders, gaps: Gaps) ->
     if at_ms.size == 0 or kept.samples.max() <= 1:
         return at_ms, number
     total = np.cumsum(kept.length_ms)
-    number, level = _leveled(at_ms - total, number)
+    number, level = _level_chunks(at_ms - total, number)
     first = np.flatnonzero(np.diff(number, prepend=-1))
     start = (level + total)[first]
     grid = 1000.0 / float(kept.rate_hz.max())
@@ -268,7 +268,7 @@ def _equidistant(at_ms: NDArray[np.float64], kept: PacketHeaders, gaps: Gaps) ->
     return start[number] + total - total[first][number], number
 
 
-def _leveled(ahead_ms: NDArray[np.float64], number: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _level_chunks(ahead_ms: NDArray[np.float64], number: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Cut chunks where ticks and samples part by more than `OFF_LATTICE_MS`; also compute the median of each chunk, both [n]."""
     level = np.empty(ahead_ms.size)
     cuts = np.zeros(ahead_ms.size, dtype=np.int64)

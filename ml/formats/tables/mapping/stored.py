@@ -106,9 +106,9 @@ def _side(side: Hemisphere | None, table: MappedTable, options: DecodeOptions, r
     mine = [(c, v) for c, v in zip(table.columns, table.values, strict=True) if c.side == side]
     amplitudes = [(c, v) for c, v in mine if c.role in AMPLITUDES]
     signals = [(c, v) for c, v in mine if c.role in SIGNALS]
-    parts = [_decoded([one, *(amplitudes if i == 0 else [])], table, options, report, side, i == 0) for i, one in enumerate(signals)]
+    parts = [_decode_signal([one, *(amplitudes if i == 0 else [])], table, options, report, side, i == 0) for i, one in enumerate(signals)]
     if not parts:
-        parts = [_decoded(amplitudes, table, options, report, side, True)]
+        parts = [_decode_signal(amplitudes, table, options, report, side, True)]
     first = parts[0]
     told: list[str | bytes | NDArray[np.float32]] = [str(side), str(table.started_at), *(p.fingerprint for p in parts)]
     told += [c.channel or "" for c, _ in signals]
@@ -117,8 +117,8 @@ def _side(side: Hemisphere | None, table: MappedTable, options: DecodeOptions, r
     samples: list[SampleLog] = []
     quality: dict[str, Any] = {}
     for i, part in enumerate(parts):
-        channel = (signals[i][0].channel or _unnamed(signals, i)) if signals else None
-        made = [_named(t, channel) for t in part.traces]
+        channel = (signals[i][0].channel or _default_name(signals, i)) if signals else None
+        made = [_with_channel(t, channel) for t in part.traces]
         traces += made
         spectra += [replace(s, channel=channel or s.channel) for s in part.spectra]
         samples += [replace(s, channel=channel or s.channel) for s in part.samples]
@@ -136,19 +136,19 @@ def _side(side: Hemisphere | None, table: MappedTable, options: DecodeOptions, r
     )
 
 
-def _unnamed(signals: Sequence[tuple[MappedColumn, Floats]], i: int) -> str | None:
+def _default_name(signals: Sequence[tuple[MappedColumn, Floats]], i: int) -> str | None:
     """Name a channel without a stated name: as in tables of one channel, else by its column."""
     return None if len(signals) == 1 else f"column {signals[i][0].number}"
 
 
-def _named(trace: TraceLog, channel: str | None) -> TraceLog:
+def _with_channel(trace: TraceLog, channel: str | None) -> TraceLog:
     if trace.stream == "amplitude":
         return trace
     details = {**trace.details, "unit_from": "mapping"}
     return replace(trace, channel=channel or trace.channel, details=details)
 
 
-def _decoded(
+def _decode_signal(
     given: Sequence[tuple[MappedColumn, Floats]],
     table: MappedTable,
     options: DecodeOptions,
