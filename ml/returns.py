@@ -1,10 +1,10 @@
 """Return of a session, and gain of one policy over another. One definition of each, for all of betaloop.
 
 Actual return: sum over t < H of gamma^t r_t + r_end. Gaps have one rule. A step without a known reward counts as the discount-weighted mean
-of the known ones (beta or amplitude not valid, or H beyond the session's end). A session whose known steps have less than `KNOWN_SHARE` of
-the discount weight has no step return. Other rules are worse. Where r_a = 0, as in the paper, a missing step that counts as 0 gets the best
-reward there is, so that gaps look good. Excluding every session with a gap loses nearly all recordings. Without a least share a few steps
-would represent a whole session.
+of the known ones. Its beta or amplitude is not valid, or H is beyond the session's end. A session whose known steps have less than
+`KNOWN_SHARE` of the discount weight has no step return. Other rules are worse. Where r_a = 0, as in the paper, a missing step that counts
+as 0 gets the best possible reward, so that gaps look good. Excluding every session with a gap loses nearly all recordings. Without a least
+share a few steps would represent a whole session.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ LONGEST_ADDRESS = 254
 
 
 def normal_address(email: str) -> str | None:
-    """The one spelling of an address; None for what no address can be.
+    """Normalise an address to its one spelling; None for what no address can be.
 
     Outer white space goes, look-alike forms become one (NFKC), capitals and small letters count as the same. An address with control,
     invisible or unassigned characters, or of more than 254 characters, is none.

@@ -1,4 +1,5 @@
-"""What is open to a blinded assessor. Everything else is closed, so that a new page or route cannot give a controller away by mistake."""
+"""Pages and routes open to a blinded assessor. Everything else is closed, so that a new page or route cannot give a controller away by
+mistake."""
 
 from __future__ import annotations
 
@@ -37,5 +38,5 @@ _PATTERNS = [(method, re.compile(path)) for method, path in OPEN]
 
 
 def is_open(method: str, path: str) -> bool:
-    """Whether a blinded assessor may call this."""
+    """Decide whether a blinded assessor may call this."""
     return any(m == ("GET" if method == "HEAD" else method) and p.fullmatch(path) for m, p in _PATTERNS)

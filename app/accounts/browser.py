@@ -1,4 +1,4 @@
-"""What signing in by whatever way does in a browser: its cookie, where it goes on, and how often one source may fail."""
+"""Effects of signing in on a browser, by whatever way: its cookie, where it goes on, and how often one source may fail."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from app.platform.sources import Allowance, in_words, network_address
 from app.settings import get_settings
 
 SIGNED_OUT = "betaloop_signed_out"
-"""Cookie of a browser in which somebody has signed out: its next sign-on asks anew, so that it is not theirs again with one click."""
+"""Cookie of a browser in which a user has signed out. Its next sign-on asks again, so that one click does not restore their session."""
 
 failed_sign_ins = Allowance(lambda: get_settings().failed_sign_ins_per_source, service.FAILURE_WINDOW.total_seconds())
 """By network address, whatever the accounts: who tries one password with many accounts meets no lock-out of an account."""
@@ -31,7 +31,7 @@ def count_try(request: Request) -> str:
 
 
 def signed_in(token: str, target: str) -> RedirectResponse:
-    """Go on as somebody who has signed in."""
+    """Redirect a user who has just signed in, with the session's cookie."""
     settings, answer = get_settings(), RedirectResponse(target, 303)
     answer.set_cookie(
         COOKIE, token, max_age=3600 * settings.session_max_hours, httponly=True, samesite="lax", secure=settings.cookie_secure
@@ -40,7 +40,7 @@ def signed_in(token: str, target: str) -> RedirectResponse:
 
 
 def local_path(target: str) -> str:
-    """A path of this service, or `/`: nobody is sent to another site after signing in.
+    """Return a path of this service, or `/`: signing in never leads to another site.
 
     Browsers read a backslash as a slash and drop tabs and line ends, hence the strict look at every character.
     """

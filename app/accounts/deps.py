@@ -27,7 +27,7 @@ _bearer = HTTPBearer(auto_error=False, description="API token from `betaloop tok
 
 
 def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> Caller:
-    """The caller of a request; its name goes into the audit trail of everything the request writes.
+    """Find the caller of a request; its name goes into the audit trail of everything the request writes.
 
     Raises:
         Unauthorized: neither a live token nor a live browser session.
@@ -42,7 +42,7 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
         raise Unauthorized(
             "This needs a bearer token or a browser session.", "Make one with `betaloop token create EMAIL --name NAME`, or sign in."
         )
-    # what the router goes by; that of `url` is put together anew, with escapes, beside what the caller's Host says
+    # the router goes by this path; that of `url` is put together again, with escapes and the caller's Host
     path = request.scope["path"]
     if caller.token_scope is Scope.METRICS and path != METRICS:
         raise Forbidden("A token for 'metrics' reads the figures of the service and nothing else.", "Make one with a wider scope.")
@@ -58,10 +58,10 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
 
 
 def _refuse_entries_of_others(request: Request, caller: Caller) -> None:
-    """Raise EntriesOfAnother for a form that somebody else filled in, in a browser that has changed hands since.
+    """Raise EntriesOfAnother for a form that another user filled in, in a browser that has changed hands since.
 
-    Forms say who wrote them where that is known (entries.js, and the page of an expired sign-in); this guards against mix-ups, not
-    against attackers, who can type whatever they like once they have signed in.
+    Forms name their author where that is known (entries.js, and the page of an expired sign-in). This guards against mix-ups, not against
+    attackers, who can type whatever they like once they have signed in.
     """
     writer = written_by(request)
     if writer is not None and writer != caller.user_id:
@@ -75,7 +75,7 @@ CurrentCaller = Annotated[Caller, Depends(get_caller)]
 
 
 def reader_of_figures(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> None:
-    """For `/metrics`: whoever has signed in or has a token; where the installation says so, every program of this machine too.
+    """Admit to `/metrics` callers who have signed in or have a token; where the installation allows it, every program of this machine too.
 
     Raises:
         Unauthorized, Forbidden: as `get_caller`.
@@ -85,7 +85,7 @@ def reader_of_figures(request: Request, db: Db, bearer: Annotated[HTTPAuthorizat
 
 
 async def judge(request: Request) -> str:
-    """Who sends a request, before its body is read. Raises Unauthorized as `get_caller`."""
+    """Name the sender of a request before its body is read. Raises Unauthorized as `get_caller`."""
     bearer = await _bearer(request)
     return await run_in_threadpool(_judged, request, bearer)
 
@@ -96,7 +96,8 @@ def _judged(request: Request, bearer: HTTPAuthorizationCredentials | None) -> st
 
 
 def caller_now(request: Request) -> Callable[[Session], Caller | None]:
-    """Who makes a request, asked anew each time, for answers that last: None once session, token or account have ended."""
+    """Make a function that finds the caller of a request again at each call, for long answers: None once session, token or account have
+    ended."""
     scheme, _, token = request.headers.get("Authorization", "").partition(" ")
     cookie = request.cookies.get(COOKIE, "")
 

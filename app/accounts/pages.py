@@ -42,7 +42,7 @@ _passwords = Bounded(AT_ONCE, 100)  # in threads of their own, so that those who
 
 @router.get("/sign-in")
 def sign_in_page(request: Request, db: Db, next: str = "/") -> Response:
-    """The sign-in form; who is signed in already goes on."""
+    """Show the sign-in form; a user who is signed in already goes on."""
     token = request.cookies.get(COOKIE)
     if token and service.caller_of_cookie(db, token):
         return RedirectResponse(local_path(next), 303)
@@ -58,7 +58,7 @@ async def sign_in(request: Request, values: FormValues) -> Response:
     except TooMany as error:
         return _sign_in_refused(request, values, error)
     except DBAPIError:
-        failed_sign_ins.give_back(source)  # no verdict was told
+        failed_sign_ins.give_back(source)  # no verdict was given
         raise
     if answer.status_code == 303:
         failed_sign_ins.give_back(source)
@@ -102,7 +102,7 @@ def sign_out(request: Request, db: Db) -> Response:
 
 @router.get("/account")
 def account(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """One's own access."""
+    """Show one's own access."""
     return _account_page(request, db, caller)
 
 
@@ -127,7 +127,7 @@ def begin_second_factor(request: Request, db: Db, caller: CurrentCaller, values:
     """Begin to set up an authenticator app, with the password; the page shows its key until a code of it was given."""
     caller.require_browser()
     try:
-        # else whoever finds a browser signed in could shut its user out
+        # else a person who finds a browser signed in could shut its user out
         with about("present"):
             service.confirm_password(_own_id(caller), str(values.get("present", "")))
         second_factor.begin(db, db.get_one(User, _own_id(caller)))
@@ -190,7 +190,7 @@ def revoke_token(token_id: RowId, db: Db, caller: CurrentCaller) -> Response:
 
 @router.get("/accounts")
 def accounts(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """The users of the studies that the caller administers."""
+    """Show the users of the studies that the caller administers."""
     caller.require(can.MANAGE_ACCOUNTS)
     return _accounts_page(request, db, caller)
 
@@ -269,7 +269,7 @@ def _managed_user(db: Session, caller: Caller, user_id: int) -> User:
 
 
 def _factor(db: Session, user: User) -> dict[str, Any]:
-    """What the account's page shows of the second factor; the secret while it is being set up, in groups to type."""
+    """Collect what the account's page shows of the second factor; the secret while it is being set up, in groups to type."""
     secret = second_factor.pending_secret(db, user.id)
     shown = totp.base32(secret) if secret else ""
     return {
@@ -290,7 +290,7 @@ def _account_page(
     codes: Sequence[str] = (),
     refused: tuple[str, Mapping[str, Any]] = ("", {}),
 ) -> HTMLResponse:
-    """One's own access; `refused` is the form that `error` is about, and what was typed into it."""
+    """Show one's own access; `refused` is the form that `error` is about, and what was typed into it."""
     user = db.get_one(User, _own_id(caller))
     values = {"user": user, "tokens": repository.tokens_of(db, user.id), "token": token, "min_password": MIN_PASSWORD}
     values |= {"factor": _factor(db, user), "codes": codes}
@@ -309,7 +309,7 @@ def _accounts_page(
     draft: dict[str, Any] | None = None,
     refused: str = "new",
 ) -> HTMLResponse:
-    """Who may sign in; `refused` is the form that `error` is about."""
+    """Show who may sign in; `refused` is the form that `error` is about."""
     page = render(
         request,
         "accounts/accounts.html",

@@ -1,9 +1,9 @@
-"""Passwords: which are too easy to guess, and argon2 in a way that many who give one at once hold up nobody else.
+"""Passwords: which are too easy to guess, and argon2 with few at once, so that many sign-ins at once delay no other request.
 
 Refused are rows of keys, few different characters, common words and one's own address and name with additions.
 
-What people choose most (passwords that became known, words and names of English, dates, ways over the keyboard) is known to `zxcvbn`, which
-estimates after how many guesses each would be found. Our own rules add words of a clinic and of other languages.
+`zxcvbn` knows what people choose most: passwords that became known, words and names of English, dates, ways over the keyboard. It estimates
+after how many guesses each would be found. Our own rules add words of a clinic and of other languages.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ _READ_AS = str.maketrans({"0": "o", "1": "i", "3": "e", "4": "a", "5": "s", "7":
 AT_ONCE = 2
 """How many passwords are hashed at the same moment in a process: argon2 takes all of a core, and 19 MiB, each time."""
 MOST_PRESENT = 20
-"""How many may hash or wait for their turn, beside sign-ins, which wait elsewhere: half of the threads that answer requests."""
+"""Number of users who may hash or wait for their turn, in addition to sign-ins, which wait elsewhere: half of the threads that answer
+requests."""
 
 _turns = threading.BoundedSemaphore(AT_ONCE)
 _places = threading.BoundedSemaphore(MOST_PRESENT)
@@ -52,7 +53,7 @@ _estimating = threading.Lock()
 
 
 def weakness(password: str, email: str = "", name: str = "") -> str | None:
-    """Why a password is too easy to guess, to follow "The password"; None where it is not.
+    """Explain why a password is too easy to guess, to follow "The password"; None where it is not.
 
     Args:
         email, name: of whom it is; their parts count as common words.
@@ -66,7 +67,7 @@ def weakness(password: str, email: str = "", name: str = "") -> str | None:
         return "is a row of keys, letters or digits"
     own = {part for part in re.split(r"[\W\d_]+", f"{email} {name}".casefold()) if len(part) >= 3}
     words = sorted({*_WORDS, *own}, key=len, reverse=True)
-    # digits were read as letters where they stand for some; what is left of a year or of an exclamation mark is no word
+    # digits were read as letters where they replace some; the rest of a year or of an exclamation mark is no word
     kept = [typed for typed, read in zip(folded, _aligned(folded, words), strict=True) if read and typed.isalpha()]
     if len(kept) < _LEAST_REST:
         return f"has fewer than {_LEAST_REST} letters that belong neither to a common word nor to the e-mail address or name"
@@ -76,7 +77,7 @@ def weakness(password: str, email: str = "", name: str = "") -> str | None:
 
 
 def _guesses(password: str, words: list[str]) -> float:
-    """After how many guesses the first characters of a password would be found by somebody who begins with what is chosen most."""
+    """Estimate after how many guesses the first characters of a password would be found, beginning with what is chosen most."""
     from zxcvbn import zxcvbn  # its lists take a moment to load, and are needed where a password is set alone
 
     with _estimating:  # it keeps the words of its caller where every thread reads them
@@ -84,7 +85,7 @@ def _guesses(password: str, words: list[str]) -> float:
 
 
 def _aligned(folded: str, words: list[str]) -> list[bool]:
-    """Which characters are part of no word."""
+    """Mark the characters that are part of no word."""
     read, kept = folded.translate(_READ_AS), [True] * len(folded)
     for word in words:
         for found in re.finditer(re.escape(word), read):
@@ -93,7 +94,7 @@ def _aligned(folded: str, words: list[str]) -> list[bool]:
 
 
 def _without_rows(text: str) -> str:
-    """The text without stretches of a row of keys, forwards or backwards, and without repetitions of one character."""
+    """Remove stretches of a row of keys, forwards or backwards, and repetitions of one character."""
     left = re.sub(r"(.)\1{2,}", "", text)
     for row in _ROWS:
         for line in (row, row[::-1]):
@@ -107,19 +108,19 @@ class FewAtOnce(Argon2Hasher):
     """Argon2, of which AT_ONCE run at the same moment in this process, in whichever threads; the others wait."""
 
     def hash(self, password: str | bytes, *, salt: bytes | None = None) -> str:
-        """The hash to store."""
+        """Compute the hash to store."""
         with _turns:
             return super().hash(password, salt=salt)
 
     def verify(self, password: str | bytes, hash: str | bytes) -> bool:
-        """Whether a password is that of a stored hash."""
+        """Verify a password against a stored hash."""
         with _turns:
             return super().verify(password, hash)
 
 
 @contextmanager
 def place() -> Iterator[None]:
-    """A place among those who wait for their turn; taken before a try is counted, for who is sent away has tried nothing.
+    """Take a place among those who wait for their turn, before a try is counted: a user who is sent away has tried nothing.
 
     Raises:
         TooMany: MOST_PRESENT are here; more would hold up every other request, for each holds a thread.

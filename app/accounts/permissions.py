@@ -1,4 +1,4 @@
-"""Who may do what: one table of permissions, one function that asks it."""
+"""Permissions: one table of who may do what, one function that asks it."""
 
 from __future__ import annotations
 
@@ -68,17 +68,17 @@ class Grant:
     ended: bool = False
 
     def holds(self, permission: str) -> bool:
-        """Whether the role includes a permission and the study has not ended, or it is one that outlasts studies."""
+        """Decide whether the role includes a permission and the study has not ended, or the permission outlasts studies."""
         return permission in PERMISSIONS[self.role] and (not self.ended or permission in AFTER_END)
 
     def covers(self, study_id: int | None, site_id: int | None) -> bool:
-        """Whether this is of a study, and of a site of it; None is every one."""
+        """Decide whether this is of a study, and of a site of it; None is every one."""
         return study_id in (None, self.study_id) and (site_id is None or self.site_id in (None, site_id))
 
 
 @dataclass(frozen=True)
 class Caller:
-    """Whoever acts: a signed-in user, a token's owner, or the system itself.
+    """The acting user: a signed-in one, a token's owner, or the system itself.
 
     `may` and `require` take the site that the row belongs to; rows the caller may not even read look as if they did not exist.
     """
@@ -101,20 +101,20 @@ class Caller:
         return ends if ends is not None and ends > now() else None
 
     def may(self, permission: str, study_id: int | None = None, site_id: int | None = None) -> bool:
-        """Whether some grant that covers the site holds the permission; without a study: whether any grant does."""
+        """Decide whether some grant that covers the site has the permission; without a study: whether any grant does."""
         if self.is_system:
             return True
         return any(g.covers(study_id, site_id) for g in self.grants_with(permission))
 
     def grants_with(self, permission: str) -> tuple[Grant, ...]:
-        """The grants that hold a permission, as far as the scope of the token leaves it. Whoever needs to know where asks this."""
+        """List the grants that have a permission, as far as the scope of the token allows it. They also show where it applies."""
         left = SCOPES[self.token_scope] if self.token_scope is not None else None
         if left is not None and permission not in left:
             return ()
         return tuple(g for g in self.grants if g.holds(permission))
 
     def require(self, permission: str, study_id: int | None = None, site_id: int | None = None) -> None:
-        """Raises NotFound for what the caller may not see, Forbidden for what it may see but not do."""
+        """Raise NotFound for what the caller may not see, Forbidden for what it may see but not do."""
         if self.may(permission, study_id, site_id):
             return
         if study_id is not None and not self.may(READ, study_id, site_id):
@@ -126,13 +126,13 @@ class Caller:
         raise Forbidden(f"Your role does not include '{permission}'.", "Ask an administrator of the study for a role that does.")
 
     def require_browser(self) -> None:
-        """Raises Forbidden for a token: passwords, tokens and accounts are changed by people who have signed in."""
+        """Raise Forbidden for a token: passwords, tokens and accounts are changed by people who have signed in."""
         if self.token_scope is not None:
             raise Forbidden("A token may not change passwords, tokens or accounts.", "Sign in with a browser.")
 
     @property
     def is_blinded(self) -> bool:
-        """Whether the caller is a blinded assessor anywhere: then only what `app.accounts.blinded` lists is open to them."""
+        """True where the caller is a blinded assessor anywhere: then only what `app.accounts.blinded` lists is open to them."""
         return any(g.role is Role.BLINDED_ASSESSOR for g in self.grants)
 
     @property

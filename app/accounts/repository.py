@@ -14,7 +14,7 @@ from app.platform.database import now
 
 
 def user_by_email(db: Session, email: str) -> User | None:
-    """The user of an address, however it is typed; None for what no address can be."""
+    """Find the user of an address, however it is typed; None for what no address can be."""
     address = normal_address(email)
     if address is None:
         return None
@@ -22,22 +22,22 @@ def user_by_email(db: Session, email: str) -> User | None:
 
 
 def some_password_hash(db: Session, address: str) -> str | None:
-    """The hash of some user's password, for an address always the same user's; None where there is no user."""
+    """Return the hash of some user's password, for an address always the same user's; None where there is no user."""
     return db.scalar(select(User.password_hash).order_by(func.md5(func.concat(User.id, " ", address))).limit(1))
 
 
 def users(db: Session) -> Sequence[User]:
-    """All users with their memberships, by address."""
+    """List all users with their memberships, by address."""
     return db.scalars(select(User).options(selectinload(User.memberships)).order_by(User.email)).all()
 
 
 def studies(db: Session) -> Sequence[Study]:
-    """All studies, oldest first."""
+    """List all studies, oldest first."""
     return db.scalars(select(Study).order_by(Study.id)).all()
 
 
 def sign_in_by_token(db: Session, token_sha256: str, idle_since: datetime, begun_since: datetime) -> SignIn | None:
-    """The live browser session of a token."""
+    """Find the live browser session of a token."""
     return db.scalar(
         select(SignIn)
         .where(SignIn.token_sha256 == token_sha256, SignIn.ended_at.is_(None))
@@ -47,17 +47,17 @@ def sign_in_by_token(db: Session, token_sha256: str, idle_since: datetime, begun
 
 
 def sign_in_of(db: Session, token_sha256: str) -> SignIn | None:
-    """The browser session of a token, live or not."""
+    """Find the browser session of a token, live or not."""
     return db.scalar(select(SignIn).where(SignIn.token_sha256 == token_sha256))
 
 
 def open_sign_ins(db: Session, user_id: int) -> Sequence[SignIn]:
-    """A user's browser sessions that nobody has ended."""
+    """List a user's browser sessions that have not been ended."""
     return db.scalars(select(SignIn).where(SignIn.user_id == user_id, SignIn.ended_at.is_(None))).all()
 
 
 def api_token_by_hash(db: Session, token_sha256: str) -> ApiToken | None:
-    """The API token of a hash, unless it was revoked or has run out."""
+    """Find the API token of a hash, unless it was revoked or has run out."""
     return db.scalar(
         select(ApiToken)
         .where(ApiToken.token_sha256 == token_sha256, ApiToken.revoked_at.is_(None), ApiToken.expires_at > now())
@@ -66,22 +66,22 @@ def api_token_by_hash(db: Session, token_sha256: str) -> ApiToken | None:
 
 
 def tokens_of(db: Session, user_id: int) -> Sequence[ApiToken]:
-    """A user's API tokens, newest first."""
+    """List a user's API tokens, newest first."""
     return db.scalars(select(ApiToken).where(ApiToken.user_id == user_id).order_by(ApiToken.created_at.desc())).all()
 
 
 def token_by_name(db: Session, user_id: int, name: str) -> ApiToken | None:
-    """A user's token by its name, revoked or not."""
+    """Find a user's token by its name, revoked or not."""
     return db.scalar(select(ApiToken).where(ApiToken.user_id == user_id, ApiToken.name == name))
 
 
 def sign_on_links(db: Session, user_id: int) -> Sequence[SignOnLink]:
-    """Who a user is at identity providers, oldest first."""
+    """List a user's identities at identity providers, oldest first."""
     return db.scalars(select(SignOnLink).where(SignOnLink.user_id == user_id).order_by(SignOnLink.id)).all()
 
 
 def recent_tries(db: Session, email: str, failed_within: timedelta, undecided_within: timedelta) -> tuple[int, int]:
-    """Tries of an address: how many failed within a span, and how many of a shorter one are undecided."""
+    """Count the tries of an address: how many failed within a span, and how many of a shorter one are undecided."""
     moment = now()
     failed = func.count().filter(SignInAttempt.failed, SignInAttempt.at > moment - failed_within)
     undecided = func.count().filter(~SignInAttempt.failed, SignInAttempt.at > moment - undecided_within)

@@ -1,6 +1,7 @@
 """The optional second factor: codes of an authenticator app, and recovery codes that work once each. The caller commits.
 
-The secret is kept encrypted, and recovery codes are hashed, with a key of the data folder, so that a copy of the database alone gives none.
+The secret is stored encrypted, and recovery codes are hashed. The key is in the data folder, so that a copy of the database alone gives
+none.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ def begin(db: Session, user: User) -> bytes:
 
 
 def pending_secret(db: Session, user_id: int) -> bytes | None:
-    """The secret of a set-up that was begun and not confirmed."""
+    """Return the secret of a set-up that was begun and not confirmed."""
     row = db.get(SecondFactor, user_id)
     return _secret(row) if row is not None and row.confirmed_at is None else None
 
 
 def confirm(db: Session, user: User, code: str) -> list[str]:
-    """Have the second factor count from now on; returns the recovery codes, which are shown this once.
+    """Confirm the second factor, which counts from now on; returns the recovery codes, which are shown this once.
 
     Raises:
         Invalid: nothing was begun, or the code is wrong.
@@ -66,13 +67,13 @@ def confirm(db: Session, user: User, code: str) -> list[str]:
 
 
 def wanted(db: Session, user_id: int) -> bool:
-    """Whether a user must give a code besides the password."""
+    """Decide whether a user must give a code besides the password."""
     row = db.get(SecondFactor, user_id)
     return row is not None and row.confirmed_at is not None
 
 
 def accepts(db: Session, user_id: int, code: str) -> bool:
-    """Whether a code, or a recovery code, is right; it works this once. True where the user has no second factor."""
+    """Accept a code, or a recovery code, if it is right; it works this once. True where the user has no second factor."""
     row = _locked(db, user_id)
     if row is None or row.confirmed_at is None:
         return True
@@ -95,13 +96,13 @@ def remove(db: Session, user_id: int) -> bool:
 
 
 def recovery_codes_left(db: Session, user_id: int) -> int:
-    """How many recovery codes still work."""
+    """Count the recovery codes that still work."""
     row = db.get(SecondFactor, user_id)
     return len(row.recovery) if row is not None else 0
 
 
 def _locked(db: Session, user_id: int) -> SecondFactor | None:
-    """The row, held until the transaction ends: of two who give one code at once, one is taken."""
+    """Lock the row until the transaction ends: of two requests with one code at once, one is accepted."""
     return db.get(SecondFactor, user_id, with_for_update=True, populate_existing=True)
 
 

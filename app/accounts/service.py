@@ -26,8 +26,8 @@ from app.settings import get_settings
 FAILURES_ALLOWED = 5
 FAILURE_WINDOW = timedelta(minutes=15)
 UNDECIDED_WINDOW = timedelta(minutes=1)
-"""For so long a try counts whose verdict is not written. One whose verdict could not be written (the disk of the database is full) told its
-sender nothing; a check and its wait for others take seconds."""
+"""Time for which a try counts whose verdict is not written. One whose verdict could not be written (the disk of the database is full) gave
+its sender none. A check and its wait for others take seconds."""
 LOCKED_OUT = {"why": "too many failed tries"}
 AT_ONCE = {"why": "too many tries at once"}
 TOKEN_DAYS, MOST_TOKEN_DAYS = 90, 730
@@ -41,7 +41,7 @@ _hasher = PasswordHash((FewAtOnce(time_cost=2, memory_cost=19 * 1024, parallelis
 
 @lru_cache(maxsize=1)
 def _decoy() -> str:
-    """Hash of a password that nobody has, where there is nobody yet."""
+    """Make the hash of a password that does not exist, for an installation without users."""
     return _hasher.hash(secrets.token_hex(16))
 
 
@@ -63,7 +63,7 @@ def add_user(db: Session, email: str, role: Role, password: str, study_code: str
 
 
 def check_password(password: str, email: str, name: str = "") -> None:
-    """Raises Invalid for a password that is too short or too easy to guess, TooMany where too many ask at the same moment."""
+    """Raise Invalid for a password that is too short or too easy to guess, TooMany where too many ask at the same moment."""
     with place():
         why = weakness(password, email, name)
     if why is not None:
@@ -75,7 +75,7 @@ def check_password(password: str, email: str, name: str = "") -> None:
 
 
 def set_password(db: Session, user: User, password: str) -> None:
-    """Change a password; every browser session and API token of the user ends, for somebody else may have made them."""
+    """Change a password; every browser session and API token of the user ends, for another person may have made them."""
     check_password(password, user.email, user.name)
     with place():
         user.password_hash = _hasher.hash(password)
@@ -99,7 +99,7 @@ def change_own_password(db: Session, user_id: int, present: str, new: str, code:
 
 
 def confirm_password(user_id: int, password: str, code: str = "") -> None:
-    """Have a user who has signed in prove to be there. Tries are counted together with sign-ins, in a transaction of their own.
+    """Require proof that a signed-in user is present. Tries are counted together with sign-ins, in a transaction of their own.
 
     Args:
         code: of the second factor, where the user has one.
@@ -127,18 +127,18 @@ def confirm_password(user_id: int, password: str, code: str = "") -> None:
 
 
 def administers(caller: Caller, study_id: int, site_id: int | None = None) -> bool:
-    """Whether the caller may manage accounts of a site, or (site_id None) of a whole study."""
+    """Decide whether the caller may manage accounts of a site, or (site_id None) of a whole study."""
     where = caller.grants_with(MANAGE_ACCOUNTS)
     return caller.is_system or any(g.study_id == study_id and g.site_id in (None, site_id) for g in where)
 
 
 def manages(caller: Caller, user: User) -> bool:
-    """Whether the caller administers everything that the user has access to, and there is something."""
+    """Decide whether the caller administers everything that the user has access to, and there is something."""
     return bool(user.memberships) and all(administers(caller, m.study_id, m.site_id) for m in user.memberships)
 
 
 def reads_whole_audit(db: Session, caller: Caller) -> bool:
-    """Whether the caller may read the audit trail, whose rows belong to no study: a grant over every study, at all of its sites."""
+    """Decide whether the caller may read the audit trail, whose rows belong to no study: a grant over every study, at all of its sites."""
     whole = {g.study_id for g in caller.grants_with(READ_AUDIT) if g.site_id is None}
     return caller.is_system or all(study.id in whole for study in repository.studies(db))
 
@@ -154,21 +154,21 @@ def set_active(db: Session, user: User, active: bool, caller: Caller) -> None:
 def sign_in(db: Session, email: str, password: str, code: str = "") -> str:
     """Check a password and open a browser session; returns the cookie's token.
 
-    Every try is counted as undecided, and committed, before its password is looked at; taken back when it was right, and committed as
-    failed before a wrong one is told: however many come at once, no more than FAILURES_ALLOWED of an address are told a verdict within
+    Every try is counted as undecided, and committed, before its password is checked. It is taken back when it was right, and committed as
+    failed before a wrong one is reported. So however many come at once, no more than FAILURES_ALLOWED of an address get a verdict within
     FAILURE_WINDOW. The caller commits the session.
 
     Args:
         code: of the second factor, where the user has one.
 
     Raises:
-        TooMany: too many failures of this address lately. Unauthorized: wrong address, password or code; which of them is not told.
+        TooMany: too many failures of this address lately. Unauthorized: wrong address, password or code; which of them is not revealed.
     """
     address = normal_address(email)
     user = repository.user_by_email(db, email)
     attempt = _count_attempt(db, user.email if user else address, known=user is not None) if address else None
-    # an unknown address costs the same time as a wrong password, so that addresses cannot be guessed by the clock: somebody's hash
-    # stands in, for an address always the same, because hashes of earlier versions cost more
+    # an unknown address costs the same time as a wrong password, so that addresses cannot be guessed by the clock. Another user's hash is
+    # used, for an address always the same, because hashes of earlier versions cost more
     stand_in = repository.some_password_hash(db, address or "") or _decoy()
     ok = _hasher.verify(password, user.password_hash if user else stand_in)
     if not (ok and user and user.active and attempt and second_factor.accepts(db, user.id, code)):
@@ -186,7 +186,7 @@ def sign_in(db: Session, email: str, password: str, code: str = "") -> str:
 
 
 def open_session(db: Session, user: User, issuer: str | None = None) -> str:
-    """Open a browser session of somebody who has shown who they are, to us or to an identity provider; returns the cookie's token."""
+    """Open a browser session of a user who has shown who they are, to us or to an identity provider; returns the cookie's token."""
     token = secrets.token_urlsafe(32)
     db.add(SignIn(token_sha256=_hash(token), user_id=user.id, issuer=issuer))
     return token
@@ -195,7 +195,7 @@ def open_session(db: Session, user: User, issuer: str | None = None) -> str:
 def _count_attempt(db: Session, address: str, known: bool) -> SignInAttempt:
     """Count a try of an address as undecided, and commit.
 
-    A lock-out is one row of the trail, however often it is tried meanwhile: whoever guesses must not be able to fill it.
+    A lock-out is one row of the trail, however often it is tried until it ends. An attacker must not be able to fill the trail.
 
     Raises:
         TooMany: it has used up its tries, by those that failed alone or with the undecided ones; this one is not counted.
@@ -225,7 +225,7 @@ def sign_out(db: Session, token: str) -> None:
 
 
 def caller_of_cookie(db: Session, token: str, used: bool = True) -> Caller | None:
-    """Who the cookie's token belongs to, unless the session idled out or ended; `used` counts as an act against idling."""
+    """Find the owner of the cookie's token, unless the session idled out or ended; `used` counts as an act against idling."""
     settings = get_settings()
     row = repository.sign_in_by_token(
         db, _hash(token), now() - timedelta(minutes=settings.session_idle_minutes), now() - timedelta(hours=settings.session_max_hours)
@@ -239,13 +239,13 @@ def caller_of_cookie(db: Session, token: str, used: bool = True) -> Caller | Non
 
 
 def last_user_of_cookie(db: Session, token: str) -> int | None:
-    """Whose browser session a cookie's token was, although it has ended."""
+    """Find whose browser session a cookie's token was, although it has ended."""
     row = repository.sign_in_of(db, _hash(token)) if token else None
     return row.user_id if row is not None else None
 
 
 def caller_of_token(db: Session, token: str) -> Caller | None:
-    """Who an API token belongs to, unless it was revoked or has run out; the time of its last use is kept, to the minute."""
+    """Find the owner of an API token, unless it was revoked or has run out. The time of its last use is stored, to the minute."""
     row = repository.api_token_by_hash(db, _hash(token))
     if row is None or not row.user.active:
         return None
@@ -256,7 +256,7 @@ def caller_of_token(db: Session, token: str) -> Caller | None:
 
 
 def caller_of(user: User) -> Caller:
-    """A user as an acting caller."""
+    """Convert a user to an acting caller."""
     return Caller(user.email, user.id, tuple(_grant(m) for m in user.memberships))
 
 
@@ -298,7 +298,7 @@ def revoke_token(db: Session, user_id: int, token_id: int) -> None:
 
 
 def study_of(db: Session, code: str | None) -> Study:
-    """The study of a code, or the only one. Raises NotFound naming those there are."""
+    """Find the study of a code, or the only one. Raises NotFound naming those there are."""
     known = repository.studies(db)
     found = [s for s in known if code in (None, s.code)]
     if len(found) != 1:

@@ -1,7 +1,7 @@
-"""Signing something: the signer shows anew who they are, and what is signed is kept (`app.platform.signatures`).
+"""Signing: the signer shows again who they are, and the signed content is stored (`app.platform.signatures`).
 
-They give the password again (with the code of a second factor), or were asked again by the hospital's sign-on at most five minutes ago,
-in this browser session, for this one signature.
+They give the password again (with the code of a second factor), or the hospital's sign-on asked them again. That was at most five minutes
+ago, in this browser session, for this one signature.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def sign(
 ) -> Signature:
     """Sign something with one's password or, where it is empty, a fresh sign-on. The transaction is not committed.
 
-    Whether the caller may sign it at all is for whoever calls this.
+    The function that calls this must check whether the caller may sign it at all.
 
     Args:
         kind: what is signed, e.g. `plan`. subject_id: which. meaning: what the signature says, e.g. "approved for use in this participant".

@@ -1,4 +1,4 @@
-"""What a session of `betaloop control` means for an implant's battery, under assumptions about the implant that a file states."""
+"""Effect of a session of `betaloop control` on an implant's battery, under assumptions about the implant that a file states."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MEND = (
 
 
 def read_implant(path: Path) -> Implant:
-    """The assumptions in a JSON file.
+    """Read the assumptions in a JSON file.
 
     Raises:
         Invalid: no such file, or an assumption is missing or no number.

@@ -28,7 +28,7 @@ BENCH_MINUTES = 10.0
 
 
 class DeviceSide(StrEnum):
-    """How the command's input argument `SCHEME:REST` names a device side; the rest is the port, the file, or the simulated brain."""
+    """Name of a device side in the command's input argument `SCHEME:REST`; the rest is the port, the file, or the simulated brain."""
 
     TCP = "tcp"
     TAIL = "tail"
@@ -49,18 +49,18 @@ _MEND = {
 
 
 def is_live(source: str, wish: Wish) -> bool:
-    """Whether a source is a device side, which amplitudes go out to."""
+    """Decide whether a source is a device side, which receives amplitudes."""
     return (source == "-" and wish.realtime) or _device_side(source) is not None
 
 
 def _device_side(source: str) -> tuple[DeviceSide, str] | None:
-    """The scheme of a source and what follows its colon; None for a file of recorded input."""
+    """Split a source into its scheme and what follows its colon; None for a file of recorded input."""
     scheme, colon, rest = source.partition(":")
     return (DeviceSide(scheme), rest) if colon and scheme in set(DeviceSide) else None
 
 
 def _simulated_brain(source: str) -> str | None:
-    """Which brain a simulated device is asked for; None where the source is no simulated device."""
+    """Return the brain that a simulated device is asked for; None where the source is no simulated device."""
     match _device_side(source):
         case DeviceSide.SIMULATED, brain:
             return brain
@@ -116,7 +116,7 @@ def _run(opened: OpenBundle, link: Link, task: Task, now: Callable[[], datetime]
 
 
 def _clock(device: SimulatedDevice, task: Task, now: Callable[[], datetime]) -> Callable[[], datetime]:
-    """The time of day in a simulation: from the moment at which it is said to begin, as its own clock goes on."""
+    """Make the clock of a simulation: the time of day from its stated beginning, as its own clock goes on."""
     begins = (task.begins or now()).astimezone()
     return lambda: begins + timedelta(seconds=device.now())
 
@@ -137,7 +137,7 @@ def _link(manifest: BundleManifest, source: str) -> tuple[Link, str]:
 
 @contextmanager
 def _stopped_by_signals(link: Link) -> Iterator[None]:
-    """Ctrl-C and a stop of the system end the session on clinical settings, with its log whole."""
+    """Make Ctrl-C and a stop of the system end the session on clinical settings, with its log whole."""
     if not isinstance(link, QueueLink):
         yield
         return

@@ -1,7 +1,7 @@
 """A simulated device side: a synthetic participant whose beta answers to the amplitude, over the tablet's protocol, on a clock of its own.
 
-A whole session runs in the time that its computations take. What is in between is the very loop that runs in the clinic: `tamper` lets a
-test lose, delay, repeat or change what the device sends.
+A whole session runs in the time that its computations take. In between is the very loop that runs in the clinic. With `tamper` a test can
+lose, delay, repeat or change what the device sends.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ Tamper = Callable[[int, str], Iterable[Sent]]
 
 
 def as_sent(_number: int, line: str) -> Iterable[Sent]:
-    """Every message arrives, at once and whole."""
+    """Deliver every message, at once and whole."""
     return [(0.0, Event.LINE, line)]
 
 
 class Brain(Protocol):
-    """What a simulated device measures: beta in a unit, as from a source."""
+    """Measurements of a simulated device: beta in a unit, as from a source."""
 
     signal: Signal
 
     def beta(self, amplitude_ma: float) -> float:
-        """Beta of the next period, in which an amplitude is in force."""
+        """Compute beta of the next period, in which an amplitude is in force."""
 
 
 class SyntheticBrain:
@@ -60,7 +60,7 @@ class SyntheticBrain:
         self.signal = Signal("uV", manifest.beta_source)  # the amplitude itself, whatever the device would make it from
 
     def beta(self, amplitude_ma: float) -> float:
-        """Beta of the next period, in which an amplitude is in force."""
+        """Compute beta of the next period, in which an amplitude is in force."""
         if self._before:
             return float(self._before.popleft())
         *_, info = self._environment.step(np.array([amplitude_ma / self._cdbs_ma], dtype=np.float32))
@@ -68,7 +68,7 @@ class SyntheticBrain:
 
 
 def brain_of(text: str, manifest: BundleManifest, steps: int) -> SyntheticBrain:
-    """The synthetic participant named `P1` or `P1:SEED`. Raises NotFound where there is none."""
+    """Make the synthetic participant named `P1` or `P1:SEED`. Raises NotFound where there is none."""
     from ml.population import PARTICIPANTS
 
     found = _NAME.fullmatch(text)
@@ -101,15 +101,15 @@ class SimulatedDevice:
         self._coming: list[tuple[float, Event, str]] = [(0.0, Event.LINE, hello)]
 
     def now(self) -> float:
-        """Seconds on the clock of the simulation."""
+        """Read the clock of the simulation, in seconds."""
         return self._now_s
 
     def sleep(self, seconds: float) -> None:
-        """The tablet stands still, and the device goes on."""
+        """Stop the tablet for a while; the device goes on."""
         self._now_s += seconds
 
     def next(self, until_s: float) -> Arrival | None:
-        """As `Link.next`."""
+        """Wait for the next arrival, as `Link.next`."""
         while not self._coming or self._coming[0][0] > min(until_s, self._due_s):
             if self._due_s > until_s:
                 break
@@ -122,7 +122,7 @@ class SimulatedDevice:
         return Arrival(self._now_s, event, text)
 
     def send(self, line: str) -> None:
-        """As `Link.send`."""
+        """Send a line, as `Link.send`."""
         self.heard.append(line)
         self.device.hear(line, self._now_s)
 
@@ -132,7 +132,7 @@ class SimulatedDevice:
         return (self._periods + 1) * self._period_s
 
     def _measure(self) -> None:
-        """A period ends on the device: its beta, under the amplitude in force, is sent."""
+        """Finish a period on the device: its beta, under the amplitude in force, is sent."""
         due_s, number = self._due_s, self._periods
         amplitude = self.device.look(due_s)
         self.amplitudes_ma.append(amplitude)

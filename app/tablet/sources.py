@@ -1,4 +1,4 @@
-"""Where beta amplitudes come from for `betaloop control`: recordings, synthetic participants, standard input."""
+"""Sources of beta amplitudes for `betaloop control`: recordings, synthetic participants, standard input."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LFP_UNITS = {"uV": 1.0, "mV": 1000.0, "V": 1e6}
 
 
 class Row(NamedTuple):
-    """What has come by the time of a decision: the time, the beta amplitude (None: nothing), microseconds that computing it took."""
+    """Arrival by the time of a decision: the time, the beta amplitude (None: nothing), microseconds that computing it took."""
 
     now_s: float
     sample: BetaSample | None
@@ -65,7 +65,7 @@ class Source:
 
 @dataclass(frozen=True, kw_only=True)
 class Wish:
-    """What was asked of a source.
+    """Request to a source.
 
     Attributes:
         channel: of a recording with several; the one with most valid periods when None.
@@ -81,7 +81,7 @@ class Wish:
 
 
 def open_source(text: str, manifest: BundleManifest, wish: Wish, stdin: Iterable[str]) -> Source:
-    """A source by its name.
+    """Open a source by its name.
 
     Args:
         text: a path (RC+S zip or folder, table of 2 s steps, table of `t_s, lfp`), `cohort:P1` or `cohort:P1:SEED`, or `-`.
@@ -111,7 +111,7 @@ def open_source(text: str, manifest: BundleManifest, wish: Wish, stdin: Iterable
 
 
 def _recorded(path: Path, options: DecodeOptions, manifest: BundleManifest, wish: Wish) -> Source:
-    """The first recording of a file that has the bundle's kind of beta."""
+    """Read the first recording of a file that has the bundle's kind of beta."""
     recordings = [r for r in decode(path, options=options).recordings if _same_side(r, manifest)]
     for recording in recordings:
         traces = [t for t in recording.traces if t.stream in ("beta", "band_power") and t.unit != "uV2"]
@@ -133,7 +133,7 @@ def _recorded(path: Path, options: DecodeOptions, manifest: BundleManifest, wish
 
 
 def _same_side(recording: RecordingLog, manifest: BundleManifest) -> bool:
-    """Whether a recording can be of the bundle's hemisphere: one that says the other side never is."""
+    """Decide whether a recording can be of the bundle's hemisphere: one that names the other side never is."""
     return manifest.hemisphere is None or recording.hemisphere in (None, manifest.hemisphere)
 
 
@@ -147,27 +147,27 @@ def _chosen(traces: list[TraceLog], channel: str | None) -> TraceLog:
 
 
 def _from_trace(trace: TraceLog, signal: Signal) -> Rows:
-    """One value per period, known at its end; an invalid one comes as NaN."""
+    """Yield one value per period, known at its end; an invalid one comes as NaN."""
     for end_s, value, valid in zip(trace.t_end_s.tolist(), trace.values.tolist(), trace.valid.tolist(), strict=True):
         yield Row(end_s, BetaSample(end_s, value if valid else math.nan, signal))
 
 
 def _lines(lines: Iterable[str], manifest: BundleManifest) -> Rows:
-    """A line per period."""
+    """Read a line per period."""
     for k, line in enumerate(lines):
         now_s = k * manifest.period_s
         yield Row(now_s, _sample(line, now_s, manifest))
 
 
 def _sample(line: str, now_s: float, manifest: BundleManifest) -> BetaSample | None:
-    """A number, taken to be of the bundle's unit and source; NaN where there is another text, nothing where the line is empty."""
+    """Parse a number, taken to be of the bundle's unit and source; NaN where there is another text, nothing where the line is empty."""
     if not line.strip():
         return None
     return BetaSample(now_s, number(line.strip()), Signal(manifest.beta_unit, manifest.beta_source))
 
 
 def _raw(stretches: list[Stretch], manifest: BundleManifest, description: str, rows: int | None = None) -> Source:
-    """P_beta in time from raw samples in uV."""
+    """Compute P_beta in time from raw samples in uV."""
     end_s = max((start + x.size / rate for start, rate, x in stretches), default=0.0)
     count = math.ceil(end_s / manifest.period_s - 1e-9) if rows is None else rows
     if not stretches or count < 1:
@@ -198,7 +198,7 @@ def _offline(stretches: list[Stretch], manifest: BundleManifest, rows: int) -> N
 
 
 def _rcs_stretches(path: Path, options: DecodeOptions, recording: RecordingLog) -> dict[str, list[Stretch]]:
-    """Gap-free stretches of the recording's channels in uV, on the recording's clock."""
+    """Collect gap-free stretches of the recording's channels in uV, on the recording's clock."""
     files = FolderFiles(path) if path.is_dir() else ZipFiles(path, options.archive)
     start_ms = recording.started_at.timestamp() * 1000.0 if recording.started_at else 0.0
     out: dict[str, list[Stretch]] = {}
@@ -216,7 +216,7 @@ def _rcs_stretches(path: Path, options: DecodeOptions, recording: RecordingLog) 
 
 
 def _lfp_columns(path: Path) -> list[Stretch]:
-    """Gap-free stretches in uV of a table `t_s, lfp [unit]`; empty where the table is another.
+    """Read gap-free stretches in uV of a table `t_s, lfp [unit]`; empty where the table is another.
 
     Raises:
         UndecodableFile: times that do not increase, or no known unit.
@@ -248,7 +248,7 @@ def _lfp_columns(path: Path) -> list[Stretch]:
 
 
 def _cohort(text: str, manifest: BundleManifest, steps: int) -> Source:
-    """A synthetic participant that answers to the amplitude: the loop is closed."""
+    """Simulate a synthetic participant that answers to the amplitude: the loop is closed."""
     brain = brain_of(text.removeprefix("cohort:"), manifest, steps)
     return Source(_simulate(brain, manifest, steps), f"{brain.description}, closed loop of {steps} steps", participant=brain.participant)
 

@@ -92,8 +92,8 @@ class BundleManifest:
         test_windows_from: where the beta windows of the test vectors were logged; None where they are made up.
         test_windows: how many of them there are, before those at the edges.
         logged_lower_bound: B, lowest amplitude fraction that the study's random controller draws; None where not known.
-        asked_mean: over the logged test windows, the mean fraction that the network requests. asked_below_bound, asked_below_minimum: the
-            shares of windows with less than B, and with less than the clinician's minimum.
+        asked_mean: the mean fraction that the network requests over the logged test windows. asked_below_bound, asked_below_minimum: shares
+            of windows with a request below B, and below the clinician's minimum.
         energy_of_cdbs, charge_of_cdbs: mean square and mean of the amplitude over cDBS, over the logged test windows and within limits.
         int8_bound, int8_planes, int8_bytes: of the fixed-point header; None where there is none.
         taken_by: who took the bundle first, and when; None for one made without a service.

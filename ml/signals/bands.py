@@ -72,7 +72,7 @@ class BandRows:
 
     @property
     def reached(self) -> NDArray[np.float64]:
-        """Share that is compared with a limit of coverage: `covered`, and one sample more.
+        """Covered share for comparison with a limit: `covered`, and one sample more.
 
         Rows begin and end between samples. So a row that packets fill to an exact share has one sample more or one less.
         """
@@ -313,7 +313,7 @@ def _impulse_response(rate_hz: float, low_hz: float, high_hz: float) -> NDArray[
 
 
 def _squared_correlation(run: _Run, filtered: NDArray[np.float64], lags_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Square the measured samples' autocorrelation, averaged over the lags around each of `lags_s`; same shape."""
+    """Compute the square of the measured samples' autocorrelation, averaged over the lags around each of `lags_s`; same shape."""
     most = min(int(MAX_LAG_S * run.rate_hz), run.measured.size - 1)
     length = scipy.fft.next_fast_len(run.measured.size + most + 1, real=True)
     signal, mask = np.zeros(run.measured.size), run.measured.astype(np.float64)

@@ -1,1 +1,2 @@
-"""Sign-on at a hospital's identity provider (OpenID Connect), beside passwords: the provider says who somebody is, never what they may."""
+"""Sign-on at a hospital's identity provider (OpenID Connect), in addition to passwords: the provider confirms who a user is, never what
+they may."""

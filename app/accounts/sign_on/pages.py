@@ -34,7 +34,7 @@ _NONCE_BYTES = 12
 
 @dataclass(frozen=True)
 class _Way:
-    """What the sealed cookie holds: the begin, where to go on, and whether it confirms a session instead of opening one."""
+    """Content of the sealed cookie: the beginning, where to go on, and whether it confirms a session instead of opening one."""
 
     begun: Begun
     target: str
@@ -58,7 +58,7 @@ def begin_to_confirm(caller: CurrentCaller, next: str = "/") -> Response:
 
 @router.get("/return")
 def come_back(request: Request) -> Response:
-    """Where the provider sends the browser to."""
+    """Receive the browser that the provider sends back."""
     _require_configured()
     way, source = _opened(request.cookies.get(BEGUN, "")), None
     try:
@@ -69,7 +69,7 @@ def come_back(request: Request) -> Response:
         failed_sign_ins.give_back(source)
     except BetaloopError as error:
         if isinstance(error, ProviderAway) and source is not None:
-            failed_sign_ins.give_back(source)  # nobody was refused
+            failed_sign_ins.give_back(source)  # no refusal
         answer = _refusal(request, error, way)
     # each begin is good for one return
     answer.delete_cookie(BEGUN, path=_PATH, httponly=True, samesite="lax", secure=get_settings().cookie_secure)
@@ -89,7 +89,7 @@ def _require_configured() -> None:
 
 
 def _max_age_s() -> int:
-    """A browser session that has idled out must not come back with one click of somebody else."""
+    """Limit the age of a login: another person must not restore an idled-out browser session with one click."""
     return 60 * get_settings().session_idle_minutes
 
 
@@ -139,7 +139,7 @@ def _sealed(way: _Way) -> str:
 
 
 def _opened(cookie: str) -> _Way | None:
-    """What a cookie of ours holds; None for any other, and for an old one."""
+    """Open a cookie of ours; None for any other, and for an old one."""
     try:
         sealed = base64.urlsafe_b64decode(cookie.encode("ascii"))
         held = json.loads(AESGCM(_key()).decrypt(sealed[:_NONCE_BYTES], sealed[_NONCE_BYTES:], BEGUN.encode()))

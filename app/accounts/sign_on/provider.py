@@ -1,4 +1,4 @@
-"""What is said with an identity provider: OpenID Connect, authorization code with PKCE. Knows no accounts and no database.
+"""Exchange with an identity provider: OpenID Connect, authorization code with PKCE. Knows no accounts and no database.
 
 The tokens of a provider are looked at once and not kept. Sources: OpenID Connect Core 1.0 (3.1), Discovery 1.0, RFC 7636, RFC 9207.
 """
@@ -43,12 +43,12 @@ class ProviderAway(BetaloopError):
 
 
 class Refused(Forbidden):
-    """What came back from the provider signs nobody on."""
+    """The provider's answer signs no user on."""
 
 
 @dataclass(frozen=True)
 class Begun:
-    """What is remembered, in the browser's sealed cookie, between the way to the provider and the way back.
+    """Sign-on in progress, remembered in the browser's sealed cookie between the way to the provider and the way back.
 
     Attributes:
         state, nonce, verifier: random; of the way back, of the ID token, and of PKCE.
@@ -65,7 +65,7 @@ class Begun:
 
 @dataclass(frozen=True)
 class Identity:
-    """Whom a provider has asked to show who they are.
+    """Identity of a user whom a provider has checked.
 
     Attributes:
         issuer, subject: name the person for good. address: an e-mail address that the provider vouches for, or None.
@@ -79,12 +79,12 @@ class Identity:
 
 
 def configured() -> bool:
-    """Whether this installation has a sign-on."""
+    """Decide whether this installation has a sign-on."""
     return bool(get_settings().oidc_issuer)
 
 
 def provider() -> Provider:
-    """The provider of this installation.
+    """Return the provider of this installation.
 
     Raises:
         RuntimeError: a setting that it needs is missing or cannot be used.
@@ -124,7 +124,7 @@ class Provider:
     """One provider; used by many threads.
 
     Args:
-        issuer: its address, under which `/.well-known/openid-configuration` lies. client_id, secret: ours there, the secret may be empty.
+        issuer: its address; `/.well-known/openid-configuration` is below it. client_id, secret: ours there, the secret may be empty.
         public_url: where browsers reach this service. claim: the claim with a user's address.
     """
 
@@ -137,7 +137,7 @@ class Provider:
         self._metadata_at = self._keys_at = -KEEP_S
 
     def begin(self, max_age_s: int, *, fresh: bool) -> tuple[str, Begun]:
-        """The address that the browser is sent to, and what to remember until it comes back.
+        """Begin a sign-on: return the address that the browser is sent to, and what to remember until it comes back.
 
         Args:
             max_age_s: how long ago the person may have shown who they are, s. fresh: ask them now, whenever that was.
@@ -151,7 +151,7 @@ class Provider:
         return url, begun
 
     def finish(self, begun: Begun, answer: Mapping[str, str], max_age_s: int) -> Identity:
-        """Whom the provider has sent back.
+        """Identify the user whom the provider has sent back.
 
         Args:
             begun: what was remembered. answer: the query of the address that the browser came back to. max_age_s: as at the begin.
@@ -162,7 +162,7 @@ class Provider:
         """
         if not hmac.compare_digest(answer.get("state", "").encode(), begun.state.encode()):
             raise Refused("This answer belongs to another sign-on.", "Begin again from the sign-in page.")
-        # RFC 9207: an answer of another provider that somebody has slipped in
+        # RFC 9207: an answer of another provider that an attacker has slipped in
         if answer.get("iss", self.issuer) != self.issuer:
             raise Refused("This answer comes from another provider.", "Begin again from the sign-in page.")
         if "code" not in answer:
@@ -171,7 +171,7 @@ class Provider:
         return self._identity(self._exchanged(answer["code"], begun), begun, max_age_s)
 
     def sign_out_address(self) -> str | None:
-        """Where a browser ends its session at the provider, and is sent back from; None where it offers that not."""
+        """Build the address where a browser ends its session at the provider, and is sent back from; None where it does not offer that."""
         address = self.metadata().get("end_session_endpoint")
         if not address or not _safe(address):
             return None
@@ -179,7 +179,7 @@ class Provider:
         return f"{address}{'&' if '?' in address else '?'}{urlencode(query)}"
 
     def metadata(self) -> dict[str, Any]:
-        """What the provider publishes of itself. Raises ProviderAway."""
+        """Fetch what the provider publishes of itself. Raises ProviderAway."""
         with self._lock:
             if time.monotonic() - self._metadata_at < KEEP_S:
                 return self._metadata

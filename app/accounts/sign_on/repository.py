@@ -11,7 +11,7 @@ from app.accounts.models import SignIn, SignOnLink, User
 
 
 def link_of(db: Session, issuer: str, subject: str) -> SignOnLink | None:
-    """The link of somebody at a provider, with its user."""
+    """Find the link of a subject at a provider, with its user."""
     mine = (SignOnLink.issuer == issuer) & (SignOnLink.subject == subject)
     return db.scalar(select(SignOnLink).where(mine).options(selectinload(SignOnLink.user).selectinload(User.memberships)))
 
@@ -23,7 +23,7 @@ def use_login(db: Session, link: SignOnLink, at: datetime) -> bool:
 
 
 def link_of_user(db: Session, user_id: int, issuer: str) -> SignOnLink | None:
-    """The link of a user at a provider."""
+    """Find the link of a user at a provider."""
     return db.scalar(select(SignOnLink).where(SignOnLink.user_id == user_id, SignOnLink.issuer == issuer))
 
 

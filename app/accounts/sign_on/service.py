@@ -1,4 +1,4 @@
-"""Rules of a sign-on: whose account somebody from a provider has, and what a sign-on confirms. The caller commits."""
+"""Rules of a sign-on: which account belongs to a provider's subject, and what a sign-on confirms. The caller commits."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _AGAIN = "Begin again, and give your password there; or give the one of here."
 
 
 def sign_on(db: Session, identity: Identity) -> str:
-    """Open a browser session of the account that belongs to somebody; returns the cookie's token. Refusals are committed to the trail.
+    """Open a browser session of the account that belongs to an identity; returns the cookie's token. Refusals are committed to the trail.
 
     An account belongs to whom it was linked with at their first sign-on, by an address that the provider vouches for; none is made here.
 
     Raises:
-        Refused: there is none, it is closed, or it belongs to somebody else at the provider.
+        Refused: there is none, it is closed, or it belongs to another subject at the provider.
     """
     link = repository.link_of(db, identity.issuer, identity.subject)
     user = link.user if link else _user_of(db, identity.address)
@@ -47,10 +47,10 @@ def sign_on(db: Session, identity: Identity) -> str:
 
 
 def confirm(db: Session, caller: Caller, identity: Identity) -> None:
-    """Note that the user of a browser session has shown, just now, who they are: it stands for the password of one signature.
+    """Note that the user of a browser session has shown, just now, who they are: this replaces the password of one signature.
 
     Raises:
-        Refused: it was somebody else, or a login that was shown here before, for a sign-on or another signature.
+        Refused: it was another user, or a login that was shown here before, for a sign-on or another signature.
     """
     link = repository.link_of(db, identity.issuer, identity.subject)
     row = db.get(SignIn, caller.sign_in_id) if caller.sign_in_id is not None else None
@@ -80,7 +80,8 @@ def use_confirmation(db: Session, caller: Caller) -> None:
 
 
 def _user_of(db: Session, address: str | None) -> User | None:
-    """The user of exactly this address. What only looks alike (NFKC, ß and ss) may be another mailbox, which the provider vouches for."""
+    """Find the user of exactly this address. What only looks alike (NFKC, ß and ss) may be another mailbox, which the provider vouches
+    for."""
     user = accounts.user_by_email(db, address) if address else None
     return user if user is not None and address is not None and user.email == address.strip().lower() else None
 

@@ -13,7 +13,7 @@ from app.platform.database import Db
 
 
 def managed_study(study_code: Annotated[str, Path(max_length=40, pattern=r"^[^\x00]*$")], db: Db, caller: CurrentCaller) -> Study:
-    """The study. Raises NotFound, Forbidden."""
+    """Find the study. Raises NotFound, Forbidden."""
     return service.study_to_manage(db, study_code, caller)
 
 

@@ -29,7 +29,7 @@ router = APIRouter()
 
 @router.get("/studies")
 def studies(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """The studies that the caller administers."""
+    """Show the studies that the caller administers."""
     caller.require(can.MANAGE_ACCOUNTS)
     return _page(request, db, caller)
 
@@ -120,7 +120,7 @@ def changed(request: Request, db: Session, caller: Caller, done: str, change: Ca
 
 
 def reason_of(values: FormData) -> str:
-    """Why something changes. Raises Invalid where nobody says."""
+    """Read why something changes. Raises Invalid where no reason is given."""
     reason = str(values.get("reason", "")).strip()
     if not 1 <= len(reason) <= 1000:
         raise Invalid(

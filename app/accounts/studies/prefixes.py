@@ -1,7 +1,7 @@
-"""What participants' codes of a study begin with, so that who enrols in one study is never told which codes another has.
+"""Prefixes of participants' codes of a study: a user who enrols in one study never learns which codes another has.
 
 Codes are unique in an installation, because addresses name participants by them. Every study but the first has a prefix of its own, none
-the beginning of another's: a code is held against these before it is looked up, so that "taken" is said of the own study alone.
+the beginning of another's. A code is compared with these before it is looked up, so that "taken" refers to the own study alone.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ LONGEST = 20
 
 
 def default_of(code: str) -> str:
-    """The prefix of a study for which nobody states one. Raises Invalid for a code that is too long."""
+    """Choose the prefix of a study for which none is stated. Raises Invalid for a code that is too long."""
     prefix = code.replace(".", "-") + "-"
     if len(prefix) > LONGEST:
         raise Invalid(f"'{prefix}' is too long to begin participants' codes with.", f"State a prefix of at most {LONGEST} characters.")
@@ -25,7 +25,7 @@ def default_of(code: str) -> str:
 
 
 def claim(db: Session, study: Study, prefix: Prefix) -> None:
-    """Give a study without a prefix one. Nobody enrols meanwhile.
+    """Give a study without a prefix one. Until then no participant is enrolled.
 
     Raises:
         Conflict: it has one, one of another study begins with this or the other way round, or codes of another study begin with it.
@@ -44,7 +44,7 @@ def claim(db: Session, study: Study, prefix: Prefix) -> None:
 
 
 def require_own(db: Session, study: Study, code: str) -> str:
-    """What follows the study's prefix in the code of a participant to enrol; until the transaction ends no study claims a prefix.
+    """Return what follows the study's prefix in the code of a participant to enrol; until the transaction ends no study claims a prefix.
 
     Raises:
         Invalid: the code has not this study's prefix, or has another one's. No participant is looked up for it.

@@ -10,11 +10,11 @@ from app.accounts.studies.schemas import SiteOut, StudyOut
 
 
 def study_out(db: Session, study: Study) -> StudyOut:
-    """A study with its sites."""
+    """Convert a study with its sites."""
     sites = [site_out(s) for s in repository.sites_of(db, study.id)]
     return StudyOut(code=study.code, name=study.name, code_prefix=study.code_prefix, ended_at=study.ended_at, sites=sites)
 
 
 def site_out(site: Site) -> SiteOut:
-    """A site."""
+    """Convert a site."""
     return SiteOut(code=site.code, name=site.name, ended_at=site.ended_at)

@@ -41,7 +41,7 @@ def add_study(db: Session, draft: StudyIn, caller: Caller) -> Study:
 
 
 def study_to_manage(db: Session, code: str, caller: Caller) -> Study:
-    """A study that the caller administers at all of its sites.
+    """Find a study that the caller administers at all of its sites.
 
     Raises:
         NotFound: a study that the caller may not read. Forbidden: one that the caller reads and does not administer.
@@ -58,8 +58,8 @@ def change_study(db: Session, study: Study, change: StudyChange, caller: Caller)
     """Give a study another name, or the prefix that it lacks; its code stays, and so do codes of participants.
 
     Raises:
-        Invalid: neither. Conflict: a prefix that cannot be used. Forbidden: one by somebody who does not administer all studies, for what
-            stands in its way may be another study's.
+        Invalid: neither. Conflict: a prefix that cannot be used. Forbidden: one by a user who does not administer all studies, since
+            another study's codes may prevent it.
     """
     if change.name is None and change.code_prefix is None:
         raise Invalid("Nothing is to change.", "Give a name or a prefix.", field="name")
@@ -102,7 +102,7 @@ def rename_site(db: Session, study: Study, code: str, name: str, reason: str) ->
 
 
 def site_of(db: Session, study: Study, code: str) -> Site:
-    """A study's site. Raises NotFound."""
+    """Find a study's site. Raises NotFound."""
     site = repository.site_by_code(db, study.id, code)
     if site is None:
         raise NotFound(f"Study '{study.code}' has no site '{code}'.")
@@ -113,8 +113,8 @@ def grant(db: Session, study: Study, email: str, role: Role, site_code: str | No
     """Give a user a role in a study, at one site or at all; a role that the user has there is replaced.
 
     Raises:
-        NotFound: no such user or site. Invalid: one's own role, or a blinded assessor with another role in the study. Forbidden: to blind
-            somebody who works in a study that the caller does not administer, for it would close that study to them.
+        NotFound: no such user or site. Invalid: one's own role, or a blinded assessor with another role in the study. Forbidden: to blind a
+            user who works in a study that the caller does not administer, for it would close that study to them.
     """
     user, site_id = _user(db, email), site_of(db, study, site_code).id if site_code else None
     _require_other(user, caller)

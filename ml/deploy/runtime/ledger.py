@@ -1,8 +1,8 @@
 """Slots that this tablet has run: a folder with one file per slot, made before the first amplitude and never taken back.
 
-A file is made whole or not at all, and reaches the disk before stimulation changes. So it is found by a process that was killed, by a
-second one that starts at the same time, and by a new bundle of the same slot. Withdrawals, and the latest time that the tablet has seen,
-are remembered too. So a clock that is set back opens nothing.
+A file is made whole or not at all, and reaches the disk before stimulation changes. So a killed process, a second process that starts at
+the same time, and a new bundle of the same slot all find it. Withdrawals, and the latest time that the tablet has seen, are remembered too.
+So a clock that is set back opens nothing.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ class Ran:
 
 
 def read_head(lines: Iterator[str], options: DecodeOptions) -> tuple[float, Ran | None, str, str | None]:
-    """Read the head of a file from its lines: the period, s, what ran, the head as it may be stored, and the nonce of a blinded log.
+    """Read the head of a file from its lines: the period, s, what ran, the head for storage, and the nonce of a blinded log.
 
     Raises:
         UndecodableFile: the head is cut, or of another version or period.

@@ -45,7 +45,7 @@ _WORD = re.compile(r"[^\W\d_]+")
 
 
 def preview_of(path: Source, key: bytes) -> dict[str, Any] | None:
-    """Show of a table what may be shown, as plain JSON; None for what is no table that a mapping could read.
+    """Make the preview of a table, as plain JSON; None for what is no table that a mapping could read.
 
     Args:
         path: the uploaded bytes.
