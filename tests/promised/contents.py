@@ -19,7 +19,7 @@ VISIT_FORM = "tests/app/pages/test_study_pages.py::test_a_visit_is_added_by_form
 CONTENTS: list[Promise] = [
     *of(
         "platform/bucket",
-        ("a machine with another key does not start", "            elif self._asked(lambda place=place: self._fs.cat_file(place)) != said:",
+        ("a machine with another key does not start", "            elif self._ask(lambda place=place: self._fs.cat_file(place)) != said:",
          "            elif False:", f"{BUCKET}::test_machines_with_other_keys_do_not_start"),
         ("a machine without the keys of the others makes none", "            if name in known and not (folder / name).exists():",
          "            if False:", f"{BUCKET}::test_machines_with_other_keys_do_not_start"),
