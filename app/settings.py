@@ -93,12 +93,12 @@ class Settings(BaseSettings):
         return self.data_dir / "jobs"
 
     def secret(self, name: str) -> bytes:
-        """A random key of this installation, made at first use and kept in the data folder, readable by the owner only."""
+        """Return a random key of this installation, made at first use and stored in the data folder, readable by the owner only."""
         return stored_secret(self.data_dir / "secrets", name)
 
 
 def stored_secret(folder: Path, name: str) -> bytes:
-    """A random key of 32 bytes in a folder of secrets; made at first use, also when several processes ask at once.
+    """Return a random key of 32 bytes in a folder of secrets; made at first use, also when several processes ask at once.
 
     Raises:
         RuntimeError: the file does not hold such a key.
@@ -114,7 +114,7 @@ def stored_secret(folder: Path, name: str) -> bytes:
 
 
 def written_once(path: Path, make: Callable[[], str]) -> str:
-    """The text of a file that only its owner reads. The first process writes it, all others read the same."""
+    """Return the text of a file that only its owner reads. The first process writes it, all others read the same."""
     if not path.exists():
         private_folder(path.parent)
         draft = path.with_name(f"{path.name}.{secrets.token_hex(4)}")
@@ -133,7 +133,7 @@ def written_once(path: Path, make: Callable[[], str]) -> str:
 
 
 def private_folder(path: Path) -> Path:
-    """Make a folder that only its owner may enter, and return it; one that stands open to others is closed."""
+    """Make a folder that only its owner may enter, and return it; one that is open to others is closed."""
     path.mkdir(parents=True, exist_ok=True, mode=0o700)
     info = path.stat()
     if info.st_mode & 0o077 and info.st_uid == os.geteuid():
@@ -143,5 +143,5 @@ def private_folder(path: Path) -> Path:
 
 @lru_cache(maxsize=1)
 def get_settings() -> Settings:
-    """The settings of this process."""
+    """Return the settings of this process."""
     return Settings()

@@ -18,17 +18,17 @@ from app.study.deps import CurrentParticipant
 
 
 def current_policy(policy_id: RowId, db: Db, caller: CurrentCaller) -> Policy:
-    """The policy that the path names."""
+    """Find the policy that the path names."""
     return repository.policy(db, policy_id, caller)
 
 
 def current_snapshot(snapshot_id: RowId, db: Db, caller: CurrentCaller) -> BufferSnapshot:
-    """The snapshot that the path names."""
+    """Find the snapshot that the path names."""
     return repository.snapshot(db, snapshot_id, caller)
 
 
 def current_own_policy(participant: CurrentParticipant, policy_id: RowId, db: Db, caller: CurrentCaller) -> Policy:
-    """The policy that the path names after its participant. Raises NotFound for another participant's."""
+    """Find the policy that the path names after its participant. Raises NotFound for another participant's."""
     policy = repository.policy(db, policy_id, caller)
     study.require_own(participant, policy, f"policy {policy_id}")
     return policy
@@ -42,7 +42,7 @@ CurrentSnapshot = Annotated[BufferSnapshot, Depends(current_snapshot)]
 
 
 def current_sweep(sweep_id: RowId, db: Db, caller: CurrentCaller) -> Sweep:
-    """The sweep that the path names."""
+    """Find the sweep that the path names."""
     return repository.sweep(db, sweep_id, caller)
 
 
@@ -50,7 +50,7 @@ CurrentSweep = Annotated[Sweep, Depends(current_sweep)]
 
 
 def sweep_viewed(sweep: CurrentSweep, db: Db) -> Iterator[None]:
-    """For routes that show what policies of a sweep are predicted to bring: the trail says who looked, as `app.study.deps` does."""
+    """Record who looked, for routes that show what policies of a sweep are predicted to bring, as `app.study.deps` does."""
     yield
     if record_view(db, "sweep", sweep.id):
         db.commit()

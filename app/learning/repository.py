@@ -18,7 +18,7 @@ from app.study.repository import count, in_scope
 
 
 def snapshot(db: Session, snapshot_id: int, caller: Caller) -> BufferSnapshot:
-    """A snapshot with its members. Raises NotFound."""
+    """Find a snapshot with its members. Raises NotFound."""
     row = db.scalar(
         select(BufferSnapshot)
         .join(Participant, Participant.id == BufferSnapshot.participant_id)
@@ -32,34 +32,34 @@ def snapshot(db: Session, snapshot_id: int, caller: Caller) -> BufferSnapshot:
 
 
 def snapshot_by_pins(db: Session, participant_id: int, pins_sha256: str) -> BufferSnapshot | None:
-    """The participant's snapshot with these pins."""
+    """Find the participant's snapshot with these pins."""
     return db.scalar(
         select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id, BufferSnapshot.pins_sha256 == pins_sha256)
     )
 
 
 def add_snapshot(db: Session, **columns: Any) -> int | None:
-    """Add a buffer snapshot; its number, or None where the participant has one of the same pins, made by somebody else meanwhile."""
+    """Add a buffer snapshot; its number, or None where the participant has one of the same pins, made by another process in between."""
     row = insert(BufferSnapshot).values(**columns).on_conflict_do_nothing(index_elements=["participant_id", "pins_sha256"])
     return db.scalar(row.returning(BufferSnapshot.id))
 
 
 def snapshots(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[BufferSnapshot], int]:
-    """A page of a participant's snapshots, newest first."""
+    """List a page of a participant's snapshots, newest first."""
     query = select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id)
     rows = db.scalars(query.order_by(BufferSnapshot.id.desc()).limit(limit).offset(offset).options(selectinload(BufferSnapshot.members)))
     return rows.all(), count(db, query)
 
 
 def newest_snapshot(db: Session, participant_id: int) -> BufferSnapshot | None:
-    """The snapshot that was taken last."""
+    """Find the snapshot that was taken last."""
     return db.scalar(
         select(BufferSnapshot).where(BufferSnapshot.participant_id == participant_id).order_by(BufferSnapshot.id.desc()).limit(1)
     )
 
 
 def newest_gate_decision(db: Session, participant_id: int) -> BufferGateDecision | None:
-    """The last word on the participant's buffer gate."""
+    """Find the newest decision on the participant's buffer gate."""
     return db.scalar(
         select(BufferGateDecision)
         .where(BufferGateDecision.participant_id == participant_id)
@@ -69,7 +69,7 @@ def newest_gate_decision(db: Session, participant_id: int) -> BufferGateDecision
 
 
 def policy(db: Session, policy_id: int, caller: Caller) -> Policy:
-    """A policy. Raises NotFound."""
+    """Find a policy. Raises NotFound."""
     row = db.scalar(
         select(Policy)
         .join(Participant, Participant.id == Policy.participant_id)
@@ -82,13 +82,13 @@ def policy(db: Session, policy_id: int, caller: Caller) -> Policy:
 
 
 def policies(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[Policy], int]:
-    """A page of a participant's policies, newest first."""
+    """List a page of a participant's policies, newest first."""
     query = select(Policy).where(Policy.participant_id == participant_id)
     return db.scalars(query.order_by(Policy.id.desc()).limit(limit).offset(offset)).all(), count(db, query)
 
 
 def policies_named(db: Session, participant_id: int, ids: Sequence[int]) -> list[Policy]:
-    """The participant's policies of these ids, in that order, each once. Raises NotFound naming those that are not there."""
+    """Find the participant's policies of these ids, in that order, each once. Raises NotFound naming those that are not there."""
     rows = {p.id: p for p in db.scalars(select(Policy).where(Policy.participant_id == participant_id, Policy.id.in_(ids)))}
     missing = sorted(set(ids) - set(rows))
     if missing:
@@ -99,7 +99,7 @@ def policies_named(db: Session, participant_id: int, ids: Sequence[int]) -> list
 
 
 def candidates(db: Session, participant_id: int) -> Sequence[Policy]:
-    """Policies that a ranking should hold: trained, distilled or made elsewhere, and not retired; oldest first.
+    """List policies that a ranking should have: trained, distilled or made elsewhere, and not retired; oldest first.
 
     Their curves and other metrics are read when something asks for them.
     """
@@ -107,7 +107,7 @@ def candidates(db: Session, participant_id: int) -> Sequence[Policy]:
 
 
 def candidate_names(db: Session, participant_id: int) -> dict[int, str]:
-    """Names of the same policies by their number, oldest first."""
+    """Map the same policies' numbers to their names, oldest first."""
     query = select(Policy.id, Policy.name).where(*_ranked(participant_id)).order_by(Policy.id)
     return {row.id: row.name for row in db.execute(query)}
 
@@ -117,17 +117,17 @@ def _ranked(participant_id: int) -> tuple[ColumnElement[bool], ...]:
 
 
 def policy_by_name(db: Session, participant_id: int, name: str) -> Policy | None:
-    """The participant's policy of a name."""
+    """Find the participant's policy of a name."""
     return db.scalar(select(Policy).where(Policy.participant_id == participant_id, Policy.name == name))
 
 
 def policy_of_step(db: Session, job_id: str, job_step: str) -> Policy | None:
-    """The policy that a step of a job made."""
+    """Find the policy that a step of a job made."""
     return db.scalar(select(Policy).where(Policy.job_id == job_id, Policy.job_step == job_step))
 
 
 def baselines(db: Session, participant_id: int) -> Sequence[Policy]:
-    """The participant's baseline policies that are in use, oldest first."""
+    """List the participant's baseline policies that are in use, oldest first."""
     return db.scalars(
         select(Policy)
         .where(Policy.participant_id == participant_id, Policy.kind == "baseline", Policy.retired_reason.is_(None))
@@ -136,7 +136,7 @@ def baselines(db: Session, participant_id: int) -> Sequence[Policy]:
 
 
 def trained_count(db: Session, participant_id: int) -> int:
-    """How many policies were trained for the participant; call under `lock_participant` to number the next."""
+    """Count the policies trained for the participant; call under `lock_participant` to number the next."""
     query = select(func.count()).select_from(Policy).where(Policy.participant_id == participant_id, Policy.kind == "trained")
     return db.scalar(query) or 0
 
@@ -147,19 +147,19 @@ def lock_participant(db: Session, participant_id: int) -> None:
 
 
 def names_in_use(db: Session, participant_id: int, prefix: str) -> set[str]:
-    """Names of the participant's policies that begin so."""
+    """List names of the participant's policies that begin so."""
     return set(
         db.scalars(select(Policy.name).where(Policy.participant_id == participant_id, or_(Policy.name.startswith(prefix, autoescape=True))))
     )
 
 
 def snapshot_members(db: Session, snapshot_id: int) -> Sequence[SnapshotSession]:
-    """The sessions of a snapshot, left-out ones among them."""
+    """List the sessions of a snapshot, excluded ones among them."""
     return db.scalars(select(SnapshotSession).where(SnapshotSession.snapshot_id == snapshot_id).order_by(SnapshotSession.session_id)).all()
 
 
 def sweep(db: Session, sweep_id: int, caller: Caller) -> Sweep:
-    """A sweep with its policies. Raises NotFound."""
+    """Find a sweep with its policies. Raises NotFound."""
     row = db.scalar(
         select(Sweep)
         .join(Participant, Participant.id == Sweep.participant_id)
@@ -173,17 +173,17 @@ def sweep(db: Session, sweep_id: int, caller: Caller) -> Sweep:
 
 
 def sweeps(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[Sweep], int]:
-    """A page of a participant's sweeps, newest first."""
+    """List a page of a participant's sweeps, newest first."""
     query = select(Sweep).where(Sweep.participant_id == participant_id)
     rows = db.scalars(query.order_by(Sweep.id.desc()).limit(limit).offset(offset).options(selectinload(Sweep.policies)))
     return rows.all(), count(db, query)
 
 
 def sweep_of_job(db: Session, job_id: str) -> Sweep | None:
-    """The sweep that a job made."""
+    """Find the sweep that a job made."""
     return db.scalar(select(Sweep).where(Sweep.job_id == job_id))
 
 
 def sweep_names(db: Session, participant_id: int) -> set[str]:
-    """Names of the participant's sweeps."""
+    """List the names of the participant's sweeps."""
     return set(db.scalars(select(Sweep.name).where(Sweep.participant_id == participant_id)))

@@ -26,7 +26,7 @@ from app.study.models import Participant
 
 
 def policy_out(db: Session, p: Policy, participant: Participant) -> PolicyOut:
-    """A policy for the API."""
+    """Convert a policy for the API."""
     return PolicyOut(
         id=p.id,
         participant=participant.code,
@@ -50,7 +50,7 @@ def policy_out(db: Session, p: Policy, participant: Participant) -> PolicyOut:
 
 
 def snapshot_out(db: Session, s: BufferSnapshot, participant: Participant) -> SnapshotOut:
-    """A snapshot for the API."""
+    """Convert a snapshot for the API."""
     return SnapshotOut(
         id=s.id,
         participant=participant.code,
@@ -70,7 +70,7 @@ def snapshot_out(db: Session, s: BufferSnapshot, participant: Participant) -> Sn
 
 
 def gate_out(found: gates.Gate) -> GateOut:
-    """The gate for the API."""
+    """Convert the gate for the API."""
     decision = found.decision
     return GateOut(
         open=found.is_open,
@@ -104,7 +104,7 @@ def _baseline(row: dict[str, Any]) -> BaselineScoreOut:
 
 
 def sweep_out(db: Session, sweep: Sweep) -> SweepOut:
-    """A sweep for the API."""
+    """Convert a sweep for the API."""
     return SweepOut(
         id=sweep.id,
         participant=db.get_one(Participant, sweep.participant_id).code,

@@ -14,7 +14,7 @@ from app.platform.jobs import JobContext
 
 
 def run_pipeline(job: JobContext) -> dict[str, Any]:
-    """Snapshot, train, distil, fit the DLSM, estimate, rank. Training and fitting run side by side."""
+    """Run all steps: snapshot, train, distil, fit the DLSM, estimate, rank. Training and fitting run side by side."""
     params = PipelineParams.model_validate(job.params)
     training, evaluation = params.training(), params.evaluation()
     job.step(PLAN, "Pin the sessions to learn from", weight=STORE_WEIGHT)

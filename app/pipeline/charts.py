@@ -36,7 +36,7 @@ SHARE_CURVES = {"dlsm_paper_loss", "dlsm_paper_held_out_score", "dlmm_loss", "dl
 
 
 def job_curves(job: Job, events: Sequence[JobEvent]) -> list[Chart]:
-    """The learning curves of a job's steps; of a step that was resumed, the last point of an x counts."""
+    """Draw the learning curves of a job's steps; of a step that was resumed, the last point of an x counts."""
     curves: dict[str, dict[str, dict[float, float]]] = defaultdict(lambda: defaultdict(dict))
     for event in events:
         for point in event.data.get("points", []):
@@ -49,7 +49,8 @@ def job_curves(job: Job, events: Sequence[JobEvent]) -> list[Chart]:
 
 
 def _of_member(name: str) -> tuple[str, str]:
-    """A curve of several policies trained side by side ends in `_1`, `_2`, ...: its name, and ` · 1` for the line's label."""
+    """Split the name of a curve of several policies trained side by side (`_1`, `_2`, ...) into its name and ` · 1` for the line's
+    label."""
     curve, _, number = name.rpartition("_")
     return (curve, f" · {number}") if number.isdigit() and curve in JOB_CURVES else (name, "")
 

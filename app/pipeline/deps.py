@@ -23,7 +23,7 @@ class ParticipantJob:
 
 
 def current_job(job_id: Annotated[str, Path(pattern=r"^[0-9a-fA-F-]{1,36}$")], db: Db, caller: CurrentCaller) -> ParticipantJob:
-    """The job that the path names. Raises NotFound for a job of a participant that the caller may not see."""
+    """Find the job that the path names. Raises NotFound for a job of a participant that the caller may not see."""
     job = jobs.get(db, job_id)
     participant = db.get(Participant, job.participant_id) if job.participant_id is not None else None
     if participant is None:

@@ -37,7 +37,7 @@ def declare_distillation(job: JobContext, count: int) -> None:
 
 
 def distil_all(job: JobContext, params: DistilParams, snapshot: dict[str, Any], teachers: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The distillation stage; returns ids, names and files of the students."""
+    """Run the distillation stage; returns ids, names and files of the students."""
     calls: list[ComputeStep] = [
         (
             f"distil/{k}",
@@ -61,7 +61,7 @@ def distil_all(job: JobContext, params: DistilParams, snapshot: dict[str, Any], 
 
 
 def teachers(db: Session, participant_id: int, params: DistilParams) -> list[Policy]:
-    """The policies to distil.
+    """Choose the policies to distil.
 
     Raises:
         NotFound: no such policy. Invalid: a baseline, or nothing to distil.

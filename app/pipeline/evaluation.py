@@ -139,7 +139,8 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
 
 
 def _fitted(params: EvaluateParams) -> list[str]:
-    """Methods with a compute step: all but the combination, which is computed from their estimates; the posterior always, as it ranks."""
+    """List methods with a compute step: all but the combination, which is computed from their estimates; the posterior always, as it
+    ranks."""
     return [m for m in dict.fromkeys([*params.methods, POSTERIOR]) if m != AGGREGATE]
 
 

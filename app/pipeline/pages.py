@@ -63,7 +63,7 @@ VALUE_NAMES = {
 
 @router.get("/participants/{code}/jobs")
 def jobs_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
-    """Jobs of a participant, and the form to start one."""
+    """Show jobs of a participant, and the form to start one."""
     return _jobs(request, participant, db, caller, paging.limit, paging.offset)
 
 
@@ -91,7 +91,7 @@ def start_job(request: Request, participant: CurrentParticipant, db: Db, caller:
 
 @router.get("/jobs")
 def all_jobs_page(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
-    """Jobs of every participant that the caller may read: those at work or waiting, then those that ended."""
+    """Show jobs of every participant that the caller may read: those at work or waiting, then those that ended."""
     participants, _ = study.participants(db, caller, MOST_PARTICIPANTS, 0)
     codes = {p.id: p.code for p in participants}
     live, _ = jobs.find(db, status=jobs.LIVE, limit=MOST_LIVE, participants=codes)
@@ -117,7 +117,7 @@ def all_jobs_page(request: Request, db: Db, caller: CurrentCaller, paging: Pagin
 
 @router.get("/jobs/{job_id}")
 def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """One job: progress, learning curves, log."""
+    """Show one job: progress, learning curves, log."""
     events = jobs.events_after(db, found.job.id, 0, SHOWN_EVENTS)
     steps = list(zip(found.job.steps, numbered([s.title for s in found.job.steps]), strict=True))
     page = render(
@@ -166,7 +166,7 @@ def _jobs(
     given: dict[str, Any] | None = None,
 ) -> HTMLResponse:
     rows, total = jobs.find(db, participant.id, limit=limit, offset=offset)
-    # what keeps every job from starting is said before anybody tries
+    # what keeps every job from starting is shown before anyone tries
     said = error or not_ready(db, participant)
     page = render(
         request,
@@ -203,7 +203,7 @@ def _titles() -> dict[str, str]:
 
 
 def _in_words(params: dict[str, Any]) -> list[tuple[str, str]]:
-    """What was asked for, by the names that its form has; what was left open is left out."""
+    """List what was asked for, by the names of its form; what was left open is omitted."""
     return [(PARAM_NAMES.get(name, name.replace("_", " ")), _value(name, v)) for name, v in params.items() if v is not None and v != []]
 
 

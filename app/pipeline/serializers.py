@@ -9,7 +9,7 @@ from app.study.models import Participant
 
 
 def job_out(job: Job, participant: Participant) -> JobOut:
-    """A job for the API."""
+    """Convert a job for the API."""
     return JobOut(
         id=job.id,
         kind=job.kind,

@@ -32,8 +32,8 @@ def start_job(
 ) -> Started:
     """Put a job of this participant on the queue, unless the same one is there: a request that is sent twice starts one job.
 
-    Given instead is one that has not ended: of a kind of which there is one at a time, whatever it was asked for; of others one with the
-    same params and data, unless another is asked for by `again`.
+    Instead a job may be returned that has not ended. Of a kind with one job at a time, it is that job, whatever it was asked for. Of others
+    it is one with the same params and data, unless `again` asks for another.
 
     Raises:
         UnknownKind: there is no such kind. Invalid: params that break its schema, or something that it requires is not there.
@@ -56,7 +56,8 @@ def start_job(
 
 
 def _same(db: Session, participant: Participant, live: Job, params: BaseModel) -> bool:
-    """Whether a job that has not ended does what these params ask for; one that waits reads its data when it begins, as a new one would."""
+    """Decide whether a job that has not ended does what these params ask for. One that waits reads its data when it begins, as a new one
+    would."""
     if live.cancel_requested_at is not None or live.params != params.model_dump(mode="json"):
         return False
     planned = next((s for s in live.steps if s.key == PLAN and s.result is not None), None)
@@ -69,7 +70,7 @@ def _same(db: Session, participant: Participant, live: Job, params: BaseModel) -
 
 
 def retry_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
-    """A new job with the same params, whichever else is at work.
+    """Start a new job with the same params, whichever else is at work.
 
     Raises:
         Conflict: the job has not ended, or another one repeats it. NotFound: it is another participant's.

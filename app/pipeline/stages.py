@@ -1,4 +1,4 @@
-"""What the stages of every job share: the participant, the snapshot that everything rests on, facts that later steps need."""
+"""Common part of the stages of every job: the participant, the snapshot that everything rests on, facts that later steps need."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ ComputeStep = tuple[str, str, dict[str, Any]]
 
 
 def acting(job: JobContext) -> Caller:
-    """Whoever submitted the job; what it may do was checked then."""
+    """Return the caller who submitted the job; what it may do was checked then."""
     return Caller(label=job.created_by, user_id=None, grants=(), is_system=True)
 
 
 def participant_of(db: Session, job: JobContext) -> Participant:
-    """The job's participant."""
+    """Find the job's participant."""
     if job.participant_id is None:
         raise Invalid(f"A job of kind '{job.kind}' needs a participant.", "Start it from the participant's page.")
     return db.get_one(Participant, job.participant_id)
 
 
 def take_snapshot(job: JobContext, db: Session) -> BufferSnapshot:
-    """The snapshot that everything in this job rests on."""
+    """Take the snapshot that everything in this job rests on."""
     return snapshots.take_snapshot(db, participant_of(db, job), acting(job))
 
 
 def snapshot_facts(db: Session, snapshot: BufferSnapshot) -> dict[str, Any]:
-    """What later steps need to know of a snapshot, and the margins and levels by which its participant's policies are judged."""
+    """Collect what later steps need to know of a snapshot, and the margins and levels for assessing its participant's policies."""
     participant = db.get_one(Participant, snapshot.participant_id)
     levels = participant.current_margins
     margins = asdict(margins_of(participant.margins_in_force)) | {"test_within": levels.test_within, "unsafe_beyond": levels.unsafe_beyond}
@@ -53,7 +53,7 @@ def snapshot_facts(db: Session, snapshot: BufferSnapshot) -> dict[str, Any]:
 
 
 def plan_on_snapshot(job: JobContext, more: Callable[[Session, BufferSnapshot], dict[str, Any]] | None = None) -> dict[str, Any]:
-    """The first step of every kind: take the snapshot and, in the same transaction, read what decides on the steps that follow.
+    """Run the first step of every kind: take the snapshot and, in the same transaction, read what decides on the steps that follow.
 
     Returns:
         `snapshot`, its facts, and what `more` gives.
@@ -67,5 +67,5 @@ def plan_on_snapshot(job: JobContext, more: Callable[[Session, BufferSnapshot], 
 
 
 def policy_facts(policies: Sequence[Policy]) -> list[dict[str, Any]]:
-    """Ids, names and files of policies."""
+    """List ids, names and files of policies."""
     return [{"id": p.id, "name": p.name, "sha256": p.onnx_sha256} for p in policies]

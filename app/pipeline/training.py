@@ -39,12 +39,12 @@ def run_train(job: JobContext) -> dict[str, Any]:
 
 
 def training_plan(db: Session, snapshot: BufferSnapshot, params: TrainParams, caller: Caller) -> dict[str, Any]:
-    """What the training stage reads before it begins: `starts` and `tested_so_far`, as the functions give them."""
+    """Read what the training stage needs before it begins: `starts` and `tested_so_far`, as the functions give them."""
     return {"starts": training_starts(db, snapshot.participant_id, params), "tested_so_far": tested_so_far(db, snapshot, caller)}
 
 
 def tested_so_far(db: Session, snapshot: BufferSnapshot, caller: Caller) -> dict[str, Any]:
-    """What sessions of policies showed, as the evaluation of the same snapshot would know it; sweeps go by it too.
+    """Collect what sessions of policies showed, as the evaluation of the same snapshot would know it; sweeps use it too.
 
     Returns:
         `tests`, as `Tested` has them, and `policies` that they are of, retired ones too, as [{`id`, `sha256`}].
@@ -54,7 +54,7 @@ def tested_so_far(db: Session, snapshot: BufferSnapshot, caller: Caller) -> dict
 
 
 def training_starts(db: Session, participant_id: int, params: TrainParams) -> list[dict[str, Any] | None]:
-    """Where each training starts: None from scratch, else the parent's id, algorithm and files.
+    """Find the start of each training: None from scratch, else the parent's id, algorithm and files.
 
     Raises:
         NotFound: no such policy. Invalid: a policy that cannot be trained further, or takes other windows than the settings say.

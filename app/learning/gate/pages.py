@@ -29,7 +29,7 @@ LABELS = {"reason": "Reason", "choice": "Decision"}
 
 @router.get("/participants/{code}/buffer-gate", dependencies=[ResultsViewed])
 def gate_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """Whether sessions of learned policies enter the replay buffer, the tests behind it, and the form to decide otherwise."""
+    """Show whether sessions of learned policies enter the replay buffer, the tests behind it, and the form to decide otherwise."""
     return _page(request, participant, db, caller)
 
 

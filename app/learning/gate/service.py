@@ -1,8 +1,8 @@
 """The gate of the replay buffer: sessions of learned policies enter once their QoCs are significantly better than the random controller's.
 
-Source: Gao et al. 2023, section 4.1, which names no test. Ours: for each QoC that counts in r_end, a one-sided rank-sum test of all RL and
-distilled sessions against all random ones, Holm-adjusted; the gate opens when at least one QoC is better and none is worse. A clinician
-may decide otherwise with a reason; the decision stays on record and holds until the next one.
+Source: Gao et al. 2023, section 4.1, which names no test. Ours: each QoC that counts in r_end has a one-sided rank-sum test of all RL and
+distilled sessions against all random ones, Holm-adjusted. The gate opens when at least one QoC is better and none is worse. A clinician may
+decide otherwise with a reason; the decision stays on record and applies until the next one.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ class QocTest:
 
     @property
     def tested(self) -> bool:
-        """Whether there were enough sessions for a test."""
+        """True where there were enough sessions for a test."""
         return self.p_better is not None
 
 
 @dataclass(frozen=True)
 class Gate:
-    """Whether sessions of learned policies may enter the buffer, and on what grounds.
+    """Decision whether sessions of learned policies may enter the buffer, with its reasons.
 
     Attributes:
         tests: one per QoC that counts.
         opened_by_test: what the tests say.
-        decision: the clinician's last word; None where nobody has decided.
+        decision: the clinician's newest decision; None where there is none.
     """
 
     tests: tuple[QocTest, ...]
@@ -79,7 +79,7 @@ class Gate:
 
 
 def gate(db: Session, participant: Participant, sessions: Sequence[StudySession]) -> Gate:
-    """The gate as the participant's confirmed sessions have it, less excluded ones and those of a plan whose key is sealed."""
+    """Determine the gate from the participant's confirmed sessions, without excluded ones and those of a plan whose key is sealed."""
     live = [s for s in sessions if s.status == "confirmed" and not s.excluded_reason and not s.visit.sealed]
     arms = [(s, blinding.arm(s, SYSTEM).controller) for s in live]
     learned = [s for s, controller in arms if controller in LEARNED]
@@ -124,7 +124,7 @@ def _values(sessions: Sequence[StudySession], outcome: Outcome) -> list[float]:
 
 
 def _adjusted(tests: Sequence[QocTest]) -> tuple[QocTest, ...]:
-    """Both families of p-values by Holm's method, over the QoCs that could be tested."""
+    """Adjust both families of p-values by Holm's method, over the QoCs that could be tested."""
     tested = [t for t in tests if t.tested]
     better, worse = (iter(holm([getattr(t, name) for t in tested])) for name in ("p_better", "p_worse"))
     return tuple(t if not t.tested else replace(t, p_better=next(better), p_worse=next(worse)) for t in tests)

@@ -1,4 +1,4 @@
-"""Controllers without learning, as policies of a participant, that every ranking shows beside its candidates.
+"""Controllers without learning, as policies of a participant, that every ranking compares with its candidates.
 
 They are ONNX files like any other policy, so that they are estimated, bundled and tested in the same way.
 """
@@ -23,7 +23,7 @@ from ml.policies.policy import ProportionalPolicy
 from ml.trajectories import ReplayBuffer
 
 CONSTANTS = (1.0, 0.85, 0.7, 0.55, 0.4)
-"""Amplitude fractions held constant: cDBS, and a grid from which a ranking names the best."""
+"""Constant amplitude fractions: cDBS, and a grid from which a ranking names the best."""
 
 _OPSET, _IR_VERSION = 17, 8
 
@@ -31,9 +31,9 @@ _OPSET, _IR_VERSION = 17, 8
 def ensure_baselines(
     db: Session, participant: Participant, snapshot: BufferSnapshot, buffer: ReplayBuffer, created_by: str
 ) -> list[Policy]:
-    """The participant's baseline policies, made where they are missing: constants once per window length, and proportional control
-    between quantiles of the beta amplitudes (0.25 and 0.9), made once from the first snapshot in a unit and source of beta. With them
-    the clone of the snapshot's logged behaviour, where a sweep has made one.
+    """Return the participant's baseline policies and make missing ones. Constants are made once per window length. Proportional control
+    between quantiles of the beta amplitudes (0.25 and 0.9) is made once from the first snapshot in a unit and source of beta. The clone of
+    the snapshot's logged behaviour is added where a sweep has made one.
     """
     window = buffer.settings.window
     made = {p.name: p for p in repository.baselines(db, participant.id)}
@@ -56,7 +56,7 @@ def ensure_baselines(
 
 
 def constant_onnx(amplitude: float, window: int) -> bytes:
-    """A policy file that answers every beta window with the same amplitude fraction."""
+    """Write a policy file that answers every beta window with the same amplitude fraction."""
     shape = [
         helper.make_node("Shape", ["beta_window"], ["shape"]),
         helper.make_node("Gather", ["shape", "first"], ["count"]),
@@ -72,7 +72,7 @@ def constant_onnx(amplitude: float, window: int) -> bytes:
 
 
 def proportional_onnx(policy: ProportionalPolicy, window: int) -> bytes:
-    """A policy file of proportional control."""
+    """Write a policy file of proportional control."""
     gain = (1 - policy.floor) / (policy.high - policy.low)
     nodes = [
         helper.make_node("Slice", ["beta_window", "start", "stop", "axis"], ["newest"]),
@@ -89,7 +89,7 @@ def proportional_onnx(policy: ProportionalPolicy, window: int) -> bytes:
 
 
 def _proportional(buffer: ReplayBuffer) -> ProportionalPolicy | None:
-    """Proportional control for this buffer; None where beta has no spread to be proportional to."""
+    """Build proportional control for this buffer; None where beta has no spread to be proportional to."""
     try:
         return proportional_from_buffer(buffer)
     except ValueError:

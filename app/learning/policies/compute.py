@@ -1,4 +1,4 @@
-"""What is done to a policy file of strangers: it is opened and run. Runs in a limited child, never in the web process."""
+"""Opening and running of a foreign policy file. Runs in a limited child, never in the web process."""
 
 from __future__ import annotations
 

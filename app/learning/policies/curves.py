@@ -17,7 +17,7 @@ CURVES = {
 
 
 def curve_charts(curve: Mapping[str, Sequence[float]], of: str) -> list[Chart]:
-    """A chart for each learning curve of a policy."""
+    """Make a chart for each learning curve of a policy."""
     updates = curve.get("update", [])
     charts = []
     for name, (title, unit) in CURVES.items():

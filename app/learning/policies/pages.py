@@ -33,7 +33,7 @@ LABELS = {"name": "Name"}
 
 @router.get("/participants/{code}/policies")
 def policies_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
-    """All policies of a participant, and the form for one made elsewhere."""
+    """Show all policies of a participant, and the form for one made elsewhere."""
     return _policies(request, participant, db, caller, paging.limit, paging.offset)
 
 
@@ -61,7 +61,7 @@ def add_policy(
 
 @router.get("/snapshots/{snapshot_id}")
 def snapshot_page(request: Request, snapshot: CurrentSnapshot, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """What a snapshot's buffer covers."""
+    """Show what a snapshot's buffer covers."""
     participant = db.get_one(Participant, snapshot.participant_id)
     return HTMLResponse(render(request, "learning/snapshot.html", participant=participant, view=describe(db, snapshot, caller)))
 

@@ -33,13 +33,13 @@ UPLOAD_LIMIT = MAX_FILE_BYTES
 
 
 def window_of(policy: Policy) -> int:
-    """W that a policy takes: what an uploaded one was tried with, else what its file says."""
+    """Find the W that a policy takes: what an uploaded one was tried with, else what its file says."""
     own = policy.config.get("window") if policy.kind == "external" else None
     return int(own) if own else OnnxPolicy(onnx_of(policy)).window
 
 
 def onnx_of(policy: Policy) -> bytes:
-    """The stored ONNX file of a policy. Raises Invalid, naming the policy, where it is missing or damaged."""
+    """Read the stored ONNX file of a policy. Raises Invalid, naming the policy, where it is missing or damaged."""
     try:
         return files.read(policy.onnx_sha256)
     except files.MissingFile as error:
@@ -61,7 +61,7 @@ def require_window(policy: Policy, window: int) -> None:
 def add_external(db: Session, participant: Participant, name: str, content: bytes, file_name: str, caller: Caller) -> Policy:
     """Store a policy made elsewhere. It is tried, in a child, on beta windows of many scales, and on the participant's own if any.
 
-    The file's name, which may name a person, stands in the answer to a bad file alone and is not kept.
+    The file's name, which may name a person, is part of the answer to a bad file alone and is not stored.
 
     Raises:
         Invalid: the file is no such policy; says what is wrong with it. Conflict: the name is taken.
@@ -118,7 +118,7 @@ def retire(db: Session, participant: Participant, policy: Policy, reason: str | 
 def store_students(
     db: Session, job_id: str, created_by: str, snapshot: BufferSnapshot, steps: Sequence[tuple[str, dict[str, Any], Path, int]]
 ) -> list[Policy]:
-    """Students of a job's distillation steps, each with its key, result, working folder and teacher.
+    """Store the students of a job's distillation steps, each with its key, result, working folder and teacher.
 
     A step whose student is there already gives that one.
     """
@@ -138,7 +138,7 @@ def store_students(
 
 
 def probe_windows(snapshot: BufferSnapshot | None, settings: SettingsVersion) -> NDArray[np.float64]:
-    """Beta windows for test vectors: spread over the snapshot's states; without one, ramps around the threshold."""
+    """Choose beta windows for test vectors: spread over the snapshot's states; without one, ramps around the threshold."""
     if snapshot is not None:
         states = read_buffer(snapshot.file_sha256).transitions().states
         return np.asarray(states[np.unique(np.linspace(0, len(states) - 1, BUNDLE_TEST_WINDOWS).astype(int))])
@@ -169,7 +169,7 @@ def _student_row(job_id: str, created_by: str, snapshot: BufferSnapshot, key: st
 
 
 def free_name(db: Session, participant_id: int, wish: str) -> str:
-    """The wish, or with the first free number behind it."""
+    """Return the wanted name, or with the first free number behind it."""
     taken = repository.names_in_use(db, participant_id, wish)
     if wish not in taken:
         return wish

@@ -9,7 +9,7 @@ from app.platform.errors import TooLarge
 
 
 def read_limited(file: UploadFile) -> bytes:
-    """The bytes of an uploaded policy. Raises TooLarge."""
+    """Read the bytes of an uploaded policy. Raises TooLarge."""
     content = file.file.read(service.UPLOAD_LIMIT + 1)
     if len(content) > service.UPLOAD_LIMIT:
         raise TooLarge(

@@ -7,5 +7,5 @@ from ml.trajectories import ReplayBuffer, from_parquet
 
 
 def read_buffer(sha256: str) -> ReplayBuffer:
-    """A stored snapshot's buffer, by the hash of its file."""
+    """Read a stored snapshot's buffer, by the hash of its file."""
     return from_parquet(files.read(sha256))

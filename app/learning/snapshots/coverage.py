@@ -1,4 +1,4 @@
-"""What a snapshot's buffer covers: amplitudes, beta, sessions per controller and visit, and what stayed outside."""
+"""Coverage of a snapshot's buffer: amplitudes, beta, sessions per controller and visit, and what stayed outside."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ml.trajectories import ReplayBuffer
 
 AMPLITUDE_BINS = 20
 HIDDEN = "hidden"
-"""Stands for the controller of a session whose plan's key is sealed."""
+"""Replaces the controller of a session whose plan's key is sealed."""
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
@@ -70,7 +70,7 @@ def describe(db: Session, snapshot: BufferSnapshot, caller: Caller) -> SnapshotV
     for member in snapshot.members:
         session = sessions[member.session_id]
         if member.left_out_reason is None:
-            # a plan may be signed over sessions which an earlier snapshot holds: of these the visit alone is told
+            # a plan may be signed over sessions of an earlier snapshot: of these only the visit is shown
             arm = blinding.arm(session, caller) if blinding.unsealed([session]) else None
             by_visit.setdefault(session.visit.number, Counter())[arm.controller.value if arm else HIDDEN] += 1
     present = {name for counts in by_visit.values() for name in counts}
@@ -112,7 +112,7 @@ def _amplitude_chart(buffer: ReplayBuffer) -> Chart:
 
 
 def _beta_chart(buffer: ReplayBuffer) -> Chart:
-    """Quantiles of beta per session, oldest session first, with the threshold."""
+    """Draw quantiles of beta per session, oldest session first, with the threshold."""
     unit, xi = buffer.beta_unit, buffer.settings.xi_beta
     labels = [f"visit {s.visit} · {s.session_id}" for s in buffer.sessions]
     quantiles = np.array([np.nanquantile(s.beta, QUANTILES) for s in buffer.sessions])

@@ -1,4 +1,4 @@
-"""Buffer snapshots: which sessions a result may rest on, the version of everything in them, and why the others were left out.
+"""Buffer snapshots: which sessions a result may rest on, the version of everything in them, and why the others were excluded.
 
 Every confirmed session is looked at. What cannot enter is kept in the snapshot's list with its reason. Sessions of learned policies enter
 when the gate is open (`app.learning.gate.service`).
@@ -60,7 +60,7 @@ class Member:
     left_out: str | None
 
     def pins(self) -> list[Any]:
-        """Everything of this session that a result depends on."""
+        """List everything of this session that a result depends on."""
         table, s = self.table, self.trajectory
         arm = blinding.arm(self.session, SYSTEM)
         hours = hours_since_dose(self.session)
@@ -93,7 +93,7 @@ class Member:
 
     @property
     def steps(self) -> int | None:
-        """Usable steps; None where the session is left out."""
+        """Usable steps; None where the session is excluded."""
         return int(self.trajectory.usable().sum()) if self.trajectory else None
 
 
@@ -133,12 +133,12 @@ class Collection:
 
 
 def collect(db: Session, participant: Participant, sessions: Sequence[StudySession] | None = None) -> Collection:
-    """The buffer of the participant as the data are now; nothing is stored.
+    """Collect the buffer of the participant from the current data; nothing is stored.
 
     `sessions`: the confirmed ones, where they are at hand.
 
     Raises:
-        Invalid: no beta threshold yet (with a suggestion from the data), one without a unit and source, or no session with a usable step
+        Invalid: no beta threshold yet (with a suggestion from the data), or one without a unit and source. Or no session has a usable step
             (with the reasons).
     """
     version = participant.current_settings
@@ -166,10 +166,11 @@ def collect(db: Session, participant: Participant, sessions: Sequence[StudySessi
 
 
 def not_ready(db: Session, participant: Participant) -> Invalid | None:
-    """Why nothing can be learned or estimated yet; None when it can.
+    """Explain why nothing can be learned or estimated yet; None when it can.
 
-    Kept by this process until a row of the participant's sessions or settings changes, or the gate is decided on, or another session has
-    the minutes of one first, or a visit is sealed or opened: to find it out, every trace is read.
+    The result is cached by this process, since every trace is read for it. The cache ends when a row of the participant's sessions or
+    settings changes, the gate is decided on, or a visit is sealed or opened. It also ends when another session has the minutes of one
+    first.
     """
     sessions = session_repository.ReadOnce(db, participant.id)
     decision = repository.newest_gate_decision(db, participant.id)
@@ -191,7 +192,7 @@ def not_ready(db: Session, participant: Participant) -> Invalid | None:
 
 
 def take_snapshot(db: Session, participant: Participant, caller: Caller) -> BufferSnapshot:
-    """Store the buffer as it is now; when nothing it depends on has changed, the snapshot that already pins it.
+    """Store the current buffer; when nothing it depends on has changed, return the snapshot that already pins it.
 
     Two transactions at once get one row: the unique pins make the later one wait for, and then find, the other's.
 
@@ -229,7 +230,7 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
 
 
 def _mend(db: Session, snapshot: BufferSnapshot, found: Collection) -> None:
-    """Make a snapshot's missing or damaged file anew, where the same data still give the same bytes; else whoever reads it is told."""
+    """Restore a snapshot's missing or damaged file, where the same data still give the same bytes; else its readers get an error."""
     if not files.is_whole(snapshot.file_sha256):
         content = to_parquet(found.buffer)
         same = hashlib.sha256(content).hexdigest() == snapshot.file_sha256
@@ -241,7 +242,7 @@ def _mend(db: Session, snapshot: BufferSnapshot, found: Collection) -> None:
 def _read(db: Session, session: StudySession, version: SettingsVersion, traces: TracesOf, failed: Qoc) -> Member:
     """The session's trajectory, or the first reason of its own against it."""
     if session.visit.sealed:
-        return Member(session, None, None, SEALED)  # how much was learnt from it, and what, would tell what ran
+        return Member(session, None, None, SEALED)  # how much was learnt from it, and what, would reveal what ran
     try:
         table = session_data(db, session, traces).table
     except Invalid as error:
@@ -265,7 +266,7 @@ def _why_unusable(trajectory: SessionTrajectory, table: StepTable) -> str:
 
 
 def _signal(version: SettingsVersion, read: list[Member]) -> tuple[str, str]:
-    """The one unit and source of beta for the buffer, as the settings state them.
+    """Return the one unit and source of beta for the buffer, as the settings state them.
 
     Raises:
         Invalid: they do not. A threshold without a unit judges no trace, and every reward rests on it.
@@ -339,7 +340,7 @@ def _row(snapshot_id: int, m: Member) -> SnapshotSession:
 
 
 def _digest(s: SessionTrajectory) -> str:
-    """Hash of a trajectory's numbers: catches every change that the row numbers do not show, such as a moved segment."""
+    """Hash a trajectory's numbers: this catches every change that the row numbers do not show, such as a moved segment."""
     digest = hashlib.sha256()
     for values in (s.lead_beta, s.beta, s.amplitude):
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes() + b"|")

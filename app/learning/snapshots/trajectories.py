@@ -48,7 +48,7 @@ def trajectory_of(session: StudySession, table: StepTable, arm: Arm, version: Se
 
 
 def own_reason(session: StudySession, table: StepTable) -> str | None:
-    """The first reason of the session's own against reading its steps; None where there is none."""
+    """Find the first reason of the session's own against reading its steps; None where there is none."""
     if session.excluded_reason:
         return f"excluded by a person: {session.excluded_reason}"
     if table.beta_trace is None:

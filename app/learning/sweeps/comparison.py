@@ -1,4 +1,4 @@
-"""How the policies of a sweep compare: on sessions that they did not learn from, with each other and with controllers without learning."""
+"""Comparison of the policies of a sweep: on held-out sessions, with each other and with controllers without learning."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CURVES = (
     ("curve", "mean_q", "Promised return of the policy", "reward; an unbounded climb is over-estimation"),
     ("curve", "action_distance", "Distance from the recorded amplitudes", "mean absolute difference, fraction of cDBS"),
 )
-"""Where a curve stands in a policy's metrics, its name there, its title and unit."""
+"""Place of a curve in a policy's metrics, its name there, its title and unit."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Candidate:
         best_update: the update whose state was chosen; None: the last.
         rate: the policy's learning rate. seed: of its training.
         gain: estimated return less that of cDBS, with its lower bound; None where it was not estimated.
-        by_posterior: whether the posterior estimated it; sweeps of before have gains by fitted Q evaluation, which decide nothing.
-        supported, told: whether sessions lie near what the policy does, and whether they can order policies at all.
-        within, saves, expected_saving: probability that every known outcome keeps its margin, share of cDBS's energy that the policy is
-            predicted to save, and their product; None where unknown, as in sweeps of before.
+        by_posterior: whether the posterior estimated it; older sweeps have gains by fitted Q evaluation, which decide nothing.
+        `supported`, `told`: whether sessions are near what the policy does, and whether they can order policies at all.
+        within: probability that every known outcome keeps its margin. saves: share of cDBS's energy that the policy is predicted to save.
+            expected_saving: their product. None where unknown, as in older sweeps.
         beyond: whether an outcome is as probably beyond its margin as makes a verdict *unsafe*; None where that was not asked.
         below: the lower bound B of the buffer's random sessions, and the share of its states answered with less; None where unknown.
     """
@@ -76,15 +76,16 @@ class Candidate:
 
     @property
     def leaves_the_logged_range(self) -> bool:
-        """Whether it asks for less than the random controller was allowed to more often than `LARGEST_SHARE_BELOW`."""
+        """True where it requests less than the random controller was allowed to more often than `LARGEST_SHARE_BELOW`."""
         return self.below is not None and self.below[1] > LARGEST_SHARE_BELOW
 
 
 def candidates(sweep: Sweep) -> list[Candidate]:
-    """The sweep's policies, the largest expected saving by the posterior first; last those without supporting sessions or beyond a margin.
+    """List the sweep's policies, the largest expected saving by the posterior first; last those without supporting sessions or beyond a
+    margin.
 
-    In sweeps of before, which have no saving, the largest gain over cDBS. Where the posterior has not spoken of all of them, or the data
-    cannot order policies: by their score on held-out sessions, and in the order of training where nothing was held out.
+    Older sweeps have no saving: the largest gain over cDBS comes first. Where the posterior has not estimated all of them, or the data
+    cannot order policies, their score on held-out sessions decides. Where nothing was held out, the order of training stays.
     """
     found = [_candidate(p) for p in sweep.policies]
     if ordered_by_posterior(found):
@@ -93,17 +94,18 @@ def candidates(sweep: Sweep) -> list[Candidate]:
 
 
 def ordered_by_posterior(found: Sequence[Candidate]) -> bool:
-    """Whether the posterior orders all of them."""
+    """Decide whether the posterior orders all of them."""
     return bool(found) and all(c.standing is not None for c in found)
 
 
 def ordered_by_saving(found: Sequence[Candidate]) -> bool:
-    """Whether the posterior orders all of them by what they are expected to save, and not by the gain of the return."""
+    """Decide whether the posterior orders all of them by what they are expected to save, and not by the gain of the return."""
     return ordered_by_posterior(found) and all(c.expected_saving is not None for c in found)
 
 
 def better_without_learning(found: Sequence[Candidate], baselines: Sequence[dict[str, Any]]) -> str | None:
-    """The best controller without learning where it is above every policy of the sweep, else None; None too where nothing was estimated.
+    """Find the best controller without learning where it is above every policy of the sweep, else None. None too where nothing was
+    estimated.
 
     By what orders the policies where that is the posterior, else by the scores on held-out sessions.
     """
@@ -120,10 +122,10 @@ def better_without_learning(found: Sequence[Candidate], baselines: Sequence[dict
 
 
 def surely_above_cdbs(found: Sequence[Candidate]) -> Candidate | None:
-    """The policy with the largest lower bound of its gain over cDBS by the posterior; None where no bound lies above 0.
+    """Find the policy with the largest lower bound of its gain over cDBS by the posterior; None where no bound is above 0.
 
-    Policies that are retired, that no session supports or that are probably beyond a margin, and all where the data cannot order policies,
-    are left out.
+    Policies that are retired, that no session supports or that are probably beyond a margin are excluded. So are all where the data cannot
+    order policies.
     """
     judged = {str(k): c for k, c in enumerate(found) if c.standing is not None and c.standing[0] and c.policy.retired_reason is None}
     name = surest({k: c.gain for k, c in judged.items() if c.gain is not None})
@@ -131,7 +133,8 @@ def surely_above_cdbs(found: Sequence[Candidate]) -> Candidate | None:
 
 
 def held_near(config: Mapping[str, Any]) -> str | None:
-    """What a policy's training held it near, by its configuration: `logged`, `cDBS`, or such as `0.70 of cDBS`; None where nothing."""
+    """Name the anchor of a policy's training, by its configuration: `logged`, `cDBS`, or such as `0.70 of cDBS`; None where there is
+    none."""
     if config.get("anchor") != "constant":
         return config.get("anchor")
     amplitude = float(config.get("anchor_amplitude", 1.0))
@@ -139,7 +142,8 @@ def held_near(config: Mapping[str, Any]) -> str | None:
 
 
 def below_bound(policy: Policy) -> tuple[float, float] | None:
-    """The lower bound of the random sessions that a policy learned from, and how often it asks for less; None where that is not known."""
+    """Return the lower bound of the random sessions that a policy learned from, and how often it requests less; None where that is
+    unknown."""
     stored = policy.metrics.get("below_bound")
     return None if stored is None else (float(stored["bound"]), float(stored["share"]))
 
@@ -175,7 +179,7 @@ def _candidate(policy: Policy) -> Candidate:
 
 
 def _chosen(held: dict[str, list[float]], best_update: int | None) -> int:
-    """Index of the scoring whose state was chosen."""
+    """Find the index of the scoring whose state was chosen."""
     updates = held.get("update", [])
     return updates.index(best_update) if best_update in updates else len(updates) - 1
 
@@ -186,7 +190,7 @@ def _at(curves: dict[str, list[float]], name: str, index: int) -> float | None:
 
 
 def charts(sweep: Sweep) -> list[Chart]:
-    """Learning curves of all policies of a sweep, one chart for each kind of curve that was recorded."""
+    """Draw the learning curves of all policies of a sweep, one chart for each kind of curve that was recorded."""
     made = (_chart(sweep.policies, *curve) for curve in CURVES)
     return [chart for chart in made if chart is not None]
 

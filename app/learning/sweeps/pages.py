@@ -18,7 +18,7 @@ router = APIRouter()
 
 @router.get("/sweeps/{sweep_id}", dependencies=[SweepViewed])
 def sweep_page(request: Request, sweep: CurrentSweep, db: Db) -> HTMLResponse:
-    """One sweep: its policies on sessions they did not learn from, beside controllers without learning."""
+    """Show one sweep: its policies on held-out sessions, compared with controllers without learning."""
     found = comparison.candidates(sweep)
     page = render(
         request,

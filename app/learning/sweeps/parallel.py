@@ -1,4 +1,4 @@
-"""Parallel coordinates of a sweep: one line per policy from its hyper-parameters to what became of it, coloured by how it stands."""
+"""Parallel coordinates of a sweep: one line per policy from its hyper-parameters to its results, coloured by its standing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LEAST = 2
 
 
 class Standing(StrEnum):
-    """How a policy of a sweep stands, of what speaks against it the first that holds."""
+    """Standing of a policy of a sweep: the first objection that applies."""
 
     RETIRED = "retired"
     BELOW_TRIED = "below_tried"
@@ -51,7 +51,7 @@ class Axis:
     """One column of the figure.
 
     Attributes:
-        places: where each policy lies, from 0 at the bottom to 1; None where it has no value there.
+        places: place of each policy, from 0 at the bottom to 1; None where it has no value there.
         ticks: place and words.
         cells: of the table behind the figure.
         always: drawn although all policies have one value.
@@ -65,7 +65,7 @@ class Axis:
 
 
 BETWEEN = 0.06
-"""Share of a column's height below which two numbers beside it would meet."""
+"""Share of a column's height below which two numbers next to it would meet."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Parallel:
 
 
 def standing(candidate: Candidate) -> Standing:
-    """How a policy stands by what its sweep's page says of it."""
+    """Determine the standing of a policy by what its sweep's page says of it."""
     if candidate.policy.retired_reason is not None:
         return Standing.RETIRED
     if candidate.leaves_the_logged_range:
@@ -94,7 +94,7 @@ def standing(candidate: Candidate) -> Standing:
 
 
 def parallel(candidates: Sequence[Candidate], words: dict[Standing, str]) -> Parallel | None:
-    """The figure of a sweep; None of fewer policies than can be compared.
+    """Draw the figure of a sweep; None of fewer policies than can be compared.
 
     Args:
         candidates: best first, as the page lists them. words: of each standing.
@@ -134,7 +134,7 @@ def _named(name: str, values: Sequence[str]) -> Axis:
 
 
 def _number(name: str, values: Sequence[float | None], logarithmic: bool = False, always: bool = False) -> Axis:
-    """A column of numbers; without any it has no place and no tick."""
+    """Make a column of numbers; without any it has no place and no tick."""
     known = [float(v) for v in values if v is not None and math.isfinite(v) and (v > 0 or not logarithmic)]
     cells: list[Cell] = [None if v is None else float(v) for v in values]
     if not known:
@@ -162,9 +162,9 @@ def _figure(candidates: Sequence[Candidate], axes: Sequence[Axis], stands: Seque
     plane = Plane(LEFT, TOP, W - LEFT - RIGHT, H - TOP - BOTTOM, (0.0, max(len(axes) - 1, 1)), (0.0, 1.0))
     for k, column in enumerate(axes):
         plane.line([(k, 0.0), (k, 1.0)], "border", 1.0)
-        # names stand in two heights, or those of neighbours meet
+        # names are in two heights, or those of neighbours meet
         plane.text(plane.at_x(k), TOP - (44 if k % 2 else 26), column.name, "middle", weight=650)
-    # the best is drawn last and lies on top
+    # the best is drawn last, on top
     for which in reversed(range(len(candidates))):
         tone, dash = LOOKS[stands[which]]
         plane.line([(k, a.places[which]) for k, a in enumerate(axes)], tone, 1.8, dash)
@@ -181,7 +181,7 @@ def _figure(candidates: Sequence[Candidate], axes: Sequence[Axis], stands: Seque
 
 
 def _names(plane: Plane, candidates: Sequence[Candidate], last: Axis, stands: Sequence[Standing]) -> None:
-    """Each policy's name beside the end of its line, as far as there is room."""
+    """Write each policy's name at the end of its line, as far as there is room."""
     ending = [(k, place) for k, place in enumerate(last.places) if place is not None]
     ending = ending[: int((H - TOP - BOTTOM) / 14)]
     wanted = [plane.at_y(place) + 4 for _, place in ending]

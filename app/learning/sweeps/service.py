@@ -99,7 +99,7 @@ def _policy(
 
 
 def _store_clone(db: Session, sweep: Sweep, snapshot: BufferSnapshot, workdir: Path) -> None:
-    """The clone of the logged behaviour as a baseline of this snapshot, once."""
+    """Store the clone of the logged behaviour as a baseline of this snapshot, once."""
     name = f"behaviour clone of snapshot {snapshot.id}"
     if repository.policy_by_name(db, snapshot.participant_id, name):
         return

@@ -1,4 +1,4 @@
-"""What the child processes of learning run: training, scores of controllers without learning, distillation.
+"""Compute steps of learning, for child processes: training, scores of controllers without learning, distillation.
 
 Loaded by those children alone: everything heavy is imported here, and nothing that the web service loads imports this module.
 """
@@ -51,8 +51,8 @@ def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
     """Train the policies of one group side by side on a snapshot, from scratch or from another policy.
 
     Args:
-        params: `snapshot_sha256`; `algorithm`; `configs`, members of its configuration; `held_out`, whether sessions are left out;
-            `margins` as `_judged_by` takes them; `tested` as `known_tests` does; optionally `initial` with `checkpoint_sha256` or
+        params: `snapshot_sha256`; `algorithm`; `configs`, members of its configuration; `held_out`, whether sessions are held out.
+            `margins` as `_judged_by` takes them; `tested` as `known_tests` does. Optionally `initial` with `checkpoint_sha256` or
             `onnx_sha256`.
         workdir: gets each policy as `policy-K.onnx` and its whole training as `training-K.pt`.
         report: learning curves over updates.
@@ -83,7 +83,7 @@ def train(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
 
 
 def _why(error: Exception, report: StepReport) -> str:
-    """Why a training ended, for who reads results; which network's loss it was goes to the log."""
+    """Explain why a training ended, for people who read results; the network whose loss diverged goes to the log."""
     if not isinstance(error, rl.TrainingDiverged):
         return said_of(error, report.log)
     report.log(str(error))
@@ -94,7 +94,7 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
     """Score controllers that learn nothing, or no more than to imitate, as the policies of the sweep are scored.
 
     Args:
-        params: `snapshot_sha256`; `held_out`, whether sessions are left out; `margins` as `_judged_by` takes them; `tested` as
+        params: `snapshot_sha256`; `held_out`, whether sessions are held out; `margins` as `_judged_by` takes them; `tested` as
             `known_tests` does; `seed`.
         workdir: gets the clone of the logged behaviour as `clone.onnx`.
         report: progress.
@@ -140,11 +140,11 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
 
 
 def best_supported(constants: Mapping[str, PosteriorGain], level: float) -> float | None:
-    """The amplitude with the largest expected saving, by names such as `0.70`; None without one.
+    """Find the amplitude with the largest expected saving, by names such as `0.70`; None without one.
 
-    Expected is the energy that it saves times the probability that all QoCs keep within the margins, among those that sessions support and
-    that keep them with a probability of `level` at least. Where no QoC is known, the one with the largest gain: a saving alone would be
-    the lowest of all.
+    The expected saving is the energy that it saves times the probability that all QoCs keep within the margins. Only amplitudes count that
+    sessions support and that keep the margins with a probability of `level` at least. Where no QoC is known, the one with the largest gain
+    counts: a saving alone would be the lowest of all.
     """
     fit = {name: one for name, one in constants.items() if one.supported and (one.within is None or one.within >= level)}
     known = {name: one.within * (1 - float(name) ** 2) for name, one in fit.items() if one.within is not None}
@@ -161,14 +161,14 @@ def known_tests(tested: Mapping[str, Any] | None, buffer: ReplayBuffer) -> Tests
 
 
 def supported_best(buffer: ReplayBuffer, margins: Mapping[str, float] | None, tests: Tests | None = None) -> float | None:
-    """`best_supported` of twentieths that are probably within the margins; `margins` as `_judged_by` takes them."""
+    """Apply `best_supported` to twentieths that are probably within the margins; `margins` as `_judged_by` takes them."""
     limits, levels = _judged_by(margins)
     constants = _gains(buffer, {f"{a:.2f}": ConstantPolicy(a) for a in CONSTANT_GRID}, limits, tests)
     return best_supported(constants, 1 - levels.unsafe_beyond)
 
 
 def _judged_by(margins: Mapping[str, float] | None) -> tuple[Margins, Levels]:
-    """The participant's margins, and how sure a verdict must be, from members of both by name; the defaults where None."""
+    """Read the participant's margins, and how sure a verdict must be, from members of both by name; the defaults where None."""
     given = dict(margins or {})
     levels = {name: given.pop(name) for name in ("test_within", "unsafe_beyond") if name in given}
     return Margins(**given), Levels(**levels)
@@ -177,7 +177,7 @@ def _judged_by(margins: Mapping[str, float] | None) -> tuple[Margins, Levels]:
 def with_best_anchor(
     configs: Sequence[dict[str, Any]], buffer: ReplayBuffer, margins: Mapping[str, float] | None, tests: Tests | None = None
 ) -> list[dict[str, Any]]:
-    """Configurations in which the anchor `best` is the amplitude that it means; cDBS where no constant has a claim to be better."""
+    """Replace the anchor `best` in configurations by the amplitude that it means; cDBS where no constant is shown to be better."""
     if not any(one.get("anchor") == BEST for one in configs):
         return list(configs)
     best = supported_best(buffer, margins, tests)
@@ -186,11 +186,11 @@ def with_best_anchor(
 
 
 def hold_out(buffer: ReplayBuffer, wanted: bool, every: int) -> tuple[ReplayBuffer, rl.HeldOutSessions | None]:
-    """Sessions to learn from, and those that watch; all and none where they are too few to spare any."""
+    """Split sessions into those to learn from and held-out ones; all and none where they are too few to spare any."""
     if not wanted or len(buffer.sessions) < FEWEST_TO_HOLD_OUT:
         return buffer, None
     learnt, left = rl.split_sessions(buffer)
-    # a split may leave nothing to start a score from; then nobody watches
+    # a split may leave nothing to start a score from; then no session is held out
     if not any(s.usable().any() for s in left.sessions) or not learnt.transitions().states.size:
         return buffer, None
     watching = rl.HeldOutSessions(
@@ -205,7 +205,7 @@ def hold_out(buffer: ReplayBuffer, wanted: bool, every: int) -> tuple[ReplayBuff
 
 
 def _share_of_end(learnt: ReplayBuffer, config: rl.TrainConfig) -> dict[str, Any]:
-    """How well r_end falls apart into shares of steps, where a policy was to learn from them; null where it learned without."""
+    """Describe how well r_end divides into shares of steps, where a policy was to learn from them; null where it learned without."""
     if config.aim != "return":
         return {}
     share = rl.fit_end_reward(learnt)
@@ -215,7 +215,8 @@ def _share_of_end(learnt: ReplayBuffer, config: rl.TrainConfig) -> dict[str, Any
 def stored_gains(
     buffer: ReplayBuffer, policies: Mapping[str, Policy], margins: Mapping[str, float] | None = None, tests: Tests | None = None
 ) -> dict[str, dict[str, Any] | None]:
-    """Gain of each policy over cDBS by the posterior over the whole buffer, as it is stored; None where it cannot be estimated.
+    """Compute the gain of each policy over cDBS by the posterior over the whole buffer, in its stored form; None where it cannot be
+    estimated.
 
     The policies have seen most of these sessions, which flatters them. `margins` as `_judged_by` takes them. `tests`: what tested sessions
     showed of other policies; it moves those that act alike.
@@ -232,7 +233,7 @@ def _stored(one: PosteriorGain, levels: Levels) -> dict[str, Any]:
 
 
 def _gains(buffer: ReplayBuffer, policies: Mapping[str, Policy], margins: Margins, tests: Tests | None) -> dict[str, PosteriorGain]:
-    """Gains over cDBS; none where the sessions are too few for the posterior."""
+    """Compute gains over cDBS; none where the sessions are too few for the posterior."""
     try:
         return gains_over_cdbs(buffer, policies, margins=margins, tests=tests)
     except ValueError:  # what the method says of sessions that it cannot fit
@@ -240,13 +241,14 @@ def _gains(buffer: ReplayBuffer, policies: Mapping[str, Policy], margins: Margin
 
 
 def _below_bound(policy: Policy, buffer: ReplayBuffer) -> dict[str, Any]:
-    """How often a policy asks for less, on the buffer's states, than the random controller was allowed to; null without such a session."""
+    """Compute how often a policy requests less, on the buffer's states, than the random controller was allowed to; null without such a
+    session."""
     bound = random_bound(buffer)
     return {"below_bound": None if bound is None else {"bound": bound, "share": share_below_bound(policy, buffer)}}
 
 
 def _metrics(result: rl.TrainedPolicy, buffer: ReplayBuffer) -> dict[str, Any]:
-    """What a trained policy is stored with."""
+    """Collect what a trained policy is stored with."""
     held = {name: values.tolist() for name, values in result.held_out.items()}
     steps = buffer.transitions()
     actions = result.policy.act(steps.states)
@@ -295,7 +297,7 @@ def distil(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[st
 
 
 def _returns_beside(buffer: ReplayBuffer, student: Policy, teacher: Policy) -> dict[str, float]:
-    """Estimated returns of student and teacher by one fitted Q evaluation of the whole buffer, reward units."""
+    """Estimate returns of student and teacher by one fitted Q evaluation of the whole buffer, reward units."""
     return {
         "student_return": fqe_value(buffer, student, ()).value,
         "teacher_return": fqe_value(buffer, teacher, ()).value,
@@ -311,7 +313,7 @@ def _initial(start: dict[str, str] | None) -> rl.TrainedPolicy | rl.MlpPolicy | 
 
 
 def _with_start(values: dict[str, Any], initial: rl.TrainedPolicy | rl.MlpPolicy | None) -> dict[str, Any]:
-    """Hyper-parameters for a start: fine-tuning keeps layers and the critic's inputs; without its critic, that one learns first."""
+    """Change hyper-parameters for a start: fine-tuning keeps layers and the critic's inputs; without its critic, that one learns first."""
     if initial is None:
         return values
     if isinstance(initial, rl.TrainedPolicy):
@@ -326,6 +328,6 @@ def _scale_of(policy: rl.MlpPolicy) -> dict[str, float]:
 
 
 def _thinned(values: list[float]) -> list[float]:
-    """At most `_CURVE_POINTS` of a curve's points, the last one among them."""
+    """Select at most `_CURVE_POINTS` of a curve's points, the last one among them."""
     step = -(-len(values) // _CURVE_POINTS)
     return values[::-1][::step][::-1]

@@ -11,28 +11,28 @@ from app.learning.schemas import DistilParams, TrainParams
 TRAINING: dict[str, dict[str, Any]] = {
     # from scratch as in the paper: learning rates from 1e-5 to 1e-3
     "full": {"updates": 10_000, "batch": 64, "low": 1e-5, "high": 1e-3, "critic_lr": 1e-3},
-    # For the demo. With 2000 updates at 1e-4 to 1e-3 all six policies of P1 ended at one amplitude, which the saturation curve shows; the
-    # values here were picked after seeing true returns of that synthetic participant too, so they are no evidence of how well DDPG learns.
+    # For the demo. With 2000 updates at 1e-4 to 1e-3 all six policies of P1 ended at one amplitude, which the saturation curve shows. The
+    # values here were chosen after seeing true returns of that synthetic participant too. So they are no evidence of how well DDPG learns.
     "quick": {"updates": 4_000, "batch": 64, "low": 1e-5, "high": 3e-4, "critic_lr": 1e-3},
 }
 CONSTRAINED = {"low": 1e-4, "high": 1e-3}
 """Learning rates of the other algorithms: around the 3e-4 of their publications."""
 
 ANCHORED = ("td3_bc", "rebrac")
-"""Algorithms whose policies are held near an amplitude."""
+"""Algorithms whose policies stay near an amplitude."""
 
 BEST = "best"
 """As `anchor` of a configuration: near the best constant amplitude, which the child process finds before it trains."""
 
 CLOSE: dict[str, dict[str, Any]] = {"td3_bc": {"alpha": 1.25}, "rebrac": {"actor_penalty": 0.8}}
-"""How firmly policies are held near the best constant amplitude: at the published strength the critic, whose rewards miss most of what a
-dose does to symptoms, took them to doses that no session supports (docs/learning.md)."""
+"""Strength that keeps policies near the best constant amplitude. At the published strength the critic took them to doses that no session
+supports (docs/learning.md). Its rewards miss most of what a dose does to symptoms."""
 
 LOOSE: dict[str, dict[str, Any]] = {"td3_bc": {"alpha": 2.5}, "rebrac": {"actor_penalty": 0.2}}
 """The same with more room for what the values say; still firmer than ReBRAC's published 0.05."""
 
 HELD_BY = ("anchor", "anchor_amplitude", "alpha", "actor_penalty")
-"""Members of a configuration that say what a policy is held near, and how firmly."""
+"""Members of a configuration that state a policy's anchor, and its strength."""
 
 FINE_TUNING = {"low": 1e-7, "high": 1e-5}
 """The paper's learning rates when going on from a tested policy."""
@@ -41,16 +41,16 @@ DISTILLATION: dict[str, dict[str, Any]] = {"full": {"updates": 5_000, "sigma": 0
 
 
 def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]) -> list[dict[str, Any]]:
-    """The policies of a sweep in groups that are trained side by side, each in a child process of its own.
+    """Group the policies of a sweep; each group is trained side by side, in a child process of its own.
 
-    From scratch the policies are dealt to the algorithms in turn, each of which goes through its aims and anchors; those of one algorithm
+    From scratch the policies are dealt to the algorithms in turn; each algorithm goes through its aims and anchors. Those of one algorithm
     have learning rates spread evenly in the logarithm, whatever their aims and anchors. Those of one kind fill two groups, one for each
     core. Seeds count up over all. A fine-tuned policy is a group of its own.
 
     Args:
         params: what was asked for.
-        starts: one for each policy: None from scratch, else `policy_id`, `algorithm`, the hash of the parent's file, and `trained_with`,
-            the aim and the anchor of the parent's own training where it had any.
+        starts: one for each policy. None from scratch; else `policy_id`, `algorithm`, the hash of the parent's file, and `trained_with`.
+            The last has the aim and the anchor of the parent's own training where it had any.
 
     Returns:
         For each group: `key` of its step, `algorithm`, `configs` (members of the algorithm's configuration), `start`.
@@ -73,7 +73,7 @@ def training_groups(params: TrainParams, starts: Sequence[dict[str, Any] | None]
 
 
 def generation_groups(params: TrainParams, parents: Sequence[dict[str, Any]], each: int) -> list[dict[str, Any]]:
-    """The groups of a next generation: `each` policies fine-tuned from every parent, then `params.count` from scratch.
+    """Group the policies of a next generation: `each` policies fine-tuned from every parent, then `params.count` from scratch.
 
     The rates of fine-tuning are dealt to the parents in turn, so that no parent has the slow ones alone. Seeds count up over all.
 
@@ -88,13 +88,13 @@ def generation_groups(params: TrainParams, parents: Sequence[dict[str, Any]], ea
 
 
 def fresh_rates(params: TrainParams) -> tuple[float, float]:
-    """Lowest and highest learning rate of the policies that are trained from scratch, over all algorithms."""
+    """Find the lowest and highest learning rate of the policies that are trained from scratch, over all algorithms."""
     each = [_rates(params, algorithm) for algorithm in params.algorithms]
     return min(low for low, _ in each), max(high for _, high in each)
 
 
 def _kinds(params: TrainParams) -> list[tuple[str, dict[str, Any]]]:
-    """Kinds of policies in the order of dealing: every algorithm once before any has a second aim or anchor."""
+    """List kinds of policies in the order of dealing: every algorithm once before any has a second aim or anchor."""
     aims = ("steps", "return") if params.aim == "both" else (params.aim,)
     # Cloning knows no reward, so that its aims would be twins.
     each = {a: _variants(aims if a != "cloning" else ("steps",), _anchors(params, a)) for a in dict.fromkeys(params.algorithms)}
@@ -107,7 +107,7 @@ def _fine_tuning(params: TrainParams, k: int, start: dict[str, Any]) -> dict[str
     rate = _between(low, high, k, len(params.policies))
     config = _config(params, start["algorithm"], actor_lr=rate, seed=params.seed + k)
     asked: dict[str, Any] = {"aim": "return" if params.aim == "return" else "steps"} | _anchors(params, start["algorithm"])[0]
-    # By turns means what the parent had: its critics sum that aim, and another anchor would undo what was tested.
+    # Alternating means what the parent had: its critics sum that aim, and another anchor would undo what was tested.
     turns = (("aim",) if params.aim == "both" else ()) + (HELD_BY if params.anchor in ("both", "all") else ())
     kept = {name: value for name, value in start.get("trained_with", {}).items() if name in turns}
     config |= asked | kept
@@ -115,13 +115,13 @@ def _fine_tuning(params: TrainParams, k: int, start: dict[str, Any]) -> dict[str
 
 
 def _variants(aims: Sequence[str], anchors: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Every pair of an aim and an anchor. Both change from one to the next, so that few policies have all aims and all anchors."""
+    """List every pair of an aim and an anchor. Both change from one to the next, so that few policies have all aims and all anchors."""
     n, again = len(aims), math.lcm(len(aims), len(anchors))
     return [{"aim": aims[(k + k // again) % n]} | anchors[k % len(anchors)] for k in range(n * len(anchors))]
 
 
 def _anchors(params: TrainParams, algorithm: str) -> list[dict[str, Any]]:
-    """What the policies of an algorithm are held near, as members of its configuration; the best constant amplitude first, and twice."""
+    """List the anchors of an algorithm's policies, as members of its configuration; the best constant amplitude first, and twice."""
     if algorithm not in ANCHORED:
         return [{}]
     logged: dict[str, Any] = {"anchor": "logged"}
@@ -137,7 +137,7 @@ def _anchors(params: TrainParams, algorithm: str) -> list[dict[str, Any]]:
 
 
 def _rates(params: TrainParams, algorithm: str) -> tuple[float, float]:
-    """Lowest and highest learning rate of the policies."""
+    """Return the lowest and highest learning rate of the policies."""
     spread = FINE_TUNING if params.policies else TRAINING[params.preset] if algorithm == "ddpg" else CONSTRAINED
     low = spread["low"] if params.actor_lr_low is None else params.actor_lr_low
     high = spread["high"] if params.actor_lr_high is None else params.actor_lr_high
@@ -164,7 +164,7 @@ def _config(params: TrainParams, algorithm: str, *, actor_lr: float, seed: int) 
 
 
 def distillation_config(params: DistilParams, k: int) -> dict[str, Any]:
-    """Hyper-parameters of the k-th student (`DistilConfig`)."""
+    """Choose hyper-parameters of the k-th student (`DistilConfig`)."""
     preset = DISTILLATION[params.preset]
     updates = preset["updates"] if params.updates is None else params.updates
     config = {
@@ -177,6 +177,6 @@ def distillation_config(params: DistilParams, k: int) -> dict[str, Any]:
 
 
 def _between(low: float, high: float, k: int, n: int) -> float:
-    """The k-th of n values from low to high, evenly spread in the logarithm; the middle where there is one alone."""
+    """Compute the k-th of n values from low to high, evenly spread in the logarithm; the middle where there is one alone."""
     share = 0.5 if n == 1 else k / (n - 1)
     return float(f"{math.exp(math.log(low) + share * (math.log(high) - math.log(low))):.3g}")

@@ -6,10 +6,10 @@ POLICY, CLONE = "policy.onnx", "clone.onnx"
 
 
 def policy_file(member: int) -> str:
-    """A trained policy's file in the folder of its step."""
+    """Name a trained policy's file in the folder of its step."""
     return f"policy-{member}.onnx"
 
 
 def training_file(member: int) -> str:
-    """A whole training's file in the folder of its step."""
+    """Name a whole training's file in the folder of its step."""
     return f"training-{member}.pt"

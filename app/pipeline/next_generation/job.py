@@ -49,7 +49,7 @@ def run_next_generation(job: JobContext) -> dict[str, Any]:
 
 
 def _plan(db: Session, job: JobContext, snapshot: BufferSnapshot) -> dict[str, Any]:
-    """The tested policies, and their posterior returns where a ranking knows all sessions; what judging them anew needs where none does."""
+    """Read the tested policies, and their posterior returns where a ranking knows all sessions; else what assessing them again needs."""
     tested = [t.policy for t in tested_policies(db, participant_of(db, job))]
     plan = {"tested": policy_facts(tested), "tested_so_far": tested_so_far(db, snapshot, acting(job))}
     known = posterior_on(db, snapshot.participant_id, snapshot.id)
@@ -60,7 +60,7 @@ def _plan(db: Session, job: JobContext, snapshot: BufferSnapshot) -> dict[str, A
 
 
 def _starts(job: JobContext, params: NextGenerationParams, planned: dict[str, Any]) -> list[dict[str, Any]]:
-    """The parents, the best first, as trainings start from them."""
+    """Choose the parents, the best first, as trainings start from them."""
     posterior = planned["posterior"] if planned["posterior"] is not None else _judge(job, params, planned)
 
     def choose(db: Session) -> dict[str, Any]:
@@ -77,7 +77,7 @@ def _starts(job: JobContext, params: NextGenerationParams, planned: dict[str, An
 
 
 def _judge(job: JobContext, params: NextGenerationParams, planned: dict[str, Any]) -> dict[str, float]:
-    """The posterior returns of the tested policies with what their sessions showed."""
+    """Estimate the posterior returns of the tested policies with what their sessions showed."""
     job.step(JUDGE, "Judge the tested policies with the sessions since the last ranking", weight=shown(POSTERIOR).weight)
     found = job.compute(JUDGE, "evaluate_method", judging_call(params, planned))
     if "failed" in found:

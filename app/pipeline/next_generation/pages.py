@@ -29,7 +29,7 @@ _LABELS = {"preset": "Size", "parents": "Policies to go on from", "tuned": "Fine
 
 @router.get("/participants/{code}/next-generation", dependencies=[ResultsViewed])
 def next_generation(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """What the next generation would go on from, and the button that starts it."""
+    """Show what the next generation would continue from, and the button that starts it."""
     return _page(request, db, participant, caller, {})
 
 

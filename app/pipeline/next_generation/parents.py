@@ -1,4 +1,4 @@
-"""Which policies a generation goes on from: those that ran in sessions, the best by the posterior first."""
+"""Parents of a generation: the policies that ran in sessions, the best by the posterior first."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ class Tested:
 
 
 def tested_policies(db: Session, participant: Participant) -> list[Tested]:
-    """Policies that can be trained further and ran in a confirmed session that is not excluded, oldest first.
+    """List policies that can be trained further and ran in a confirmed session that is not excluded, oldest first.
 
-    Left out are retired ones, those of another window than the settings say now, and those under which a serious adverse event happened
-    that no clinician has cleared.
+    Retired ones are excluded, and those of another window than the current settings. So are those under which a serious adverse event
+    happened that no clinician has cleared.
     """
     visits: dict[int, list[int]] = {}
     for session in study.sessions_of_participant(db, participant.id):
         if session.visit.sealed:
-            continue  # what goes on from it would tell what ran
+            continue  # what continues from it would reveal what ran
         # which policies did best does not depend on who asks; only those who may know every arm can
         policy_id = arm(session, SYSTEM).policy_id
         if policy_id is not None and session.excluded_reason is None:
@@ -54,18 +54,19 @@ def tested_policies(db: Session, participant: Participant) -> list[Tested]:
 
 
 def posterior_of(found: Evaluation | None) -> dict[int, float]:
-    """The posterior's estimated returns by policy; empty where the evaluation has none."""
+    """Return the posterior's estimated returns by policy; empty where the evaluation has none."""
     return {} if found is None else {row.policy_id: estimate_of(row).value for row in found.estimates if row.method == POSTERIOR}
 
 
 def posterior_on(db: Session, participant_id: int, snapshot_id: int) -> dict[int, float]:
-    """The posterior's returns by policy where the newest evaluation rests on this snapshot, so that it knows all sessions; else empty."""
+    """Return the posterior's returns by policy where the newest evaluation rests on this snapshot, so that it knows all sessions; else
+    empty."""
     newest = evaluation.newest_evaluation(db, participant_id)
     return posterior_of(newest) if newest is not None and newest.snapshot_id == snapshot_id else {}
 
 
 def best(tested: Sequence[Policy], posterior: Mapping[int, float], most: int) -> list[Policy]:
-    """The policies to go on from: the highest posterior return first, one of a teacher and its student, at most `most`."""
+    """Choose the policies to continue from: the highest posterior return first, one of a teacher and its student, at most `most`."""
     chosen: list[Policy] = []
     families: set[int] = set()
     for policy in sorted((p for p in tested if p.id in posterior), key=lambda p: (-posterior[p.id], p.id)):

@@ -24,7 +24,7 @@ from app.study.models import Participant
 
 @dataclass(frozen=True)
 class Outlook:
-    """Where a participant's next generation stands.
+    """Outlook on a participant's next generation.
 
     Attributes:
         tested: what it may go on from, the best by the newest ranking first. posterior: its estimated returns by policy.
@@ -40,12 +40,13 @@ class Outlook:
     done: Job | None
 
     def parents(self, most: int) -> list[int]:
-        """Policies that it goes on from, the best first; empty where the job judges the tested ones with the new sessions first."""
+        """List the policies that it continues from, the best first; empty where the job assesses the tested ones with the new sessions
+        first."""
         return [p.id for p in best([t.policy for t in self.tested], self.posterior, most)] if self.current else []
 
 
 def outlook(db: Session, participant: Participant, caller: Caller) -> Outlook:
-    """What the page tells before somebody starts a generation. Raises Forbidden for who may not run jobs."""
+    """Collect what the page shows before a generation is started. Raises Forbidden for callers who may not run jobs."""
     study.require(caller, can.RUN_JOBS, participant)
     newest = evaluation.newest_evaluation(db, participant.id)
     current = newest is not None and not stale_reasons(db, participant, newest)
@@ -57,7 +58,7 @@ def outlook(db: Session, participant: Participant, caller: Caller) -> Outlook:
 
 
 def _made_on(db: Session, participant_id: int, snapshot_id: int) -> Job | None:
-    """The job that trained a generation on a snapshot, whoever evaluated it again since; None where none did."""
+    """Find the job that trained a generation on a snapshot, also if it was evaluated again since; None where none did."""
     ended, _ = jobs.find(db, participant_id, NEXT_GENERATION, (JobStatus.SUCCEEDED,), limit=1)
     made = evaluation.evaluation_of_job(db, ended[0].id) if ended else None
     return ended[0] if made is not None and made.snapshot_id == snapshot_id else None
