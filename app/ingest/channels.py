@@ -1,4 +1,4 @@
-"""Which channel a controller is taken to have seen: by the target of its lead, by its contacts, and by how much it can teach."""
+"""Choice of the channel that a controller is taken to have seen, by its lead's target, its contacts, and how much it can teach."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ LITTLE = 0.5
 
 @dataclass(frozen=True)
 class Place:
-    """Where a channel was measured.
+    """Place where a channel was measured.
 
     Attributes:
-        lead: side and target as the device's settings have them, such as `left STN`; empty where they do not tell.
+        lead: side and target as the device's settings have them, such as `left STN`; empty where they lack them.
         contacts: plus and minus; None where they are not known. shorted: both are the same contact, so that there is no signal.
     """
 
@@ -35,7 +35,7 @@ class Place:
 
     @property
     def shorted(self) -> bool:
-        """Whether the pair is one contact twice."""
+        """True where the pair is one contact twice."""
         return self.contacts is not None and self.contacts[0] == self.contacts[1]
 
     @property
@@ -46,7 +46,7 @@ class Place:
 
 
 def place_of(trace: Trace, recording: Recording) -> Place:
-    """Where the channel of a trace was measured, by the recording's settings."""
+    """Find where the channel of a trace was measured, by the recording's settings."""
     key = trace.details.get("channel_key")
     if key is None and (named := re.match(r"key (\d)", trace.channel)):
         key = int(named[1])
@@ -59,7 +59,7 @@ def place_of(trace: Trace, recording: Recording) -> Place:
 
 
 def _contacts_of_key(settings: dict[str, object], key: int | None) -> str:
-    """Contacts of a sensing key where they never changed; empty otherwise."""
+    """Return the contacts of a sensing key where they never changed; empty otherwise."""
     sensing = settings.get("sensing")
     rows = sensing if isinstance(sensing, list) else []
     pairs = {str(s["contacts"][key]) for s in rows if key is not None and len(s.get("contacts") or []) > key}
@@ -69,7 +69,7 @@ def _contacts_of_key(settings: dict[str, object], key: int | None) -> str:
 def of_part(
     traces: Sequence[Trace], recording: Recording, settings: SettingsVersion, part_s: tuple[float, float], side: Hemisphere | None
 ) -> Trace | None:
-    """The channel that a controller is taken to have seen in a part of a recording: of the participant's source where there is one.
+    """Choose the channel that a controller is taken to have seen in a part of a recording: of the participant's source where there is one.
 
     Args:
         traces: of the recording.
@@ -83,11 +83,11 @@ def of_part(
 
 
 def choose(candidates: Sequence[Trace], recording: Recording, side: Hemisphere | None, worth: Callable[[Trace], Worth]) -> Trace | None:
-    """The channel that a controller is taken to have seen, of those of one kind.
+    """Choose the channel that a controller is taken to have seen, of those of one kind.
 
-    Not one contact against itself, not of the other side, of a deep target before one that is not known and that before cortex. Of one
-    target those that teach little (`LITTLE`) come last; then around the stimulating contact before beside it and that before with it; of
-    equals the one with the most usable steps, then the most valid ones, then the first.
+    A pair of one contact with itself and the other side are excluded. A deep target comes before an unknown one, and that before cortex. Of
+    one target those that teach little (`LITTLE`) come last. Then a pair around the stimulating contact comes before one next to it, and
+    that before one with it. Of equals the one with the most usable steps wins, then the most valid ones, then the first.
     """
     cathodes = _cathodes(recording)
     places = {id(trace): place_of(trace, recording) for trace in candidates}
@@ -116,7 +116,8 @@ def _of_target(target: str) -> int:
 
 
 def _of_contacts(place: Place, cathodes: frozenset[int]) -> int:
-    """0: the stimulating contacts lie between the pair; 1: beside it, or not known; 2: the pair has one of them, and its artefact."""
+    """Rank a pair by the stimulating contacts. 0: they are between the pair; 1: next to it, or unknown; 2: the pair has one of them, and
+    its artefact."""
     if place.contacts is None or not cathodes:
         return 1
     low, high = sorted(place.contacts)
@@ -126,7 +127,7 @@ def _of_contacts(place: Place, cathodes: frozenset[int]) -> int:
 
 
 def _cathodes(recording: Recording) -> frozenset[int]:
-    """Numbers of the contacts that stimulate, as far as the recording's stimulation log tells."""
+    """List the numbers of the contacts that stimulate, as far as the recording's stimulation log has them."""
     programs = [
         p
         for e in recording.details.get("events") or []
@@ -138,7 +139,7 @@ def _cathodes(recording: Recording) -> frozenset[int]:
 
 
 def montages(recording: Recording) -> int:
-    """How many sets of sensing contacts a recording went through, those aside that were replaced before it began."""
+    """Count the sets of sensing contacts that a recording went through, without those that were replaced before it began."""
     states = (recording.details.get("settings") or {}).get("sensing") or []
     begun = [i for i, s in enumerate(states) if float(s.get("from_s") or 0.0) <= 0.0]
     inside = [s for s in states[begun[-1] if begun else 0 :] if float(s.get("from_s") or 0.0) < recording.duration_s]
@@ -146,5 +147,5 @@ def montages(recording: Recording) -> int:
 
 
 def is_survey(recording: Recording) -> bool:
-    """Whether a recording is a survey of sensing montages, in which no controller was at work."""
+    """Decide whether a recording is a survey of sensing montages, in which no controller was at work."""
     return montages(recording) >= SURVEY_MONTAGES

@@ -1,7 +1,7 @@
-"""Copies of the same minutes: a recording is what a device and side had in a stretch of time, in whatever set of files it comes.
+"""Copies of the same minutes. A recording is what a device and side had in a stretch of time, in whatever set of files it comes.
 
-The fuller copy counts. A copy that holds no more than a stored one is not stored again; a fuller one takes the place of the stored one in
-its sessions, those of locked visits aside. Where both differ, or each holds what the other lacks, both are kept and a person decides.
+The fuller copy counts. A copy without anything new is not stored again. A fuller one replaces the stored one in its sessions, except in
+locked visits. Where both differ, or each has what the other lacks, both are kept and a person decides.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from ml.formats.recording import TraceLog
 
 BETA = "beta"
 NEURAL = (BETA, "band_power")
-"""Streams that tell whether two recordings hold the same signal."""
+"""Streams that show whether two recordings have the same signal."""
 FEWEST_ROWS = 5
-"""Rows of a channel that both have, from which on they are held against each other."""
+"""Fewest rows of a channel in both recordings for which they are compared."""
 EXACT_S = 0.001
 EQUAL_SHARE = 0.8
 """Share of rows on the same grid that are equal where two copies hold the same signal; ends and gaps may be cut elsewhere."""
 WITHIN_ERRORS = 0.25
-"""Rows with gaps of two copies differ by no more than this share of their standard error: the same samples are there, and what fills the
-gaps is predicted from all that each copy has."""
+"""Largest difference between rows with gaps of two copies, as a share of their standard error. The same samples are there, and what fills
+the gaps is predicted from all that each copy has."""
 TELLING = 0.5
-"""Where that tolerance is more than this share of the rows' standard deviation, it cannot tell two signals from each other."""
+"""Largest tolerance that separates two signals, as a share of the rows' standard deviation."""
 LIKE = 0.5
 """Correlation of rows on shifted grids, of which each covers a part of two others, from which on the signal is the same."""
 LOST = 0.02
@@ -46,7 +46,7 @@ Channel = tuple[str, str]
 
 
 class Relation(StrEnum):
-    """What a new recording is to a stored one of the same minutes."""
+    """Relation of a new recording to a stored one of the same minutes."""
 
     NO_MORE = "no_more"
     FULLER = "fuller"
@@ -81,11 +81,11 @@ class Rows:
 
 @dataclass
 class Verdict:
-    """What becomes of a new recording.
+    """Verdict on a new recording.
 
     Attributes:
         copy_of: a stored recording that holds all of it. fuller_than: stored ones that it takes the place of.
-        beside: stored ones of the same minutes that differ, or hold what it lacks.
+        `beside`: stored ones of the same minutes that differ, or have what it lacks.
         locked: stored ones that it is fuller than, and that stay, for sessions of a locked visit use them.
     """
 
@@ -96,12 +96,12 @@ class Verdict:
 
     @property
     def alone(self) -> bool:
-        """Whether it is fuller than one stored recording, and no other has any of its minutes."""
+        """True where it is fuller than one stored recording, and no other has any of its minutes."""
         return len(self.fuller_than) == 1 and not self.beside and not self.locked
 
 
 def of_logs(traces: Sequence[TraceLog]) -> dict[Channel, Rows]:
-    """Traces as they were decoded, on their own clock."""
+    """Convert traces as they were decoded, on their own clock."""
     return _with_errors({(t.stream, t.channel): Rows(t.t_end_s, _with_gaps(t), t.dt_s, t.unit) for t in traces})
 
 
@@ -112,7 +112,7 @@ def _with_gaps(trace: TraceLog) -> NDArray[np.float64]:
 
 
 def of_stored(traces: Sequence[Trace], ahead_s: float) -> dict[Channel, Rows]:
-    """Stored traces on the clock of a recording that begins `ahead_s` after them."""
+    """Convert stored traces to the clock of a recording that begins `ahead_s` after them."""
     return _with_errors(
         {
             (t.stream, t.channel): Rows(t.first_end_s - ahead_s + t.dt_s * np.arange(t.n, dtype=np.float64), unpack(t), t.dt_s, t.unit)
@@ -122,7 +122,7 @@ def of_stored(traces: Sequence[Trace], ahead_s: float) -> dict[Channel, Rows]:
 
 
 def _with_errors(found: Mapping[Channel, Rows]) -> dict[Channel, Rows]:
-    """The traces without the standard errors of beta, which go with beta's rows."""
+    """Join the standard errors of beta to beta's rows, and return the other traces."""
     errors = {channel: rows.values for (stream, channel), rows in found.items() if stream == ERROR_STREAM}
     return {
         key: replace(rows, error=errors[key[1]]) if key[0] == BETA and key[1] in errors else rows
@@ -132,7 +132,7 @@ def _with_errors(found: Mapping[Channel, Rows]) -> dict[Channel, Rows]:
 
 
 def relation(new: Mapping[Channel, Rows], old: Mapping[Channel, Rows]) -> Relation:
-    """What one recording is to another one of the same minutes, both on one clock."""
+    """Determine the relation of one recording to another one of the same minutes, both on one clock."""
     shared = [key for key in new.keys() & old.keys() if key[0] in NEURAL]
     alike = [found for key in shared if (found := _alike(new[key], old[key])) is not None]
     if not all(alike):
@@ -147,7 +147,7 @@ def relation(new: Mapping[Channel, Rows], old: Mapping[Channel, Rows]) -> Relati
 
 
 def _alike(a: Rows, b: Rows) -> bool | None:
-    """Whether two traces of a channel hold the same signal; None where they share too few rows to tell."""
+    """Decide whether two traces of a channel have the same signal; None where they share too few rows."""
     if a.unit != b.unit or abs(a.dt_s - b.dt_s) > EXACT_S or not a.end_s.size or not b.end_s.size:
         return None
     off = (a.end_s[0] - b.end_s[0]) / b.dt_s
@@ -169,10 +169,10 @@ def _alike(a: Rows, b: Rows) -> bool | None:
 
 
 def _equal(x: NDArray[np.float64], y: NDArray[np.float64], error: NDArray[np.float64]) -> bool | None:
-    """Whether rows on one grid are those of one signal; None where they cannot tell.
+    """Decide whether rows on one grid are those of one signal; None where they do not show it.
 
-    Whole rows, for which nothing was predicted, are held against each other; where they are too few, all rows, to within a part of their
-    standard errors.
+    Whole rows, for which nothing was predicted, are compared. Where they are too few, all rows are, to within a part of their standard
+    errors.
 
     Args:
         x, y: values, [n].
@@ -190,12 +190,12 @@ def _equal(x: NDArray[np.float64], y: NDArray[np.float64], error: NDArray[np.flo
 
 
 def _holds(fuller: Mapping[Channel, Rows], less: Mapping[Channel, Rows]) -> bool:
-    """Whether one recording has every channel of another, and a valid row in the place of each of its valid rows."""
+    """Decide whether one recording has every channel of another, and a valid row in the place of each of its valid rows."""
     return all(key in fuller and _lacks(fuller[key], rows) <= max(1.0, LOST * rows.valid_end_s.size) for key, rows in less.items())
 
 
 def _lacks(fuller: Rows, less: Rows) -> int:
-    """How many valid rows of a trace have no valid row of another within one row of their own."""
+    """Count the valid rows of a trace that have no valid row of another within one row of their own."""
     wanted, there = less.valid_end_s, fuller.valid_end_s
     if not there.size:
         return wanted.size
@@ -205,7 +205,7 @@ def _lacks(fuller: Rows, less: Rows) -> int:
 
 
 def judge(db: Session, like: Recording, traces: Sequence[TraceLog]) -> Verdict:
-    """Hold a decoded recording against the stored ones of its device, side and minutes.
+    """Compare a decoded recording with the stored ones of its device, side and minutes.
 
     Args:
         like: its row, which need not be stored yet: device, side, start and length. traces: as decoded.
@@ -232,12 +232,12 @@ def judge(db: Session, like: Recording, traces: Sequence[TraceLog]) -> Verdict:
 
 
 def _of_a_session(recording: Recording) -> bool:
-    """Whether a recording may be part of a session: surveys and a device's history share their minutes with others by nature."""
+    """Decide whether a recording may be part of a session: surveys and a device's history share their minutes with others by nature."""
     return recording.details.get("run", 0) is not None
 
 
 def sessions_of(db: Session, recording: Recording) -> list[StudySession]:
-    """Sessions with a part of a recording."""
+    """List the sessions with a part of a recording."""
     return [db.get_one(StudySession, number) for number in sorted(study.session_ids_of_recording(db, recording.id))]
 
 

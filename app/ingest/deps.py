@@ -15,7 +15,7 @@ from app.study.models import StudySession
 
 
 def current_proposal(session_id: RowId, db: Db, caller: CurrentCaller) -> StudySession:
-    """The session, once or still proposed, that the path names."""
+    """Find the session that the path names, confirmed or still proposed."""
     repository.proposal(db, session_id, caller)
     return study.session(db, session_id, caller)
 

@@ -18,7 +18,7 @@ def _cipher() -> Fernet:
 
 
 def encrypt(original: Source) -> Path:
-    """A draft file with the encrypted bytes of a file, one line per MiB; the original is left where it is."""
+    """Encrypt a file into a draft, one line per MiB; the original is left where it is."""
     cipher, sealed = _cipher(), draft_path()
     try:
         with original.open("rb") as source, sealed.open("wb") as out:
@@ -31,7 +31,7 @@ def encrypt(original: Source) -> Path:
 
 
 def decrypt(path: Path) -> Iterator[bytes]:
-    """The original bytes of a quarantined file, a MiB at a time. Raises cryptography's InvalidToken when they were tampered with."""
+    """Yield the original bytes of a quarantined file, a MiB at a time. Raises cryptography's InvalidToken when they were tampered with."""
     cipher = _cipher()
     with path.open("rb") as source:
         for line in source:

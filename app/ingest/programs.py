@@ -1,4 +1,4 @@
-"""Which program's amplitude a controller is taken to have set, where a recording has several."""
+"""Choice of the program whose amplitude a controller is taken to have set, where a recording has several."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from app.study.traces import AMPLITUDE_STREAM, amplitude_program, unpack
 
 
 class How(StrEnum):
-    """How the amplitude of a program ran."""
+    """Course of the amplitude of a program."""
 
     MOVED = "moved"
     CONSTANT = "constant"
@@ -37,7 +37,7 @@ class Program:
 
 
 def of_part(traces: Sequence[Trace], start_s: float, stop_s: float) -> list[Program]:
-    """Every program of a recording within a part of it (s), the one that a controller is taken to have set first."""
+    """List every program of a recording within a part of it (s), the one that a controller is taken to have set first."""
     found = [_program(t, start_s, stop_s) for t in traces if t.stream == AMPLITUDE_STREAM]
     return sorted(found, key=lambda p: (ORDER.index(p.how), -np.nan_to_num(p.high - p.low), -np.nan_to_num(p.high), p.number))
 

@@ -20,12 +20,12 @@ GRASP_KIND = "grasp"
 
 
 def lock_participant(db: Session, participant_id: int) -> None:
-    """Let one upload of a participant at a time make recordings and sessions; held to the end of the transaction."""
+    """Let one upload of a participant at a time make recordings and sessions; locked to the end of the transaction."""
     db.execute(select(Participant.id).where(Participant.id == participant_id).with_for_update())
 
 
 def decoded_file(db: Session, participant_id: int, sha256: str) -> UploadFile | None:
-    """The participant's file of these original bytes, if it was decoded before."""
+    """Find the participant's file of these original bytes, if it was decoded before."""
     return db.scalar(
         select(UploadFile).where(
             UploadFile.participant_id == participant_id, UploadFile.original_sha256 == sha256, UploadFile.status == "decoded"
@@ -34,7 +34,7 @@ def decoded_file(db: Session, participant_id: int, sha256: str) -> UploadFile | 
 
 
 def failed_file(db: Session, participant_id: int, file: UploadFile) -> UploadFile | None:
-    """The participant's earlier file of the same original bytes that could not be used either, and that nobody has decided on."""
+    """Find the participant's earlier file of the same original bytes that could not be used either, and that awaits a decision."""
     same = (UploadFile.original_sha256 == file.original_sha256) & (UploadFile.id < file.id) & (UploadFile.status == "failed")
     sealed = UploadFile.quarantine_sha256.is_not(None) if file.quarantine_sha256 else UploadFile.quarantine_sha256.is_(None)
     query = select(UploadFile).where(UploadFile.participant_id == participant_id, same, sealed, UploadFile.decided_at.is_(None))
@@ -42,13 +42,13 @@ def failed_file(db: Session, participant_id: int, file: UploadFile) -> UploadFil
 
 
 def names_stored(db: Session, sha256: str) -> bool:
-    """Whether any uploaded file has these stored bytes, cleaned, encrypted or released."""
+    """Decide whether any uploaded file has these stored bytes, cleaned, encrypted or released."""
     columns = (UploadFile.stored_sha256, UploadFile.quarantine_sha256, UploadFile.released_sha256)
     return db.scalar(select(UploadFile.id).where(or_(*(column == sha256 for column in columns))).limit(1)) is not None
 
 
 def session_ids_of_file(db: Session, file: UploadFile, known_recordings: Sequence[int] = ()) -> list[int]:
-    """Sessions that the recordings of a file belong to, or that the file was attached to.
+    """List the sessions that the recordings of a file belong to, or that the file was attached to.
 
     Args:
         known_recordings: recordings of the file that another file had brought before.
@@ -60,12 +60,12 @@ def session_ids_of_file(db: Session, file: UploadFile, known_recordings: Sequenc
 
 
 def device(db: Session, participant_id: int, pseudonym: str) -> Device | None:
-    """A participant's device."""
+    """Find a participant's device."""
     return db.scalar(select(Device).where(Device.participant_id == participant_id, Device.pseudonym == pseudonym))
 
 
 def upload(db: Session, upload_id: int, caller: Caller) -> tuple[Upload, Participant]:
-    """An upload and its participant. Raises NotFound."""
+    """Find an upload and its participant. Raises NotFound."""
     row = db.execute(
         select(Upload, Participant)
         .join(Participant, Participant.id == Upload.participant_id)
@@ -79,7 +79,7 @@ def upload(db: Session, upload_id: int, caller: Caller) -> tuple[Upload, Partici
 
 
 def uploads_of_participant(db: Session, participant_id: int, limit: int = 20) -> Sequence[Upload]:
-    """A participant's uploads, newest first."""
+    """List a participant's uploads, newest first."""
     return db.scalars(
         select(Upload)
         .where(Upload.participant_id == participant_id)
@@ -90,33 +90,33 @@ def uploads_of_participant(db: Session, participant_id: int, limit: int = 20) ->
 
 
 def unfinished_uploads(db: Session) -> Sequence[int]:
-    """Numbers of the uploads that were begun and not finished, oldest first."""
+    """List the numbers of the uploads that were begun and not finished, oldest first."""
     return db.scalars(select(Upload.id).where(Upload.status == "received").order_by(Upload.id)).all()
 
 
 def received_uploads(db: Session, participant_id: int) -> Sequence[int]:
-    """Numbers of a participant's uploads that were begun and not finished, oldest first."""
+    """List the numbers of a participant's uploads that were begun and not finished, oldest first."""
     mine = (Upload.participant_id == participant_id) & (Upload.status == "received")
     return db.scalars(select(Upload.id).where(mine).order_by(Upload.id)).all()
 
 
 def file_of_recording(db: Session, recording: Recording) -> UploadFile:
-    """The file that gave a recording, which has one."""
+    """Find the file that gave a recording, which has one."""
     return db.get_one(UploadFile, recording.upload_file_id)
 
 
 def recordings_of_file(db: Session, upload_file_id: int) -> Sequence[Recording]:
-    """Recordings that a file gave, in the order in which they were stored."""
+    """List the recordings that a file gave, in the order in which they were stored."""
     return db.scalars(select(Recording).where(Recording.upload_file_id == upload_file_id).order_by(Recording.id)).all()
 
 
 def recordings_by_id(db: Session, ids: Sequence[int]) -> Sequence[Recording]:
-    """Recordings by number."""
+    """Find recordings by number."""
     return db.scalars(select(Recording).where(Recording.id.in_(ids)).order_by(Recording.id)).all() if ids else []
 
 
 def recordings_of_minutes(db: Session, like: Recording) -> Sequence[Recording]:
-    """Recordings of the device and side of another one that share minutes with it and were not superseded, oldest first.
+    """List recordings of the device and side of another one that share minutes with it and were not superseded, oldest first.
 
     Args:
         like: it need not be stored; one of no known side is of both.
@@ -131,7 +131,7 @@ def recordings_of_minutes(db: Session, like: Recording) -> Sequence[Recording]:
 
 
 def fullest(db: Session, recordings: Sequence[Recording]) -> list[Recording]:
-    """Recordings, or the fuller copies that took their place, each once."""
+    """Replace recordings by the fuller copies that superseded them, each once."""
     found: dict[int, Recording] = {}
     for recording in recordings:
         while recording.superseded_by_id is not None:
@@ -141,20 +141,20 @@ def fullest(db: Session, recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def confirmed_sessions_of_recording(db: Session, recording_id: int, besides: int) -> Sequence[int]:
-    """Confirmed sessions that count on a recording, other than the one named."""
+    """List the confirmed sessions that count on a recording, other than the one named."""
     query = select(StudySession.id).join(SessionSegment, SessionSegment.session_id == StudySession.id)
     mine = (SessionSegment.recording_id == recording_id) & (StudySession.id != besides)
     return db.scalars(query.where(mine, StudySession.status == "confirmed").distinct()).all()
 
 
 def segments_of_recording(db: Session, recording_id: int, besides: int) -> Sequence[SessionSegment]:
-    """Parts of a recording that belong to sessions, other than the one named."""
+    """List the parts of a recording that belong to sessions, other than the one named."""
     query = select(SessionSegment).where(SessionSegment.recording_id == recording_id, SessionSegment.session_id != besides)
     return db.scalars(query.options(joinedload(SessionSegment.session)).order_by(SessionSegment.start_s)).all()
 
 
 def proposal(db: Session, session_id: int, caller: Caller, lock: bool = False) -> SessionProposal:
-    """The proposal behind a session; `lock`: held against others until the transaction ends. Raises NotFound."""
+    """Find the proposal behind a session; `lock`: no other may change it until the transaction ends. Raises NotFound."""
     query = (
         select(SessionProposal)
         .join(StudySession, StudySession.id == SessionProposal.session_id)
@@ -170,26 +170,26 @@ def proposal(db: Session, session_id: int, caller: Caller, lock: bool = False) -
 
 
 def proposals(db: Session, session_ids: Sequence[int]) -> dict[int, SessionProposal]:
-    """Proposals by session."""
+    """Map sessions to their proposals."""
     return {p.session_id: p for p in db.scalars(select(SessionProposal).where(SessionProposal.session_id.in_(session_ids)))}
 
 
 def overlapping_sessions(db: Session, participant_id: int, begin: datetime, end: datetime) -> Sequence[StudySession]:
-    """A participant's sessions, proposed ones too, with a start before `end`, newest first, that may share time with [begin, end]."""
+    """List a participant's sessions, proposed ones too, with a start before `end`, newest first, that may share time with [begin, end]."""
     query = select(StudySession).join(StudySession.visit).where(Visit.participant_id == participant_id)
     near = StudySession.started_at.between(begin - timedelta(days=1), end)
     return db.scalars(query.where(near).order_by(StudySession.id.desc())).all()
 
 
 def waiting_grasp_files(db: Session, participant_id: int) -> Sequence[UploadFile]:
-    """Decoded grasp files that no session has yet, oldest first."""
+    """List decoded grasp files that no session has yet, oldest first."""
     mine = (UploadFile.participant_id == participant_id) & (UploadFile.kind == GRASP_KIND)
     query = select(UploadFile).where(mine, UploadFile.status == "decoded", UploadFile.session_id.is_(None))
     return db.scalars(query.order_by(UploadFile.id)).all()
 
 
 def upload_file(db: Session, file_id: int, caller: Caller, lock: bool = False) -> tuple[UploadFile, Participant]:
-    """A file of an upload and its participant; `lock`: held until the transaction ends. Raises NotFound."""
+    """Find a file of an upload and its participant; `lock`: no other may change it until the transaction ends. Raises NotFound."""
     query = (
         select(UploadFile, Participant)
         .join(Participant, Participant.id == UploadFile.participant_id)
@@ -203,18 +203,18 @@ def upload_file(db: Session, file_id: int, caller: Caller, lock: bool = False) -
 
 
 def files_of_upload(db: Session, upload_id: int) -> Sequence[UploadFile]:
-    """The files of an upload in the order in which they came."""
+    """List the files of an upload in the order in which they came."""
     return db.scalars(select(UploadFile).where(UploadFile.upload_id == upload_id).order_by(UploadFile.id)).all()
 
 
 def quarantined_files(db: Session, participant_id: int) -> Sequence[UploadFile]:
-    """Files that are, or were, kept encrypted because they could not be read, newest first."""
+    """List files that are, or were, stored encrypted because they could not be read, newest first."""
     touched = UploadFile.quarantine_sha256.is_not(None) | UploadFile.decided_at.is_not(None)
     return db.scalars(select(UploadFile).where(UploadFile.participant_id == participant_id, touched).order_by(UploadFile.id.desc())).all()
 
 
 def readable_files(db: Session, participant_id: int | None, upload_file_id: int | None) -> Sequence[int]:
-    """Numbers of the decoded files, of one participant or one file where named, oldest first."""
+    """List the numbers of the decoded files, of one participant or one file where named, oldest first."""
     query = select(UploadFile.id).where(UploadFile.status == "decoded", UploadFile.stored_sha256.is_not(None))
     if participant_id is not None:
         query = query.where(UploadFile.participant_id == participant_id)

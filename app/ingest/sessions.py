@@ -30,10 +30,10 @@ LONGEST_STEP_S = 60.0
 
 @dataclass(frozen=True)
 class StatedSession:
-    """What the sender says of the sessions in an upload.
+    """Statement of the sender about the sessions in an upload.
 
     Attributes:
-        visit, controller: None where the sender leaves it to the files and to whoever confirms the proposals.
+        visit, controller: None where the sender leaves it to the files and to the person who confirms the proposals.
         confirm: whether what is stated counts at once; without a controller and a visit nothing does.
         session: where files without a clock (grasp tests) belong; None: the single session of the upload.
     """
@@ -48,7 +48,7 @@ class StatedSession:
 
     @property
     def counts(self) -> bool:
-        """Whether the sessions are confirmed as they arrive."""
+        """True where the sessions are confirmed as they arrive."""
         return self.confirm and self.controller is not None and self.visit is not None
 
 
@@ -67,14 +67,15 @@ class Placement:
 
 
 def makes_session(traces: Sequence[Trace], recording: Recording) -> bool:
-    """Whether a recording holds data of a session: any valid row, on a grid of steps, and not what the device calls a test or a history."""
+    """Decide whether a recording has data of a session: any valid row, on a grid of steps. What the device calls a test or a history is
+    none."""
     if recording.details.get("run", 0) is None:
         return False
     return any(t.dt_s <= LONGEST_STEP_S and any(t.valid_bits) for t in traces)
 
 
 def together(recordings: Sequence[Recording]) -> list[list[Recording]]:
-    """Groups of recordings that belong to one session each, by start; recordings without a time stay with their run in the file."""
+    """Group recordings that belong to one session each, by start; recordings without a time stay with their run in the file."""
     groups: list[list[Recording]] = []
     for recording in sorted(recordings, key=lambda r: (r.started_at is None, r.started_at, r.id)):
         home = next((g for g in groups if any(_belong(recording, other) for other in g)), None)
@@ -94,13 +95,13 @@ def _belong(a: Recording, b: Recording) -> bool:
 
 
 def place(db: Session, participant: Participant, recordings: Sequence[Recording], stated: StatedSession, alone: bool) -> Placement:
-    """Where a session lies in its recordings.
+    """Place a session in its recordings.
 
     Args:
         recordings: of one session, none of them empty.
-        alone: whether the upload holds these recordings alone, so that a stated start is theirs where they tell none.
+        alone: whether the upload has these recordings alone, so that a stated start is theirs where they have none.
 
-    A stated start counts where it lies within the recording: a recording's own clock is never overruled, but the notes say so.
+    A stated start counts where it is within the recording: a recording's own clock is never overruled, but the notes report it.
     """
     settings = participant.current_settings
     choices = []
@@ -120,7 +121,7 @@ def place(db: Session, participant: Participant, recordings: Sequence[Recording]
 
 
 def _start(stated: StatedSession, recording: Recording, alone: bool) -> datetime | None:
-    """When a session of a recording begins: as stated where that lies within the recording, else with the recording."""
+    """Choose the start of a session of a recording: as stated where that is within the recording, else with the recording."""
     counts = stated.started_at is not None and _inside(stated.started_at, recording) and (alone or recording.started_at is not None)
     return stated.started_at if counts else recording.started_at
 
@@ -140,7 +141,8 @@ def _inside(moment: datetime, recording: Recording) -> bool:
 
 
 def offset_s(recording: Recording, started_at: datetime | None, period_s: float) -> float:
-    """Where a session that starts at `started_at` begins in a recording, seconds, on the recording's grid; what comes before is its lead.
+    """Compute where a session that starts at `started_at` begins in a recording, seconds, on the recording's grid; what comes before is its
+    lead.
 
     A recording without a time of its own begins with the session, and so does one that does not reach to the stated start.
     """
@@ -182,7 +184,7 @@ def add_session(
     hemisphere: Hemisphere | None,
     counts: bool,
 ) -> StudySession:
-    """A new session, confirmed or proposed. Raises Conflict where it would count in a locked visit."""
+    """Add a session, confirmed or proposed. Raises Conflict where it would count in a locked visit."""
     if counts:
         require_unlocked(visit)
     session = StudySession(
@@ -203,7 +205,7 @@ def add_session(
 
 
 def fix_milliamperes(db: Session, session: StudySession) -> list[str]:
-    """Fractions as the milliamperes they were, by the cDBS amplitude in force as the session is confirmed; sentences where that fails.
+    """Convert fractions to milliamperes, by the cDBS amplitude in force as the session is confirmed; returns sentences where that fails.
 
     What was delivered must not change when the cDBS amplitude does. Traces of a recording that an earlier session counts on stay.
     """
@@ -235,7 +237,7 @@ def in_milliamperes(trace: Trace, cdbs_ma: float) -> None:
 
 
 def refuse_overlap(db: Session, session: StudySession) -> None:
-    """Raises Conflict where a confirmed session already counts on the same stretch of a recording, or of its device in another one."""
+    """Raise Conflict where a confirmed session already counts on the same stretch of a recording, or of its device in another one."""
     repeated.refuse(db, session)
     for segment in session.segments:
         for other in repository.segments_of_recording(db, segment.recording_id, besides=session.id):
@@ -265,7 +267,7 @@ def count(db: Session, session: StudySession) -> None:
 
 
 def counted_minutes(db: Session, placement: Placement) -> bool:
-    """Whether a session that counts has the minutes of a placement already, of the same device in another recording."""
+    """Decide whether a session that counts has the minutes of a placement already, of the same device in another recording."""
     began = placement.control.started_at
     if began is None:
         return False
@@ -274,7 +276,7 @@ def counted_minutes(db: Session, placement: Placement) -> bool:
 
 
 def disagreements(db: Session, session_ids: Sequence[int], stated: StatedSession) -> list[str]:
-    """Sentences where known sessions are not what the sender now says of them."""
+    """List sentences where known sessions are not what the sender now states about them."""
     found = []
     for session_id in dict.fromkeys(session_ids):
         session = study.session(db, session_id, SYSTEM)

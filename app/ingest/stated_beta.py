@@ -1,4 +1,4 @@
-"""What somebody states of a table's beta, which the file itself cannot tell: its unit and its source."""
+"""Stated beta of a table: its unit and its source, which the file itself cannot show."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ml.formats.tables.numbers import unit_name
 
 @dataclass(frozen=True)
 class BetaStated:
-    """What the sender says of a table: unit and source (as in the settings) of its beta, and the unit of its LFP."""
+    """Statement of the sender about a table: unit and source (as in the settings) of its beta, and the unit of its LFP."""
 
     unit: str | None = None
     source: str | None = None
@@ -23,7 +23,7 @@ _UNITS_OF_FILES = {"header": "as the file's header says", "mapping": "as the col
 
 
 def name_beta(decoded: DecodedFile, beta: BetaStated, settings: SettingsVersion) -> DecodedFile:
-    """A table's own beta under its source; the report gets a sentence that says who stated unit and source.
+    """Put a table's own beta under its source; the report gets a sentence that names who stated unit and source.
 
     Beta that was computed here, from a table of raw LFP, keeps the source `time_domain` and the unit it was computed in.
     """
@@ -44,12 +44,12 @@ def name_beta(decoded: DecodedFile, beta: BetaStated, settings: SettingsVersion)
 
 
 def _stated_by_a_person(trace: TraceLog) -> bool:
-    """Whether a trace is the beta column of a table, whose source nobody but a person can tell."""
+    """Decide whether a trace is the beta column of a table, whose source only a person can state."""
     return trace.stream == "beta" and trace.source == "table"
 
 
 def _stated_by(by_upload: str | None, by_settings: str | None) -> str:
-    """Who stated a unit or a source."""
+    """Name who stated a unit or a source."""
     if by_upload:
         return "as stated with the upload"
     return "as the participant's settings say" if by_settings else "because nobody stated one"

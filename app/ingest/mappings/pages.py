@@ -1,4 +1,4 @@
-"""HTML pages of column mappings: the form beside a waiting table's preview, and the mappings of a study."""
+"""HTML pages of column mappings: the form with a waiting table's preview, and the mappings of a study."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ UNIT_CHOICES = tuple(dict.fromkeys(unit for units in UNITS.values() for unit in 
 
 @router.get("/uploaded-files/{file_id}/mapping")
 def mapping_page(request: Request, file_id: RowId, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """A waiting table's first lines, and what its columns may be said to hold."""
+    """Show a waiting table's first lines, and what its columns may have."""
     table = service.waiting_table(db, file_id, caller)
     return _form_page(request, table, _stored(table.known) if table.known else _guessed(table.preview))
 
@@ -85,7 +85,7 @@ def read_by_mapping(request: Request, file_id: RowId, db: Db, caller: CurrentCal
 
 @router.get("/studies/{study_code}/column-mappings")
 def mappings_page(request: Request, study_code: str, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """The column mappings of a study, those in force first."""
+    """Show the column mappings of a study, those in force first."""
     return _list_page(request, db, repository.study_of(db, study_code, caller), caller)
 
 
@@ -104,7 +104,7 @@ def remove_mapping(request: Request, mapping_id: RowId, db: Db, caller: CurrentC
 
 
 def _wanted(values: FormData) -> MappingIn:
-    """The mapping that a form states. Raises Invalid, with every field that is wrong."""
+    """Read the mapping that a form states. Raises Invalid, with every field that is wrong."""
     columns: list[dict[str, Any]] = []
     for name in values:
         if name.startswith("role_") and values[name] and name.removeprefix("role_").isdecimal():
@@ -119,7 +119,7 @@ def _wanted(values: FormData) -> MappingIn:
 
 
 def _at_fields(error: BetaloopError) -> BetaloopError:
-    """The same error, each of its `errors` with the form's field as its `name`; a column's is that of its row."""
+    """Assign each of an error's `errors` the form's field as its `name`; a column's is that of its row."""
     names = {label: name for name, label in LABELS.items()}
     told = [dict(e) | {"name": names.get(e["where"], e["where"].lower().replace(" ", "_"))} for e in error.extra.get("errors", ())]
     if told:
@@ -128,7 +128,7 @@ def _at_fields(error: BetaloopError) -> BetaloopError:
 
 
 def _column_where(where: str, columns: list[dict[str, Any]]) -> str:
-    """`columns.2.unit` as the page calls it."""
+    """Name `columns.2.unit` as the page does."""
     parts = where.split(".")
     if parts[0] != "columns" or len(parts) < 2 or not parts[1].isdecimal():
         return where
@@ -136,7 +136,7 @@ def _column_where(where: str, columns: list[dict[str, Any]]) -> str:
 
 
 def _guessed(preview: dict[str, Any]) -> dict[str, str]:
-    """What the form begins with: lines as they look like, and the units that stand in names or below them."""
+    """Guess what the form begins with: lines as they look, and the units in names or below them."""
     at = next(i for i, line in enumerate(preview["lines"]) if line["number"] == preview["header_line"])
     typed = {"header_line": str(preview["header_line"]), "unit_lines": str(preview["unit_lines"])}
     near = [line["cells"] for line in preview["lines"][at : at + 1 + preview["unit_lines"]]]
@@ -148,7 +148,7 @@ def _guessed(preview: dict[str, Any]) -> dict[str, str]:
 
 
 def _stored(row: ColumnMapping) -> dict[str, str]:
-    """A stored mapping as the form shows it."""
+    """Convert a stored mapping to the form's fields."""
     mapping = row.as_mapping
     typed = {"name": row.name, "unit_lines": str(mapping.unit_lines), "holds": mapping.holds, "time_format": mapping.time_format}
     typed |= {"zone": mapping.zone or "", "rate_hz": "" if mapping.rate_hz is None else f"{mapping.rate_hz:g}"}
@@ -190,7 +190,7 @@ def _form_page(request: Request, table: WaitingTable, typed: dict[str, str], err
 def _list_page(
     request: Request, db: Session, study: Study, caller: Caller, error: BetaloopError | None = None, sent: int | None = None
 ) -> HTMLResponse:
-    """The list; `sent` is the mapping whose form was refused."""
+    """Show the list; `sent` is the mapping whose form was refused."""
     rows = mappings_out(repository.versions(db, study.id), repository.present(db, study.id))
     page = render(
         request,

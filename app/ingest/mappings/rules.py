@@ -1,4 +1,4 @@
-"""What a column mapping must say to be unambiguous: every breach is told with its field."""
+"""Rules that make a column mapping unambiguous: every breach is reported with its field."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _NEEDED_SHARES = ("tremor_none", "tremor_slight", "tremor_mild", "tremor_moderat
 
 
 def mapping_of(wanted: MappingIn, preview: dict[str, Any]) -> TableMapping:
-    """A mapping out of what a person stated, and the preview that they saw.
+    """Build a mapping from what a person stated, and the preview that they saw.
 
     Raises:
         Invalid: names each field that is wrong and why; the document's `errors` holds them.
@@ -128,7 +128,7 @@ def _channel(column: MappedColumnIn) -> str | None:
 
 
 def _sides(wanted: MappingIn) -> list[tuple[str, str]]:
-    """Sides are told of all signals and amplitudes or of none; no side has two equal ones."""
+    """Check that sides are stated of all signals and amplitudes or of none, and that no side has two equal ones."""
     errors = []
     both = [c for c in wanted.columns if c.role in (*SIGNALS, *AMPLITUDES)]
     if any(c.side for c in both):
@@ -144,7 +144,7 @@ def _sides(wanted: MappingIn) -> list[tuple[str, str]]:
 
 
 def _whole(wanted: MappingIn) -> list[tuple[str, str]]:
-    """Whether the table has all that it needs."""
+    """Check that the table has all that it needs."""
     roles = [c.role for c in wanted.columns]
     errors = []
     if (times := roles.count("time")) != 1:

@@ -12,7 +12,7 @@ from app.ingest.schemas import FileReportOut
 
 
 def mapping_out(row: ColumnMapping, current: bool) -> MappingOut:
-    """A version of a mapping for the API."""
+    """Convert a version of a mapping for the API."""
     stored = row.as_mapping
     return MappingOut(
         id=row.id,
@@ -35,13 +35,13 @@ def mapping_out(row: ColumnMapping, current: bool) -> MappingOut:
 
 
 def mappings_out(rows: Sequence[ColumnMapping], present: Sequence[ColumnMapping]) -> list[MappingOut]:
-    """Versions of mappings for the API; `present` are those in force."""
+    """Convert versions of mappings for the API; `present` are those in force."""
     in_force = {row.id for row in present}
     return [mapping_out(row, row.id in in_force) for row in rows]
 
 
 def preview_out(table: WaitingTable) -> PreviewOut:
-    """A waiting table for the API."""
+    """Convert a waiting table for the API."""
     shown = table.preview
     return PreviewOut(
         file_id=table.file.id,
@@ -56,7 +56,7 @@ def preview_out(table: WaitingTable) -> PreviewOut:
 
 
 def applied_out(applied: Applied) -> MappedOut:
-    """What came of a mapping for the API."""
+    """Convert the result of a mapping for the API."""
     return MappedOut(
         mapping=mapping_out(applied.mapping, True),
         report=[FileReportOut.model_validate(r) for f in applied.outcomes for r in f.reports],

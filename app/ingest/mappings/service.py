@@ -43,7 +43,7 @@ class Applied:
 
 
 def waiting_table(db: Session, file_id: int, caller: Caller, lock: bool = False) -> WaitingTable:
-    """A table that waits for a mapping, for those who may upload.
+    """Find a table that waits for a mapping, for those who may upload.
 
     Raises:
         NotFound: no such file, or it waits for none. Forbidden: the caller may not upload.
@@ -75,13 +75,13 @@ def read_by(db: Session, file_id: int, wanted: MappingIn, caller: Caller) -> App
         try:
             applied.outcomes += quarantine.read_held(db, other, table.participant, why, caller).files
         except (Conflict, Invalid):
-            # the mapping is stored and has read the first table: what is wrong with another one is said where that one is read; it waits on
+            # The mapping is stored and has read the first table. An error in another table is reported where that one is read; it waits on.
             applied.waiting.append(other.id)
     return applied
 
 
 def _store(db: Session, table: WaitingTable, mapping: TableMapping, wanted: MappingIn, caller: Caller) -> ColumnMapping:
-    """The next version of the mapping of a header, not committed."""
+    """Store the next version of the mapping of a header, not committed."""
     study_id = table.participant.site.study_id
     before = repository.newest(db, study_id, mapping.header)
     names = next(line["cells"] for line in table.preview["lines"] if line["header"] == mapping.header)
@@ -103,7 +103,7 @@ def _store(db: Session, table: WaitingTable, mapping: TableMapping, wanted: Mapp
 
 
 def may_remove(caller: Caller, study_id: int, created_by: str) -> bool:
-    """Whether somebody may end a mapping of a study: who uploads at all of its sites, and whoever made it."""
+    """Decide whether the caller may end a mapping of a study: users who upload at all of its sites may, and its author."""
     everywhere = any(g.study_id == study_id and g.site_id is None for g in caller.grants_with(can.UPLOAD))
     return caller.may(can.UPLOAD, study_id) and (caller.is_system or everywhere or created_by == caller.label)
 
@@ -112,8 +112,8 @@ def remove(db: Session, mapping_id: int, reason: str, caller: Caller) -> ColumnM
     """End a mapping: what was read by it stays, the next table with its header asks again. Not committed.
 
     Raises:
-        NotFound: no such mapping. Forbidden: the caller may not upload in the study, or works at one site alone and has not made it: tables
-            of every site are read by it. Conflict: it is not the present version.
+        NotFound: no such mapping. Forbidden: the caller may not upload in the study. Forbidden too: the caller works at one site alone and
+            has not made it, since tables of every site are read by it. Conflict: it is not the present version.
     """
     row = repository.mapping(db, mapping_id, caller)
     caller.require(can.UPLOAD, row.study_id)

@@ -17,7 +17,7 @@ from app.study.sessions.usable_steps import usable_steps
 
 
 def survey(session: StudySession) -> Evidence | None:
-    """That a recording is a survey of sensing montages, in which no controller was at work; None where it is none."""
+    """Report that a recording is a survey of sensing montages, in which no controller was at work; None where it is none."""
     recording = control_recording(session)
     if not channels.is_survey(recording):
         return None
@@ -25,7 +25,7 @@ def survey(session: StudySession) -> Evidence | None:
 
 
 def why(db: Session, session: StudySession) -> Evidence:
-    """Why the control channel is what it is: its lead and usable steps, and those of the channels that were passed over."""
+    """Explain the choice of the control channel: its lead and usable steps, and those of the other channels."""
     recording = control_recording(session)
     traces = [t for t in study.traces_of_recording(db, recording.id) if t.stream == session.control_stream and any(t.valid_bits)]
     chosen = next((t for t in traces if t.channel == session.control_channel), None)
@@ -40,7 +40,7 @@ def why(db: Session, session: StudySession) -> Evidence:
 
 
 def renewed(db: Session, session: StudySession, evidence: Mapping[str, Any]) -> dict[str, Any]:
-    """The evidence of a proposal whose part changed: the control channel is chosen anew for it, unless a person stated it."""
+    """Update the evidence of a proposal whose part changed: the control channel is chosen again for it, unless a person stated it."""
     if "control" in evidence and Evidence.from_json(evidence["control"]).stated:
         return dict(evidence)
     control = next(s for s in session.segments if s.is_control)
@@ -68,7 +68,7 @@ def choose_program(db: Session, session: StudySession) -> Evidence | None:
 
 
 def renewed_program(db: Session, session: StudySession, evidence: Mapping[str, Any]) -> dict[str, Any]:
-    """The evidence of a proposal after its part or side changed: the program is chosen anew, unless a person stated it."""
+    """Update the evidence of a proposal after its part or side changed: the program is chosen again, unless a person stated it."""
     if "program" in evidence and Evidence.from_json(evidence["program"]).stated:
         return dict(evidence)
     why = choose_program(db, session)
@@ -76,7 +76,7 @@ def renewed_program(db: Session, session: StudySession, evidence: Mapping[str, A
 
 
 def choose(db: Session, session: StudySession, given: dict[str, object]) -> None:
-    """The stated channel, which a control recording of the session must have."""
+    """Choose the stated channel, which a control recording of the session must have."""
     service.check_control(db, session, given)
     session.control_stream = str(given.get("control_stream") or session.control_stream)
     if given.get("control_program") is not None:

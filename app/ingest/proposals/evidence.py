@@ -1,4 +1,4 @@
-"""What a recording seems to be, by plain rules, each guess with its evidence. A person confirms or corrects it."""
+"""Guesses about a recording by plain rules, each with its evidence. A person confirms or corrects them."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from app.study.sessions.stimulation import Course, Delivered, Pattern, course
 
 
 class Source(StrEnum):
-    """Who or what says a value of a proposal."""
+    """Source of a value of a proposal."""
 
     UPLOAD = "upload"
     """The sender, with the upload."""
     PERSON = "person"
-    """Somebody who corrected the proposal; `by` names them."""
+    """A person who corrected the proposal; `by` names them."""
     CUT = "cut"
-    """Somebody who cut a recording into sessions."""
+    """A person who cut a recording into sessions."""
     RECORDING = "recording"
     """A rule that looked at the recording."""
 
 
 class Reason(StrEnum):
-    """Why a value is what it is; behind each the facts that a sentence about it needs."""
+    """Reason for a value; behind each the facts that a sentence about it needs."""
 
     STATED = "stated"
     """`by`, of a person; `open` where they left the value open."""
@@ -63,7 +63,7 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True)
 class Evidence:
-    """Why one value of a proposal is what it is. `app.ingest.wording` puts it in words."""
+    """Evidence for one value of a proposal. `app.ingest.wording` puts it in words."""
 
     source: Source
     reason: Reason
@@ -71,11 +71,11 @@ class Evidence:
 
     @property
     def stated(self) -> bool:
-        """Whether it is a person's word, which no guess replaces."""
+        """True where a person stated it, so that no guess replaces it."""
         return self.source is not Source.RECORDING
 
     def as_json(self) -> dict[str, Any]:
-        """For storage."""
+        """Convert the evidence for storage."""
         return {"source": self.source, "reason": self.reason, "facts": dict(self.facts)}
 
     @classmethod
@@ -98,7 +98,7 @@ class VisitGuess:
 
 
 def guess_visit(visits: Sequence[Visit], day: date | None, stated: Visit | None, today: date | None = None) -> VisitGuess:
-    """The stated visit, else the one on the recording's day, else an open place in the newest one that has taken place.
+    """Guess the visit: the stated one, else the one on the recording's day, else an open place in the newest one that has taken place.
 
     Args:
         visits: of the participant, by number; at least one.
@@ -124,7 +124,8 @@ def _recorded(reason: Reason, day: date | None, **facts: int) -> Evidence:
 
 
 def guess_controller(sides: Sequence[Delivered]) -> tuple[Controller | None, Evidence]:
-    """No DBS where no side was stimulated, cDBS where every side is constant at its cDBS amplitude, else left open; and why.
+    """Guess the controller, and why: no DBS where no side was stimulated, cDBS where every side is constant at its cDBS amplitude, else
+    open.
 
     Args:
         sides: of all recordings of the session. One whose amplitude is not known leaves the controller open.
@@ -135,11 +136,11 @@ def guess_controller(sides: Sequence[Delivered]) -> tuple[Controller | None, Evi
 
 
 def agreed(courses: Sequence[Course]) -> Controller | None:
-    """The controller that every side speaks for; None where they do not agree, or leave it open."""
+    """Find the controller that every side speaks for; None where they do not agree, or leave it open."""
     guesses = {c.controller for c in courses}
     return guesses.pop() if len(guesses) == 1 else None
 
 
 def stored_courses(facts: Mapping[str, Any]) -> list[Course]:
-    """The courses of the amplitude in stored evidence."""
+    """Read the courses of the amplitude in stored evidence."""
     return [Course(**{**c, "pattern": Pattern(c["pattern"])}) for c in facts["courses"]]

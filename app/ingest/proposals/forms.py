@@ -31,7 +31,7 @@ FIELDS = {"start_s": "from", "stop_s": "to", "control_stream": "control", "contr
 _PART_LABELS = {"start_s": "Begin", "stop_s": "End", "controller": "Controller"}
 
 HIDDEN = "hidden"
-"""Stands for a controller that is stated and may not be told; sent back, it changes nothing."""
+"""Replaces a controller that is stated and must stay hidden; sent back, it changes nothing."""
 PARTS = 6
 """Rows of the form that cuts a recording; longer days are cut twice, or over the interface."""
 
@@ -48,8 +48,8 @@ class ProposalForm:
         drawn: how the amplitudes of a random session were drawn; empty for other sessions.
         usable: usable steps by channel, the control channel first.
         programs: that the control recording has an amplitude of.
-        thumbnail: beta and amplitude at a glance, None where neither is known or they may not be told.
-        problem: why the form was refused. remarks: what of it stands at which field; `part-2` is a row of the form that cuts, `parts` all.
+        thumbnail: beta and amplitude at a glance, None where neither is known or they must stay hidden.
+        problem: why the form was refused. remarks: its parts, by field; `part-2` is a row of the form that cuts, `parts` all.
         to_add: the visit that can be made of the recording.
     """
 
@@ -72,7 +72,7 @@ class ProposalForm:
 
     @property
     def seen(self) -> str:
-        """The stored values for the form to send back, so that an old form's own corrections can be told from what others changed."""
+        """Stored values for the form to send back. They separate an old form's own corrections from what others changed."""
         return json.dumps(dict(self.stored))
 
     @property
@@ -82,12 +82,12 @@ class ProposalForm:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is open."""
+        """True where nothing is open."""
         return bool(self.typed["visit"] and self.typed["controller"])
 
 
 def texts(db: Session, session: StudySession, proposal: SessionProposal, caller: Caller) -> dict[str, str]:
-    """The values of a proposal as text."""
+    """Format the values of a proposal as text."""
     arm = blinding.visible_arm(session, caller)
     hidden = arm is None and blinding.is_stated(session)
     control = next(s for s in session.segments if s.is_control)
@@ -105,12 +105,12 @@ def texts(db: Session, session: StudySession, proposal: SessionProposal, caller:
 
 
 def typed_texts(values: Mapping[str, Any], session_id: int, stored: Mapping[str, str]) -> dict[str, str]:
-    """What the form sent for a proposal; a field that it does not have is as stored."""
+    """Read what the form sent for a proposal; a field that it does not have is as stored."""
     return {name: str(values.get(f"{name}-{session_id}", text)).strip() for name, text in stored.items()}
 
 
 def own_texts(values: Mapping[str, Any], session_id: int, stored: Mapping[str, str]) -> dict[str, str]:
-    """What a person changed in the form of a proposal: what was sent and is not what the form had shown, nor what is stored by now."""
+    """Find what a person changed in the form of a proposal. It was sent, differs from what the form had shown, and is not stored by now."""
     try:
         seen = json.loads(str(values.get(f"seen-{session_id}", "{}")))
     except ValueError:
@@ -121,13 +121,13 @@ def own_texts(values: Mapping[str, Any], session_id: int, stored: Mapping[str, s
 
 
 def typed_parts(values: Mapping[str, Any], session_id: int) -> list[dict[str, str]]:
-    """The rows of the form that cuts a recording, filled in or not."""
+    """Read the rows of the form that cuts a recording, filled in or not."""
     names = ("from", "to", "controller")
     return [{name: str(values.get(f"part-{session_id}-{i}-{name}", "")).strip() for name in names} for i in range(PARTS)]
 
 
 def as_change(session: StudySession, version: str, stored: Mapping[str, str], typed: Mapping[str, str]) -> ProposalChange:
-    """The fields that a person changed, as a correction. Raises Invalid, naming the field."""
+    """Convert the fields that a person changed to a correction. Raises Invalid, naming the field."""
     own = {name: text for name, text in typed.items() if text != stored[name]}
     fields: dict[str, Any] = {n: own[n] for n in ("visit", "controller", "policy", "hemisphere", "started_at") if n in own}
     if "visit" in own and not own["visit"]:
@@ -149,7 +149,7 @@ def as_change(session: StudySession, version: str, stored: Mapping[str, str], ty
 
 
 def as_parts(session: StudySession, rows: list[dict[str, str]]) -> list[PartIn]:
-    """The filled rows as parts of the recording. Raises Invalid, naming the row."""
+    """Convert the filled rows to parts of the recording. Raises Invalid, naming the row."""
     parts, errors = [], []
     for i, row in enumerate(rows, start=1):
         if not row["from"] and not row["to"]:
@@ -171,7 +171,7 @@ def as_parts(session: StudySession, rows: list[dict[str, str]]) -> list[PartIn]:
 
 
 def _time(session: StudySession, offset_s: float) -> str:
-    """A place in the control recording as the form shows it."""
+    """Format a place in the control recording as the form shows it."""
     begin = _begin(session)
     if begin is not None:
         return _clock(begin + timedelta(seconds=offset_s))
@@ -180,7 +180,7 @@ def _time(session: StudySession, offset_s: float) -> str:
 
 
 def _seconds(session: StudySession, text: str) -> float:
-    """A place in the control recording, s, from what the form sent. Raises ValueError."""
+    """Parse a place in the control recording, s, from what the form sent. Raises ValueError."""
     begin = _begin(session)
     if begin is not None:
         try:
@@ -202,7 +202,7 @@ def _seconds(session: StudySession, text: str) -> float:
 
 
 def _begin(session: StudySession) -> datetime | None:
-    """When the control recording began, by the session's own clock; None for a recording without one."""
+    """Find when the control recording began, by the session's own clock; None for a recording without one."""
     control = next(s for s in session.segments if s.is_control)
     if control.recording.started_at is None or session.started_at is None:
         return None
@@ -214,5 +214,5 @@ def _clock(moment: datetime) -> str:
 
 
 def is_clocked(session: StudySession) -> bool:
-    """Whether the form shows dates and times of day."""
+    """Decide whether the form shows dates and times of day."""
     return _begin(session) is not None

@@ -1,4 +1,4 @@
-"""Which controller a proposed session had, by what its recordings tell."""
+"""Guess of a proposed session's controller, from its recordings."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class Guess(NamedTuple):
 
 
 def controller(db: Session, session: StudySession) -> Guess:
-    """By the controller's own log where it names a session of a signed plan or a policy, else by the amplitudes of all sides."""
+    """Guess by the controller's own log where it names a session of a signed plan or a policy, else by the amplitudes of all sides."""
     slot = logged.slot_of_recording(db, control_recording(session))
     if slot is not None and slot.planned is not None:
         facts = {"visit": slot.visit_number, "position": slot.planned.position}
         if slot.planned.sealed and not session.visit.sealed:
-            # where it stands now everybody would be shown what its sealed plan hides
+            # in its present place, everyone would see what its sealed plan hides
             return Guess(None, None, Evidence(Source.RECORDING, Reason.SLOT, facts))
         return Guess(Controller(slot.planned.controller), slot.planned.policy_id, Evidence(Source.RECORDING, Reason.SLOT, facts))
     ran = logged.of_recording(db, control_recording(session))

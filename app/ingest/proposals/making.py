@@ -43,7 +43,8 @@ class NewSession:
 def make_sessions(
     db: Session, participant: Participant, upload: Upload, recordings: Sequence[Recording], stated: StatedSession
 ) -> list[NewSession]:
-    """Sessions of recordings that have none: confirmed where the sender stated visit and controller and says so, else proposed."""
+    """Make sessions of recordings that have none: confirmed where the sender stated visit and controller and confirms them, else
+    proposed."""
     usable = [r for r in recordings if sessions.makes_session(study.traces_of_recording(db, r.id), r)]
     groups = sessions.together(usable)
     return [_make(db, participant, upload, group, stated, alone=len(groups) == 1) for group in groups]
@@ -105,7 +106,7 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
 
 
 def _seen(session: StudySession, placement: Placement) -> str:
-    """Which trace of which side the controller is taken to have seen, in words."""
+    """Describe which trace of which side the controller is taken to have seen, in words."""
     trace = f"{session.control_stream.replace('_', ' ')} {session.control_channel or ''}".strip()
     others = [r for r in placement.recordings if r is not placement.control]
     side = (
@@ -120,9 +121,9 @@ def _seen(session: StudySession, placement: Placement) -> str:
 
 
 def _join_earlier(db: Session, participant: Participant, group: list[Recording], stated: StatedSession) -> NewSession | None:
-    """The sessions of earlier uploads that these recordings share their time with (the other implant came first), if there are any.
+    """Find the sessions of earlier uploads that these recordings share their time with (the other implant came first), if there are any.
 
-    A confirmed session gets them beside its controlled recording: nothing that counts changes.
+    A confirmed session gets them in addition to its controlled recording: nothing that counts changes.
     """
     first = group[0]
     if first.started_at is None:
@@ -148,7 +149,7 @@ def _join_earlier(db: Session, participant: Participant, group: list[Recording],
 
 
 def _joined(db: Session, session: StudySession, stated: StatedSession) -> tuple[str, list[str]]:
-    """What to tell of recordings that were added to a session that was there, after their time."""
+    """Report recordings that were added to an existing session, after their time."""
     differs = sessions.disagreements(db, [session.id], stated)
     if session.status == "confirmed":
         side = f" ({control_recording(session).hemisphere} side)" if control_recording(session).hemisphere else ""

@@ -46,13 +46,13 @@ SHOWN = 40
 
 @router.get("/participants/{code}/proposals")
 def proposals_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, confirmed: str = "") -> HTMLResponse:
-    """All proposals of a participant in one form; what was just confirmed is listed with its contradictions."""
+    """Show all proposals of a participant in one form; what was just confirmed is listed with its contradictions."""
     return _page(request, db, participant, caller, confirmed=[int(i) for i in confirmed.split(",") if i.isdecimal() and len(i) < 10])
 
 
 @router.get("/proposals/{session_id}")
 def proposal_page(request: Request, session: CurrentProposal, db: Db, caller: CurrentCaller) -> Response:
-    """One proposal with its traces; a confirmed one has a page as a session."""
+    """Show one proposal with its traces; a confirmed one has a page as a session."""
     if session.status != "proposed":
         return RedirectResponse(f"/sessions/{session.id}", 303)
     return _page(request, db, session.visit.participant, caller, only=session)
@@ -117,7 +117,7 @@ def _decide_one(
     values: Mapping[str, str],
     caller: Caller,
 ) -> bool:
-    """One proposal of the posted form; whether it was confirmed."""
+    """Decide on one proposal of the posted form; returns whether it was confirmed."""
     stored = texts(db, session, proposal, caller)
     own = own_texts(values, session.id, stored)
     typed = {**stored, **own}
@@ -137,13 +137,13 @@ def _decide_one(
         proposals.confirm(db, session, as_change(session, version, stored, typed), caller)
         return True
     elif own:
-        # what another tab changed meanwhile stays as it is there; an own correction beside it is refused by its version, not lost
+        # what another tab changed in between stays; an own correction of it is refused by its version, not lost
         proposals.change(db, session, as_change(session, version, stored, typed), caller)
     return False
 
 
 def _cut(db: Session, session: StudySession, version: int, rows: list[dict[str, str]], caller: Caller) -> None:
-    """Cut a recording; what is wrong with a part is said of the parts, for the fields of a correction are others."""
+    """Cut a recording. An error in a part is reported at the parts, since a correction has other fields."""
     try:
         proposals.split(db, session, version, as_parts(session, rows), caller)
     except Invalid as error:

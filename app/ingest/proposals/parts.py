@@ -48,7 +48,7 @@ def _move(session: StudySession, placement: Placement) -> None:
 
 
 def on_grid(session: StudySession, start_s: float, stop_s: float) -> tuple[float, float]:
-    """A part of the control recording on the grid of steps. Raises Invalid where it is empty or outside the recording."""
+    """Place a part of the control recording on the grid of steps. Raises Invalid where it is empty or outside the recording."""
     period = session.visit.participant.current_settings.period_s
     length = next(s for s in session.segments if s.is_control).recording.duration_s
     start, stop = round(start_s / period) * period, round(stop_s / period) * period
@@ -68,7 +68,7 @@ def on_grid(session: StudySession, start_s: float, stop_s: float) -> tuple[float
 
 
 def placement_of(session: StudySession, start_s: float, stop_s: float) -> Placement:
-    """A session's recordings, placement on another part of its control recording."""
+    """Place a session's recordings on another part of its control recording."""
     control = next(s for s in session.segments if s.is_control)
     recordings = list(dict.fromkeys(s.recording for s in session.segments))
     # a stated start may differ from the device's clock: the session's own start is what moves

@@ -21,14 +21,14 @@ from app.study.sessions.usable_steps import on_any, usable_steps
 
 
 def proposals_out(db: Session, participant_id: int, caller: Caller) -> list[ProposalOut]:
-    """All proposals of a participant for the API."""
+    """Convert all proposals of a participant for the API."""
     rows = study.proposals_of_participant(db, participant_id)
     behind = repository.proposals(db, [s.id for s in rows])
     return [proposal_out(db, s, behind[s.id], caller) for s in rows if s.id in behind]
 
 
 def proposal_out(db: Session, session: StudySession, row: SessionProposal, caller: Caller) -> ProposalOut:
-    """A proposal for the API."""
+    """Convert a proposal for the API."""
     usable = usable_steps(db, session)
     return ProposalOut(
         session=session_out(session, caller),

@@ -31,17 +31,17 @@ from app.study.visits.service import require_unlocked
 from app.study.wording import sentences
 
 RESTS_ON = frozenset({"visit", "hemisphere", "start_s", "stop_s", "started_at", "controller"})
-"""Fields of a correction after which a guessed controller is guessed anew."""
+"""Fields of a correction after which a guessed controller is guessed again."""
 
 PART = frozenset({"start_s", "stop_s", "started_at"})
-"""Fields of a correction after which a control channel that nobody stated is chosen anew."""
+"""Fields of a correction after which a control channel is chosen again, unless a person stated it."""
 
 
 def _renew_guess(db: Session, session: StudySession, proposal: SessionProposal, keep: bool = False) -> None:
-    """Guess the controller anew after what the guess rests on has changed; what a person stated stays.
+    """Guess the controller again after what the guess rests on has changed; what a person stated stays.
 
     Args:
-        keep: leave the controller, for somebody confirms it as it stands, and renew the reason alone.
+        keep: leave the controller, which a person confirms unchanged, and renew the reason alone.
     """
     if "controller" in proposal.evidence and Evidence.from_json(proposal.evidence["controller"]).stated:
         return
@@ -53,7 +53,7 @@ def _renew_guess(db: Session, session: StudySession, proposal: SessionProposal, 
 
 
 def renew(db: Session, session: StudySession) -> None:
-    """After the recordings of a proposal became other ones: its guess is made anew, and forms that are open do not overwrite it."""
+    """Update a proposal after its recordings changed: its guess is made again, and open forms do not overwrite it."""
     proposal = repository.proposals(db, [session.id])[session.id]
     proposal.version += 1
     _renew_guess(db, session, proposal)
@@ -61,7 +61,7 @@ def renew(db: Session, session: StudySession) -> None:
 
 
 def change(db: Session, session: StudySession, wanted: ProposalChange, caller: Caller) -> SessionProposal:
-    """Correct a proposal; what is left out stays.
+    """Correct a proposal; omitted fields stay.
 
     Raises:
         Conflict: it was confirmed, or changed after the caller looked at it. Invalid: a value that cannot be.
@@ -105,7 +105,7 @@ def _correct(db: Session, session: StudySession, wanted: ProposalChange, caller:
 
 
 def _by(caller: Caller, **facts: bool) -> Evidence:
-    """The word of the person who corrects a proposal."""
+    """Make the evidence of the person who corrects a proposal."""
     return Evidence(Source.PERSON, Reason.STATED, {"by": caller.label, **facts})
 
 
@@ -135,7 +135,7 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
 
 
 def split(db: Session, session: StudySession, version: int, parts: Sequence[PartIn], caller: Caller) -> list[StudySession]:
-    """Several proposals in the place of one: a part of the same recordings each.
+    """Replace one proposal by several: a part of the same recordings each.
 
     Raises:
         Conflict: as `change`, or a data query is about it. Invalid: parts outside the recording or over each other.
@@ -146,7 +146,7 @@ def split(db: Session, session: StudySession, version: int, parts: Sequence[Part
     for (_, stop), (start, _) in pairwise(spans):
         if start < stop - 1e-6:
             raise Invalid(f"Two parts share the time from {start:g} to {stop:g} s.", "Let each part begin where the one before has ended.")
-    arm = blinding.stated_arm(session, SYSTEM)  # a guess that finds the same controller keeps its policy; nobody is told
+    arm = blinding.stated_arm(session, SYSTEM)  # a guess that finds the same controller keeps its policy, which is not shown
     made = []
     for part in sorted(parts, key=lambda p: p.start_s):
         placement = placement_of(session, *on_grid(session, part.start_s, part.stop_s))
@@ -184,7 +184,7 @@ def discard(db: Session, session: StudySession, version: int, reason: str, calle
 
 
 def _refuse_asked_about(db: Session, session: StudySession, done: str) -> None:
-    """Raises Conflict where a data query, closed or not, is about the proposal: it would be about nothing."""
+    """Raise Conflict where a data query, closed or not, is about the proposal: it would be about nothing."""
     asked = data_queries.numbers_of_session(db, session.id)
     if asked:
         one = len(asked) == 1
@@ -203,7 +203,7 @@ def _delete(db: Session, session: StudySession) -> None:
 
 
 def locked(db: Session, session: StudySession, version: int, caller: Caller) -> SessionProposal:
-    """The proposal's row, locked for a change. Raises Conflict where it was confirmed, or changed after the caller looked at it."""
+    """Lock the proposal's row for a change. Raises Conflict where it was confirmed, or changed after the caller looked at it."""
     study_service.require(caller, can.WRITE_STUDY, session.visit.participant)
     proposal = repository.proposal(db, session.id, caller, lock=True)
     db.refresh(session, ["status"])
@@ -242,7 +242,7 @@ def _name_controller(db: Session, session: StudySession, given: dict[str, object
     if not {"controller", "policy"} & given.keys():
         return
     if "controller" not in given:
-        blinding.require_known(session.visit, caller)  # what a policy alone is refused for would tell the controller
+        blinding.require_known(session.visit, caller)  # what a policy alone is refused for would reveal the controller
     arm = blinding.stated_arm(session, SYSTEM)
     wanted = given.get("controller", arm.controller if arm else None)
     controller = Controller(str(wanted)) if wanted else None

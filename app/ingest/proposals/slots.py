@@ -1,4 +1,4 @@
-"""What the slot that a controller's log names says of where its session belongs."""
+"""Slot that a controller's log names: the visit to which its session belongs."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from app.study.sessions.logged import LoggedSlot
 
 
 def differs_from_slot(slot: LoggedSlot | None, stated: StatedSession) -> bool:
-    """Whether a log is of another session of a plan than its sender says; False where it names none of this participant's."""
+    """Decide whether a log is of another session of a plan than its sender states; False where it names none of this participant's."""
     if slot is None or slot.planned is None:
         return False
     planned = slot.planned
     if planned.sealed and (stated.controller is not None or stated.policy_id is not None):
-        return True  # whether they agree would tell what ran
+        return True  # whether they agree would reveal what ran
     return (
         (stated.visit is not None and stated.visit.id != planned.visit_id)
         or (stated.controller is not None and stated.controller != planned.controller)
@@ -25,7 +25,7 @@ def differs_from_slot(slot: LoggedSlot | None, stated: StatedSession) -> bool:
 
 
 def visit_of_slot(visits: Sequence[Visit], slot: LoggedSlot | None, stated: Visit | None) -> VisitGuess | None:
-    """The visit of the planned session that a log names; open where the sender says another one, but while its plan's key is sealed.
+    """Find the visit of the planned session that a log names; open where the sender states another one, but while its plan's key is sealed.
 
     None where it names none.
     """

@@ -1,4 +1,4 @@
-"""A proposed session at a glance: beta above, amplitude below, small enough to stand beside its form."""
+"""A proposed session at a glance: beta above, amplitude below, small enough for the row of its form."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ W, LEFT, TOP, EACH, BETWEEN, BOTTOM = 520.0, 44.0, 22.0, 48.0, 44.0, 38.0
 
 
 def thumbnail(data: SessionData) -> Markup | None:
-    """The steps of a session; None where neither beta nor an amplitude is known. Missing steps stay gaps."""
+    """Draw the steps of a session; None where neither beta nor an amplitude is known. Missing steps stay gaps."""
     table = data.table
     inside = table.t_s > 0
     minutes = table.t_s[inside] / 60

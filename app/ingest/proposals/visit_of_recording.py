@@ -23,7 +23,7 @@ from app.study.sessions.contradictions import control_recording, local_day
 
 
 def day_to_add(session: StudySession, proposal: SessionProposal, visits: Sequence[Visit]) -> date | None:
-    """The day of a proposal whose visit is open and that no visit has; None where there is a visit to choose, or no date."""
+    """Find the day of a proposal whose visit is open and that no visit has. None where there is a visit to choose, or no date."""
     if not proposal.visit_open or session.started_at is None:
         return None
     day = local_day(control_recording(session), session.started_at)
@@ -45,13 +45,13 @@ class VisitToAdd:
 
 
 def visit_to_add(session: StudySession, proposal: SessionProposal, visits: Sequence[Visit]) -> VisitToAdd | None:
-    """The visit of a proposal's day, as the page announces it; None as `day_to_add`."""
+    """Find the visit of a proposal's day, as the page announces it; None as `day_to_add`."""
     day = day_to_add(session, proposal, visits)
     return None if day is None else _numbered(day, visits)
 
 
 def _numbered(day: date, visits: Sequence[Visit]) -> VisitToAdd:
-    """A number that keeps numbers in the order of dates, where one is free there; else the one after the highest.
+    """Choose a number that keeps numbers in the order of dates, where one is free there; else the one after the highest.
 
     Numbers in use stay as they are: plans, exports and analyses name visits by them.
     """

@@ -27,7 +27,7 @@ router = APIRouter()
 
 @router.get("/participants/{code}/quarantine")
 def quarantine_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """Files of a participant that could not all be read."""
+    """Show files of a participant that could not all be read."""
     return _page(request, db, participant, caller)
 
 

@@ -14,7 +14,7 @@ from app.ingest.uploads import service
 
 
 def original(content: Iterator[bytes], file_id: int) -> Response:
-    """Bytes for a person to look at; no browser may run them."""
+    """Send bytes for a person to look at; no browser may run them."""
     headers = {
         "Content-Disposition": f'attachment; filename="file-{file_id}.bin"',
         "X-Content-Type-Options": "nosniff",
@@ -24,14 +24,14 @@ def original(content: Iterator[bytes], file_id: int) -> Response:
 
 
 def problem_of(file: UploadFile) -> str:
-    """Why a file could not be read, in the words that may be stored."""
+    """Explain why a file could not be read, in the words that may be stored."""
     reports = service.stored_reports(file)
     found = [f"{r.problem.what} ({r.problem.where})" for r in reports if r.problem]
     return "; ".join(found or wording.unreadable(service.unreadable_members(file)))
 
 
 def quarantined_out(file: UploadFile) -> QuarantinedOut:
-    """A quarantined file for the API."""
+    """Convert a quarantined file for the API."""
     return QuarantinedOut(
         id=file.id,
         upload_id=file.upload_id,

@@ -1,7 +1,7 @@
 """Files kept encrypted because they could not be read, and so not be cleaned: a person reviews them, releases them, or discards them.
 
-Every function here commits by itself: bytes are erased only after the decision is safe. Who decided what, when and why stands on the file's
-row and in the audit trail.
+Every function here commits on its own: bytes are erased only after the decision is safe. The file's row and the audit trail record who
+decided what, when and why.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ from ml.formats.redaction_record import REDACTOR_VERSION
 
 
 def review(db: Session, file_id: int, caller: Caller) -> Iterator[bytes]:
-    """The original bytes, piece by piece, for a person to look at; the audit trail says who did. They may identify the participant.
+    """Yield the original bytes, piece by piece, for a person to look at; the audit trail records who did. They may identify the
+    participant.
 
     Raises:
         Conflict: the file is not, or no longer, in quarantine.
@@ -62,7 +63,7 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
 
 
 def read_held(db: Session, file: UploadFile, participant: Participant, reason: str, caller: Caller) -> UploadOutcome:
-    """Read a quarantined file, as `read_again` does, for whoever may decide that it can be read."""
+    """Read a quarantined file, as `read_again` does, for users who may decide that it can be read."""
     # what is read of it is new data, although its bytes came before the end
     study_service.refuse_withdrawn(participant)
     study_service.refuse_ended(participant.site)
@@ -114,7 +115,7 @@ def _keep_preview(db: Session, file: UploadFile, preview: dict[str, Any] | None)
 
 
 def release_as_is(db: Session, file_id: int, reason: str, caller: Caller) -> UploadFile:
-    """Store a reviewed file as it came, decrypted. Raises Conflict: not in quarantine, or nobody has reviewed it."""
+    """Store a reviewed file as it came, decrypted. Raises Conflict: not in quarantine, or not reviewed."""
     file, _ = _held(db, file_id, caller)
     if file.reviewed_at is None:
         raise Conflict(f"Nobody has looked at file {file.id} yet.", "Review its content first: it may name the participant.")
@@ -168,7 +169,7 @@ def _pieces(original: RawFile, held: ExitStack) -> Iterator[bytes]:
 
 @contextmanager
 def _original(file: UploadFile) -> Iterator[RawFile]:
-    """The original, encrypted as when it came, with a key that goes when it was used.
+    """Open the original, encrypted as when it came, with a key that goes when it was used.
 
     Raises:
         Conflict: its bytes cannot be decrypted, or are not those that came.
@@ -190,13 +191,13 @@ def _original(file: UploadFile) -> Iterator[RawFile]:
 def _erase(db: Session, file: UploadFile) -> None:
     """Remove the encrypted bytes, then forget them. Commits.
 
-    In this order, for where the store is away the row still names them, and the decision can be made again; the other way round nobody
-    would ever remove them. What was made of them is committed before.
+    The order matters. Where the store is away, the row still names the bytes, and the decision can be made again. In the other order they
+    would never be removed. What was made of them is committed before.
     """
     db.refresh(file, ["quarantine_sha256"], with_for_update=True)
     sealed = file.quarantine_sha256
     if sealed is None:
-        return  # somebody has decided as well since that commit
+        return  # another person has decided as well since that commit
     files.remove(sealed)
     file.quarantine_sha256 = None
     file.report = {name: value for name, value in file.report.items() if name != PREVIEW}

@@ -1,6 +1,6 @@
-"""What is done to the bytes of an uploaded file: identity out, and decoding. Runs in a limited child, never in the web process.
+"""Compute steps on the bytes of an uploaded file: identity out, and decoding. They run in a limited child, never in the web process.
 
-The children know no settings and no database: what they need stands in their params. `reading` beside this is their caller's side.
+The children know no settings and no database: their params have what they need. `reading` in the same folder is their caller's side.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def prepare() -> None:
 
 
 def options_of(stated: dict[str, Any]) -> DecodeOptions:
-    """The options that params hold as JSON."""
+    """Read the options that params have as JSON."""
     return DecodeOptions(**{**stated, "archive": ArchiveLimits(**stated["archive"])})
 
 
@@ -117,7 +117,7 @@ def _told(report: StepReport, doing: str) -> Callable[[float], None]:
 
 
 def _left_out(source: RawFile, limits: ArchiveLimits) -> list[str]:
-    """Why members of an archive of no use were left out, counted, without their names, which may identify a person."""
+    """Count the reasons why members of an archive of no use were ignored, without their names, which may identify a person."""
     with source.open() as stream:
         if not zipfile.is_zipfile(stream):
             return []

@@ -23,10 +23,10 @@ _bearer = HTTPBearer(auto_error=False)
 
 
 class UploadRoute(APIRoute):
-    """A route whose POST nobody reaches who may upload nowhere; whose participant it is, the endpoint asks."""
+    """A route whose POST is closed to users who may upload nowhere; the endpoint checks whose participant it is."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """The route's handler, after the check."""
+        """Return the route's handler, after the check."""
         handle = super().get_route_handler()
 
         async def checked(request: Request) -> Response:
@@ -38,7 +38,7 @@ class UploadRoute(APIRoute):
 
 
 def _check(request: Request, bearer: HTTPAuthorizationCredentials | None) -> None:
-    """Raises Unauthorized for an unknown caller, Forbidden for one whose roles do not include uploads."""
+    """Raise Unauthorized for an unknown caller, Forbidden for one whose roles do not include uploads."""
     with new_session() as db:
         get_caller(request, db, bearer).require(can.UPLOAD)
     limited.prepare()

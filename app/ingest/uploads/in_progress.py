@@ -1,4 +1,4 @@
-"""Which uploads are being received at this moment, by locks that die with the process that holds them; and how far this process is."""
+"""Uploads that are being received at this moment, by locks that die with the process that has them; and how far this process is."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LOCKS = 0x75706C64
 
 @dataclass(frozen=True)
 class Progress:
-    """How far an upload is that this process is receiving.
+    """Progress of an upload that this process is receiving.
 
     Attributes:
         file, files: the file that is read, from 1, and how many there are; 0 before the first.
@@ -52,13 +52,13 @@ def tell_file(upload_id: int, file: int, of: int) -> None:
 
 
 def told(upload_id: int) -> Progress | None:
-    """How far an upload is; None where this process is not receiving it."""
+    """Return the progress of an upload; None where this process is not receiving it."""
     return _progress.get(upload_id)
 
 
 @contextmanager
 def in_progress(upload_id: int) -> Iterator[None]:
-    """Hold the lock that says that an upload is being received, on a connection of its own, for the upload itself commits in between."""
+    """Lock an upload that is being received, on a connection of its own, for the upload itself commits in between."""
     engine = create_engine(database_url(), poolclass=NullPool)
     with engine.connect() as connection:
         connection.execute(text("select pg_advisory_lock(:space, :upload)"), {"space": LOCKS, "upload": upload_id})
@@ -67,8 +67,8 @@ def in_progress(upload_id: int) -> Iterator[None]:
             yield
         finally:
             _progress.pop(upload_id, None)
-            # The server frees it too once it notices that the connection is gone, which on a busy machine is a moment later.
-            # Where the database is away the lock is gone with the connection, and what ended the upload is to be told, not this.
+            # The server frees it too once it notices that the connection is gone, which on a busy machine is a moment later. Where the
+            # database is away the lock is gone with the connection, and the error that ended the upload is reported, not this.
             with suppress(DBAPIError):
                 connection.execute(text("select pg_advisory_unlock(:space, :upload)"), {"space": LOCKS, "upload": upload_id})
                 connection.commit()
@@ -76,7 +76,7 @@ def in_progress(upload_id: int) -> Iterator[None]:
 
 @contextmanager
 def not_counted(db: Session, take_back: Callable[[], None]) -> Iterator[None]:
-    """What was begun, and counted as begun, for the case that it ends the process: a fault that passes did not, and counts for nothing.
+    """Take back a count of begun work if a temporary fault ends it: the count is for work that ends the process.
 
     Args:
         take_back: sets the count in the rows of `db` to what it was. Where the database cannot store that either, the count stays.
@@ -96,7 +96,7 @@ def not_counted(db: Session, take_back: Callable[[], None]) -> Iterator[None]:
 
 
 def coming(db: Session) -> set[int]:
-    """Numbers of the uploads that some process is receiving, this one or another on the same database."""
+    """List the numbers of the uploads that some process is receiving, this one or another on the same database."""
     held = text(
         "select objid::bigint from pg_locks where locktype = 'advisory' and granted and classid::bigint = :space and objsubid = 2"
         " and database = (select oid from pg_database where datname = current_database())"
@@ -105,6 +105,6 @@ def coming(db: Session) -> set[int]:
 
 
 def interrupted(db: Session) -> list[int]:
-    """Numbers of the uploads that were begun and that nobody is receiving, oldest first."""
+    """List the numbers of the uploads that were begun and that no process is receiving, oldest first."""
     free = text("select pg_try_advisory_xact_lock(:space, :upload)")
     return [i for i in repository.unfinished_uploads(db) if db.scalar(free, {"space": LOCKS, "upload": i})]

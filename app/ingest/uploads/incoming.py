@@ -1,4 +1,4 @@
-"""What arrives with one upload: single files, and loose files of RC+S folders that belong together."""
+"""Files that arrive with one upload: single files, and loose files of RC+S folders that belong together."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ class _Loose:
 def arrange(incoming: Sequence[Incoming]) -> Arranged:
     """Bundle loose RC+S files by folder, implant and session, each recording into one zip; everything else stays as it is.
 
-    Files without a folder are one folder together. A file is known by its name, else by its content. Two different files of one kind in
-    one recording could belong to two, and mixing them would give a wrong recording: then none of them is bundled, each is kept by itself,
-    and the report says how to send them.
+    Files without a folder are one folder together. A file is known by its name, else by its content. Two different files of one kind in one
+    recording could belong to two, and mixing them would give a wrong recording. Then none of them is bundled, each is stored alone, and the
+    report explains how to send them.
     """
     arranged = Arranged([])
     folders: dict[str, list[_Loose]] = defaultdict(list)
@@ -88,7 +88,8 @@ def arrange(incoming: Sequence[Incoming]) -> Arranged:
 
 
 def _stem(path: PurePosixPath, opening: Opening) -> str | None:
-    """Which file of a session a loose file is: by its name, its content, or, where that is empty or damaged, the begin of its name."""
+    """Find which file of a session a loose file is: by its name or its content. Where that is empty or damaged, the beginning of its name
+    decides."""
     if path.suffix.lower() == ".json" and (stem := KNOWN.get(path.stem.lower())) is not None:
         return stem
     return opening.stem or (stem_in_name(path.name) if path.suffix.lower() == ".json" else None)
@@ -115,7 +116,7 @@ def _put_together(folder: str, number: str, members: Sequence[_Loose], arranged:
 
 
 def _digest(one: Incoming) -> str:
-    """Hash of a file's bytes; it stands at its begin afterwards."""
+    """Hash a file's bytes and rewind it."""
     found = hashlib.sha256()
     while chunk := one.stream.read(files.CHUNK):
         found.update(chunk)
@@ -124,7 +125,7 @@ def _digest(one: Incoming) -> str:
 
 
 def _bundle(folder: str, number: str, members: Sequence[tuple[str, Incoming]]) -> Incoming:
-    """One zip of loose files: the same files give the same bytes, whatever their order, dates and folder."""
+    """Bundle loose files in one zip: the same files give the same bytes, whatever their order, dates and folder."""
     with raw_file() as (sink, raw):
         with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive:
             for stem, one in sorted(members, key=lambda m: m[0]):

@@ -45,7 +45,7 @@ def resume(actor: str) -> Iterator[ResumedUpload]:
     had come is not there: its sender saw the upload fail, and sends it again.
 
     Args:
-        actor: who stands in the audit trail.
+        actor: name for the audit trail.
     """
     with transaction(actor) as db:
         found = interrupted(db)
@@ -75,7 +75,7 @@ def keep_resuming(actor: str, stop: Event, every_s: float = RESUME_EVERY_S) -> N
 
 
 def why_left(participant: Participant) -> str | None:
-    """Why an upload of the participant that was cut short is not read, in a sentence; None where it is.
+    """Explain why an upload of the participant that was cut short is not read, in a sentence; None where it is.
 
     Participants who have withdrawn, sites and studies that have ended get no new data, not those either whose bytes came before.
     """

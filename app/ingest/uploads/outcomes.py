@@ -49,10 +49,10 @@ def take_grasps(db: Session, file: UploadFile, logs: Sequence[GraspLog], session
 
 
 def derive(db: Session, session: StudySession) -> list[str]:
-    """Derive a session's QoCs anew, after it was confirmed or its times changed."""
+    """Derive a session's QoCs again, after it was confirmed or its times changed."""
     return outcomes.derive_for_session(db, session)
 
 
 def give_up(db: Session, session: StudySession) -> None:
-    """Before a proposal is deleted: its grasp tests stay as removed rows."""
+    """Remove the grasp tests of a proposal before it is deleted: they stay as removed rows."""
     outcomes.give_up(db, session)

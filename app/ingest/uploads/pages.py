@@ -53,7 +53,7 @@ class _PageForm(UploadForm):
 
 @router.get("/participants/{code}/upload")
 def upload_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, visit: str = "") -> HTMLResponse:
-    """The upload form and the uploads so far."""
+    """Show the upload form and the uploads so far."""
     study_service.require(caller, can.UPLOAD, participant)
     limited.prepare()  # it is ready before a file is chosen
     return _page(request, db, participant, {"visit": visit} if visit else {})
@@ -101,7 +101,8 @@ def upload(
 
 @router.get("/participants/{code}/upload/progress")
 def upload_progress(participant: CurrentParticipant, db: Db) -> list[dict[str, Any]]:
-    """How far the uploads of a participant are that this process is reading, oldest first: for the page, while it waits for an answer."""
+    """Report the progress of the uploads of a participant that this process is reading, oldest first: for the page, while it waits for an
+    answer."""
     return [
         {"upload": number, "share": found.share, "text": wording.progress(found.file, found.files, found.share, found.doing)}
         for number in repository.received_uploads(db, participant.id)
@@ -111,7 +112,7 @@ def upload_progress(participant: CurrentParticipant, db: Db) -> list[dict[str, A
 
 @router.get("/uploads/{upload_id}")
 def report(request: Request, upload_id: RowId, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """What became of the files of one upload."""
+    """Show the results of the files of one upload."""
     row, participant = repository.upload(db, upload_id, caller)
     outcome = UploadOutcome(row, participant, service.stored_outcomes(db, row))
     waiting = {s.id for s in study.proposals_of_participant(db, participant.id)} & set(outcome.session_ids)
@@ -121,7 +122,7 @@ def report(request: Request, upload_id: RowId, db: Db, caller: CurrentCaller) ->
 
 
 def _state(upload: Upload, coming_in: set[int], left: bool) -> tuple[str, str]:
-    """What became of an upload, in a few words, and their tone; `coming_in` are those that some web service is receiving.
+    """Describe the state of an upload in a few words, and their tone; `coming_in` are those that some web service is receiving.
 
     Args:
         left: whether what was cut short is not read, for the participant has withdrawn, or the site or study has ended.

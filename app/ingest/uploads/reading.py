@@ -50,7 +50,7 @@ class ReaderFault(Exception):
 
 @dataclass(frozen=True)
 class Cleaned:
-    """What came of cleaning a file: its kind and what was done to it, or why it cannot be cleaned, and what of it was left out.
+    """Result of cleaning a file: its kind and what was done to it, or why it cannot be cleaned, and the ignored parts.
 
     Attributes:
         mapping: place of the column mapping that read it.
@@ -79,7 +79,7 @@ def clean(
         target: where the bytes without identity go; of no use where the file cannot be cleaned.
         options: choices of the decoder, which checks tables as the sender wrote them.
         who: whose files take turns where many are to be read.
-        told: takes progress.
+        `told`: takes progress.
         mappings: the study's column mappings; a table with the header of one is read by it.
 
     Raises:
@@ -102,7 +102,7 @@ def clean(
 
 
 def decode(source: Path, kind: str, options: DecodeOptions, name: str, who: str = "", told: Told = lambda *_: None) -> DecodedFile:
-    """Decode a file without identity; arguments as of `clean`, `name` as it is to stand in reports.
+    """Decode a file without identity; arguments as of `clean`, `name` as reports should show it.
 
     Raises:
         UndecodableFile: nothing in it can be used. ReaderEnded, a kind of it, and ReaderFault as `clean`.
@@ -127,7 +127,7 @@ def _run(reference: str, params: Mapping[str, Any], who: str, told: Told) -> dic
 
 
 def twice(read: Callable[[], _Read], again: Callable[[], bool] = lambda: True) -> _Read:
-    """What a child reads. One that ends it may have met a machine in need: it is read once more, where `again()` holds.
+    """Decode in a child process. If the child ends, retry once (see `again`), since memory may have been short.
 
     Raises:
         ReaderEnded: it ended that child too.

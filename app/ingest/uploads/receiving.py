@@ -42,7 +42,7 @@ CUT_SHORT = UndecodableFile(
     "the service was stopped while it took this file", "file", "Read it again on the page of the quarantine, or send it again."
 )
 LETHAL = 2
-"""So many times a process may end while it reads a file, or makes sessions of an upload; then that is not tried again by itself."""
+"""Number of times a process may end while it reads a file, or makes sessions of an upload. After that it is not retried automatically."""
 ENDED_THE_SERVICE = UndecodableFile(
     f"reading this file was cut short {LETHAL} times: the service, or what it rests on, stopped while it was read",
     "file",
@@ -54,8 +54,8 @@ TABLES = ("csv", "parquet", "control_log", "mapped")
 
 @dataclass
 class FileOutcome:
-    """What became of one file. `name` is what the sender called it; it and `for_sender`, the problem in the file's own words, go back
-    to the sender and are never stored.
+    """Result of one file. `name` is what the sender called it, `for_sender` the problem in the file's own words. Both go back to the sender
+    and are never stored.
 
     Attributes:
         duplicate: its bytes, or all of its recordings, had come before. same_bytes: its bytes had; `row` is the earlier file then.
@@ -83,7 +83,8 @@ class FileOutcome:
 
 @dataclass(frozen=True)
 class StoredContent:
-    """A file as it was stored, and why it cannot be decoded, if so; which column mapping read it, or what a mapping may be made from."""
+    """A file as it was stored, and why it cannot be decoded, if so. It also names the column mapping that read it, or has what a mapping
+    may be made from."""
 
     kind: str
     stored_sha256: str | None
@@ -139,7 +140,7 @@ class Receiver:
         return self.decode(name, row, content)
 
     def _known(self, name: str, sha256: str) -> FileOutcome | None:
-        """The outcome for bytes that were decoded before: the same recordings, and nothing stored again."""
+        """Build the outcome for bytes that were decoded before: the same recordings, and nothing stored again."""
         row = repository.decoded_file(self.db, self.participant.id, sha256)
         if row is None:
             return None
@@ -148,7 +149,7 @@ class Receiver:
         return FileOutcome(name, row, [report], duplicate=True, same_bytes=True, recordings=self._recordings(row))
 
     def _mended(self, raw: RawFile, known: FileOutcome) -> FileOutcome:
-        """The outcome for bytes that came before; where what was kept of them is missing or damaged, they take its place."""
+        """Build the outcome for bytes that came before; where their stored form is missing or damaged, they replace it."""
         row = known.row
         if row.stored_sha256 is None or files.is_whole(row.stored_sha256):
             return known
@@ -187,7 +188,7 @@ class Receiver:
         return repository.fullest(self.db, mine)
 
     def resume(self, row: UploadFile) -> FileOutcome:
-        """Go on with a file of an upload that was interrupted: decode it where that is still to do, else as it was left."""
+        """Resume a file of an upload that was interrupted: decode it where that is still to do, else leave it."""
         if row.status != "received":
             return FileOutcome(row.name, row, stored_reports(row), recordings=self._recordings(row))
         sealed = row.stored_sha256 is None or row.stored_sha256 == row.quarantine_sha256
@@ -216,7 +217,7 @@ class Receiver:
                 raise UndecodableFile(what, "first line", f"Upload it for {whose}; if that is wrong, ask which tablet it came from.")
 
     def _put_aside(self, row: UploadFile, content: StoredContent, problem: UndecodableFile) -> FileOutcome:
-        """Into quarantine with a file that ends the processes which read it; a person decides on it there."""
+        """Put a file into quarantine that ends the processes which read it; a person decides on it there."""
         assert content.stored_sha256 is not None
         log.error("file put aside: reading it ended the reader", upload_file=row.id, why=problem.stored_what)
         sealed = row.quarantine_sha256 is not None
@@ -282,7 +283,7 @@ class Receiver:
             decoded = self._decoded(row, content)
             self._refuse_another_participants(decoded)
             repository.lock_participant(self.db, self.participant.id)
-            # asked again under the lock: somebody may have sent the same bytes meanwhile
+            # asked again under the lock: another upload may have brought the same bytes in between
             if (known := self._known_meanwhile(name, row)) is not None:
                 return known
             if content.kind in TABLES:
@@ -316,7 +317,7 @@ class Receiver:
         return FileOutcome(name, row, reports, all_known, recordings=[*stored.known, *stored.fresh], grasps=decoded.grasps)
 
     def _known_meanwhile(self, name: str, row: UploadFile) -> FileOutcome | None:
-        """The outcome for a file whose bytes another upload has brought since; the row goes then. It is no other itself."""
+        """Build the outcome for a file whose bytes another upload has brought since; the row goes then."""
         known = self._known(name, row.original_sha256)
         if known is None or known.row.id == row.id:
             return None
@@ -326,7 +327,7 @@ class Receiver:
         return known
 
     def _decoded(self, row: UploadFile, content: StoredContent) -> DecodedFile:
-        """What a child makes of a stored file. One that ends it is read once more, which is known before, should that end us too.
+        """Decode a stored file in a child. One that ends it is read once more, which is recorded before, should that end us too.
 
         Raises:
             ReaderEnded: at the second time.
@@ -358,7 +359,7 @@ class Receiver:
         return FileOutcome(name, row, [report], for_sender=problem.for_sender)
 
     def _failed_before(self, name: str, row: UploadFile, before: UploadFile, report: FileReport, problem: UndecodableFile) -> FileOutcome:
-        """The same bytes were of no use before, and still are: they are kept once."""
+        """Report that the same bytes were of no use before, and still are: they are stored once."""
         report.understood.append(f"The same bytes came before, as file {before.id} in upload {before.upload_id}; they are kept once.")
         sealed, kept = row.quarantine_sha256, before.quarantine_sha256
         before.report = {**(before.report or {}), **lasting(row)}
@@ -377,5 +378,5 @@ def _forget_begin(row: UploadFile) -> None:
 
 
 def _harmless_name(name: str, kind: str) -> str:
-    """Names of files carry names of people; what stays is the kind, and the ending where it is a known one."""
+    """Make a name harmless, since names of files carry names of people. The kind stays, and the ending where it is a known one."""
     return kind + cleaned_suffix(name)

@@ -58,12 +58,12 @@ def store(db: Session, participant: Participant, file: UploadFile, decoded: Sequ
 
 
 def add(db: Session, participant: Participant, file: UploadFile, decoded: RecordingLog) -> Recording:
-    """A new recording with its traces."""
+    """Add a recording with its traces."""
     return _add(db, _row(db, participant, file, decoded), decoded)
 
 
 def _row(db: Session, participant: Participant, file: UploadFile, decoded: RecordingLog) -> Recording:
-    """A recording that is not in the database yet."""
+    """Make the row of a recording that is not in the database yet."""
     return Recording(
         participant_id=participant.id,
         device_id=_device(db, participant, decoded).id,
@@ -86,7 +86,7 @@ def _add(db: Session, recording: Recording, decoded: RecordingLog) -> Recording:
 
 
 def details(decoded: RecordingLog) -> dict[str, Any]:
-    """What a recording says beside its traces, as plain JSON."""
+    """Collect what a recording has in addition to its traces, as plain JSON."""
     found: dict[str, Any] = as_json(
         {
             "kind": decoded.kind,
@@ -103,7 +103,7 @@ def details(decoded: RecordingLog) -> dict[str, Any]:
 
 
 def trace_row(recording_id: int, trace: TraceLog) -> Trace:
-    """A trace under the present decode version."""
+    """Make the row of a trace under the present decode version."""
     values, valid = pack(trace.values, trace.valid)
     return Trace(
         recording_id=recording_id,
@@ -122,7 +122,7 @@ def trace_row(recording_id: int, trace: TraceLog) -> Trace:
 
 
 def known_time(value: datetime | None) -> datetime | None:
-    """A recording's own time, where its clock was set at all."""
+    """Return a recording's own time, where its clock was set at all."""
     try:
         return sensible_time(value) if value is not None else None
     except ValueError:
@@ -130,7 +130,7 @@ def known_time(value: datetime | None) -> datetime | None:
 
 
 def as_json(value: Any) -> Any:
-    """Plain JSON: NaN and infinity, which PostgreSQL's JSONB refuses, become null; times become ISO text."""
+    """Convert to plain JSON: NaN and infinity, which PostgreSQL's JSONB refuses, become null; times become ISO text."""
     if isinstance(value, dict):
         return {str(k): as_json(v) for k, v in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):

@@ -1,6 +1,6 @@
-"""`betaloop ingest redecode`: read every stored file again with the present decoder, and keep what it gives beside what there was.
+"""`betaloop ingest redecode`: read every stored file again with the present decoder, and add the result to what there was.
 
-Traces are added under the new decode version and never replaced: sessions use the newest version from then on, buffer snapshots keep the
+Traces are added under the new decode version and never replaced. Sessions use the newest version from then on; buffer snapshots keep the
 traces that they pin.
 """
 
@@ -41,11 +41,11 @@ class Refused(Exception):
 
 @dataclass
 class Change:
-    """What reading a file again came to.
+    """Result of reading a file again.
 
     Attributes:
         state: `up to date`, `read again`, or `failed` (then nothing of the file was changed).
-        said: what changed, or why it failed.
+        `said`: what changed, or why it failed.
     """
 
     upload_file_id: int
@@ -60,8 +60,8 @@ def redecode(participant_id: int | None, upload_file_id: int | None, dry_run: bo
 
     Args:
         participant_id, upload_file_id: only these; all where None.
-        dry_run: tell what would change, and change nothing.
-        actor: who stands in the audit trail.
+        dry_run: report what would change, and change nothing.
+        actor: name for the audit trail.
 
     Raises:
         NotFound: the named file does not exist or was never decoded.
@@ -117,7 +117,7 @@ def _read_again(db: Session, file: UploadFile, participant: Participant) -> list
 
 
 def _decoded(db: Session, file: UploadFile, participant: Participant) -> DecodedFile:
-    """The stored file as the present decoder reads it, with what its sender had stated of it."""
+    """Decode the stored file with the present decoder, with what its sender had stated of it."""
     assert file.stored_sha256 is not None
     path = files.path_of(file.stored_sha256)
     if not path.exists() or files.hash_file(path)[0] != file.stored_sha256:
@@ -127,7 +127,7 @@ def _decoded(db: Session, file: UploadFile, participant: Participant) -> Decoded
 
 
 def _outcomes_again(db: Session, file: UploadFile, decoded: DecodedFile) -> list[str]:
-    """Tremor minutes and grasp tests as they are read now; what came of it, or nothing where all of it is as it was."""
+    """Read tremor minutes and grasp tests again; returns what changed, or nothing where all is unchanged."""
     before = _outcomes(db, file)
     said = outcomes_intake.take_tremor(db, file, decoded.tremor)
     if file.session_id is not None:
@@ -136,7 +136,8 @@ def _outcomes_again(db: Session, file: UploadFile, decoded: DecodedFile) -> list
 
 
 def _outcomes(db: Session, file: UploadFile) -> list[tuple[object, ...]]:
-    """All that reading an outcome file again can change: its minutes, its grasp tests, and the QoCs of the participant's sessions."""
+    """Collect all that reading an outcome file again can change: its minutes, its grasp tests, and the QoCs of the participant's
+    sessions."""
     series = outcomes.tremor_series_of_file(db, file.participant_id, file.id)
     minutes = (series.n, series.start_unix_s_f64, series.duration_s_f64, series.fractions_f32, series.any_tremor_f32) if series else ()
     tests = [(t.session_id, t.hand, t.open_fist_s_f64, tuple(t.implausible)) for t in outcomes.grasp_tests_of_file(db, file.id)]
@@ -145,7 +146,7 @@ def _outcomes(db: Session, file: UploadFile) -> list[tuple[object, ...]]:
 
 
 def _version(db: Session, recording: Recording) -> int:
-    """The newest decode version of a recording."""
+    """Find the newest decode version of a recording."""
     traces = study.traces_of_recording(db, recording.id)
     return max([t.decode_version for t in traces] or [int(recording.details.get("decode_version", 0))])
 
@@ -153,7 +154,7 @@ def _version(db: Session, recording: Recording) -> int:
 def _matched(
     known: Sequence[Recording], decoded: Sequence[RecordingLog]
 ) -> tuple[list[tuple[Recording, RecordingLog]], list[RecordingLog]]:
-    """Stored recordings with what they are now, by content, else by device, side and start; and recordings that were not stored before."""
+    """Match stored recordings with their present decoding, by content, else by device, side and start; also return new recordings."""
     pairs: list[tuple[Recording, RecordingLog]] = []
     left, rest = list(known), list(decoded)
     for same in (lambda r, d: r.fingerprint == d.fingerprint, _same_stretch):

@@ -1,4 +1,4 @@
-"""What is stored of the reports of uploaded files, and read again."""
+"""Storage of the reports of uploaded files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def store_reports(
 
 
 def lasting(row: UploadFile) -> dict[str, Any]:
-    """The members of a file's report that stay when it is written anew: `ASIDE` and `PREVIEW`, where it has them."""
+    """Select the members of a file's report that stay when it is written again: `ASIDE` and `PREVIEW`, where it has them."""
     return {name: row.report[name] for name in (ASIDE, PREVIEW) if name in (row.report or {})}
 
 
@@ -41,7 +41,7 @@ def count_equal_lines(report: FileReport) -> None:
 
 
 def alike_together(reports: Sequence[FileReport]) -> list[FileReport]:
-    """Reports that say the same of different files as one, named by how many there are and the first of them."""
+    """Join reports that say the same of different files, named by how many there are and the first of them."""
     alike: dict[str, list[FileReport]] = defaultdict(list)
     for report in reports:
         alike[repr(replace(report, name=""))].append(report)
@@ -49,7 +49,7 @@ def alike_together(reports: Sequence[FileReport]) -> list[FileReport]:
 
 
 def stored_reports(row: UploadFile) -> list[FileReport]:
-    """The reports of a file as they were stored."""
+    """Read the stored reports of a file."""
     # a copy: sentences appended to the stored lists themselves would not be seen as a change, and not be written
     stored = deepcopy(row.report.get("reports", []))
     return [FileReport(**{**r, "problem": r["problem"] and Problem(**r["problem"])}) for r in stored]
@@ -62,7 +62,7 @@ def unreadable_members(row: UploadFile) -> list[str]:
 
 
 def known_recordings(row: UploadFile) -> list[int]:
-    """Recordings of a file that another file had brought before."""
+    """List recordings of a file that another file had brought before."""
     found: list[int] = row.report.get("known_recordings", [])
     return found
 

@@ -63,7 +63,7 @@ SESSIONS_BEGUN = "sessions_begun"
 
 @dataclass
 class UploadOutcome:
-    """What became of an upload.
+    """Result of an upload.
 
     Attributes:
         files: those that were kept.
@@ -82,7 +82,7 @@ class UploadOutcome:
 
     @property
     def usable(self) -> bool:
-        """Whether anything could be used."""
+        """True where anything could be used."""
         return any(f.row.status == "decoded" for f in self.files)
 
     @property
@@ -102,8 +102,8 @@ def state_session(
     confirm: bool = True,
     session_id: int | None = None,
 ) -> StatedSession:
-    """What the sender says of the sessions. Raises Invalid for a visit, policy or session that does not exist, or that do not fit; Conflict
-    for a locked visit."""
+    """Check what the sender states about the sessions. Raises Invalid for a visit, policy or session that does not exist, or that do not
+    fit; Conflict for a locked visit."""
     try:
         started_at = sensible_time(started_at) if started_at else None
     except ValueError as error:
@@ -138,7 +138,7 @@ def state_session(
 
 
 def as_stated(db: Session, participant: Participant, said: Mapping[str, object]) -> StatedSession:
-    """What the sender of a stored upload had said of its sessions. Raises Invalid as `state_session`."""
+    """Read what the sender of a stored upload had stated about its sessions. Raises Invalid as `state_session`."""
     visit, controller, side, start, session = (said.get(name) for name in ("visit", "controller", "hemisphere", "started_at", "session"))
     return state_session(
         db,
@@ -163,7 +163,7 @@ def receive(
 ) -> UploadOutcome:
     """Take an upload: keep every file, decode what can be decoded, make or propose sessions. Commits by itself; see `Receiver`.
 
-    `beta` says what the columns of a table are; the participant's unit and source are taken, and said, where it is silent.
+    `beta` states what the columns of a table are; where it is silent, the participant's unit and source are taken, and reported.
 
     Raises:
         TooLarge: every file exceeds the installation's limit. Invalid: no file. Conflict: the site has ended. CutShort: a fault, after
@@ -195,7 +195,7 @@ def receive(
 
 
 def _take(receiver: Receiver, outcome: UploadOutcome, incoming: Sequence[Incoming]) -> None:
-    """Keep and decode each file; those that are too large are told. Raises TooLarge where all are."""
+    """Store and decode each file; those that are too large are reported. Raises TooLarge where all are."""
     refused: list[TooLarge] = []
     for number, one in enumerate(incoming, start=1):
         tell_file(outcome.upload.id, number, len(incoming))
@@ -210,7 +210,7 @@ def _take(receiver: Receiver, outcome: UploadOutcome, incoming: Sequence[Incomin
 
 
 def finish(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
-    """What is done once all files of an upload are in: sessions, grasp tests, the report. Commits."""
+    """Finish an upload once all its files are in: sessions, grasp tests, the report. Commits."""
     upload = outcome.upload
     begun = upload.stated.get(SESSIONS_BEGUN, 0)
     if begun >= LETHAL:
@@ -240,7 +240,7 @@ def _close(db: Session, outcome: UploadOutcome) -> None:
 
 
 def _leave_without_sessions(outcome: UploadOutcome) -> None:
-    """Say of the files of an upload that its sessions ended the process which made them, and that they are not made any more."""
+    """Report on the files of an upload that its sessions ended the process which made them, and that they are not made any more."""
     log.error("upload left without sessions: making them ended the service", upload=outcome.upload.id)
     for file in outcome.files:
         if file.recordings and not file.same_bytes:
@@ -264,7 +264,7 @@ def _said(stated: StatedSession, beta: BetaStated) -> dict[str, Any]:
 
 
 def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
-    """Sessions of all recordings of the upload that have none yet; what was known keeps the sessions it has."""
+    """Make sessions of all recordings of the upload that have none yet; known recordings keep the sessions they have."""
     repository.lock_participant(db, outcome.participant.id)
     with_recordings = [f for f in outcome.files if f.recordings]
     known = {r.id: list(study.session_ids_of_recording(db, r.id)) for f in with_recordings for r in f.recordings}
@@ -307,7 +307,7 @@ def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) ->
 
 
 def _report_copy(db: Session, file: FileOutcome, recordings: set[int]) -> None:
-    """Of a further copy of what this upload holds already, only that it is one, and where it is."""
+    """Describe a further copy within this upload: only that it is one, and where it is."""
     file.session_ids = sorted({i for r in recordings for i in study.session_ids_of_recording(db, r)})
     where = f"; it is session {', '.join(map(str, file.session_ids))}" if file.session_ids else ""
     file.duplicate = True
@@ -322,7 +322,7 @@ def _no_session(without: int, of: int) -> str:
 
 
 def attach_grasps_of(db: Session, outcome: UploadOutcome, stated: StatedSession) -> None:
-    """Grasp tests to the stated session, else to the only one that this upload gave."""
+    """Attach grasp tests to the stated session, else to the only one that this upload gave."""
     target = stated.session
     if target is None and len(outcome.session_ids) == 1:
         target = db.get_one(StudySession, outcome.session_ids[0])
@@ -366,7 +366,7 @@ def attach_grasps(db: Session, file: UploadFile, session: StudySession) -> list[
 
 
 def decode_options(participant: Participant, beta: BetaStated) -> DecodeOptions:
-    """The participant's choices for decoders, and what the sender said of a table."""
+    """Combine the participant's choices for decoders with what the sender stated of a table."""
     settings = participant.current_settings
     return DecodeOptions(
         period_s=settings.period_s,
@@ -380,18 +380,18 @@ def decode_options(participant: Participant, beta: BetaStated) -> DecodeOptions:
 
 
 def options_of_file(db: Session, file: UploadFile, participant: Participant) -> DecodeOptions:
-    """The options for a stored file, with what its sender had stated of it."""
+    """Build the options for a stored file, with what its sender had stated of it."""
     return decode_options(participant, stated_beta(db, file))
 
 
 def stated_beta(db: Session, file: UploadFile) -> BetaStated:
-    """What the sender of a stored file had said of its beta."""
+    """Read what the sender of a stored file had stated of its beta."""
     said = db.get_one(Upload, file.upload_id).stated
     return BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
 
 
 def stored_outcomes(db: Session, upload: Upload) -> list[FileOutcome]:
-    """The files of an upload as they were stored, and those that had come before."""
+    """List the files of an upload as they were stored, and those that had come before."""
     earlier = [db.get_one(UploadFile, i) for i in upload.stated.get("duplicates", [])]
     both = [(f, False) for f in upload.files] + [(f, True) for f in earlier]
     return [
