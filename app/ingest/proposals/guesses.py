@@ -37,7 +37,7 @@ def controller(db: Session, session: StudySession) -> Guess:
     if slot is not None and slot.planned is not None:
         facts = {"visit": slot.visit_number, "position": slot.planned.position}
         if slot.planned.sealed and not session.visit.sealed:
-            # in its present place, everyone would see what its sealed plan hides
+            # in its present visit, everyone would see what its sealed plan hides
             return Guess(None, None, Evidence(Source.RECORDING, Reason.SLOT, facts))
         return Guess(Controller(slot.planned.controller), slot.planned.policy_id, Evidence(Source.RECORDING, Reason.SLOT, facts))
     ran = logged.of_recording(db, control_recording(session))
