@@ -34,7 +34,7 @@ if __name__ == "__main__":  # started as a script
     sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tests.architecture import prose
-from tests.architecture.texts import ROOT, nodes_of, source, tracked_files
+from tests.architecture.texts import ROOT, imports_of, nodes_of, source, tracked_files
 
 RATCHET = Path(__file__).parent / "ratchet.toml"
 COMMAND = "python -m tests.architecture.measure --update"
@@ -119,7 +119,7 @@ def imports() -> frozenset[tuple[str, str]]:
     modules = {module_name(path): path for path in product() if path.startswith("app/")}
     found: set[tuple[str, str]] = set()
     for module, path in modules.items():
-        for node in nodes_of(path).imports:
+        for node in imports_of(path):
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]
             else:
@@ -211,6 +211,7 @@ def occurrences(pattern: str, paths: Iterable[str]) -> list[str]:
 @cache
 def measurements() -> Mapping[str, tuple[int, tuple[str, ...]]]:
     """Take every measure but those of traced calls: its value, and what it counts where that can be listed."""
+    prose.findings()  # parses every file, so that their imports are known below
     app = [path for path in product() if path.startswith("app/")]
     lists = {
         "product files that name two or more outcomes": naming(*OUTCOMES, least=2),

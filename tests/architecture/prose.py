@@ -150,7 +150,7 @@ def findings_of(path: str) -> Iterator[Finding]:
     """Yield every breach of a rule in a file."""
     for text in texts_of(path):
         for sentence in sentences(text.text):
-            if word_count(sentence) > LONGEST:
+            if sentence.count(" ") >= LONGEST and word_count(sentence) > LONGEST:
                 yield Finding("long sentences", path, text.line, f"{word_count(sentence)} words: {sentence}")
         for match in BANNED.finditer(plain(text.text)):
             yield Finding("banned words", path, text.line, f"{match[0]}: {WORDS['banned'][match[0].lower()]}")

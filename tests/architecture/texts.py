@@ -63,7 +63,17 @@ class Nodes(NamedTuple):
 @lru_cache(maxsize=1)
 def nodes_of(path: str) -> Nodes:
     """Parse a Python file of the repository and sort its nodes; only the last tree is kept, for all of them would slow the collector."""
-    return sorted_nodes(ast.parse(source(path)))
+    found = sorted_nodes(ast.parse(source(path)))
+    _imports[path] = found.imports
+    return found
+
+
+_imports: dict[str, list[ast.Import | ast.ImportFrom]] = {}
+
+
+def imports_of(path: str) -> list[ast.Import | ast.ImportFrom]:
+    """Return the imports of a Python file; these are kept of every file that was parsed."""
+    return _imports[path] if path in _imports else nodes_of(path).imports
 
 
 def sorted_nodes(tree: ast.Module) -> Nodes:
