@@ -1,4 +1,4 @@
-"""What the logged controllers did: their density where it is not known, and clones of them that can be evaluated like any policy."""
+"""Behaviour of the logged controllers: their density where it is unknown, and clones of them that can be evaluated like any policy."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ RIDGE = 1e-3
 
 
 def controller_key(session: SessionTrajectory) -> Key:
-    """Sessions with the same key were run by the same controller: its kind and, where one ran, the policy."""
+    """Identify the controller of a session: its kind and, where one ran, the policy."""
     return session.controller, session.policy_id
 
 
 def controllers(buffer: ReplayBuffer) -> dict[Key, list[int]]:
-    """Indices of the sessions of every controller with a usable step."""
+    """List the indices of the sessions of every controller with a usable step."""
     groups: dict[Key, list[int]] = {}
     for i, session in enumerate(buffer.sessions):
         if session.usable().any():
@@ -37,7 +37,7 @@ def controllers(buffer: ReplayBuffer) -> dict[Key, list[int]]:
 
 
 class UniformController:
-    """The random controller as something that acts: uniform on [lower, 1], drawn anew at each call in the order of a seed."""
+    """The random controller as a policy: uniform on [lower, 1], a new draw at each call in the order of a seed."""
 
     def __init__(self, lower: float, seed: int) -> None:
         self._lower, self._rng = lower, np.random.default_rng(seed)
@@ -65,13 +65,13 @@ class Clone:
     residual: float
 
     def act(self, states: NDArray[Any]) -> Floats:
-        """Cloned amplitudes within [0, 1]."""
+        """Compute cloned amplitudes within [0, 1]."""
         x = (_features((states - self.mean) / self.std, self.inner, self.offset) - self.centre) / self.spread
         return np.asarray(np.clip(self.weights[0] + x @ self.weights[1:], 0.0, 1.0), dtype=np.float64)
 
 
 def clone(states: Floats, actions: Floats, seed: int = 0) -> tuple[Policy, float]:
-    """A policy that does what was logged, and the spread of the logged amplitudes around it.
+    """Fit a policy that does what was logged, and the spread of the logged amplitudes around it.
 
     Args:
         states: windows, [N, W]. actions: amplitudes, [N].
@@ -92,7 +92,8 @@ def clone(states: Floats, actions: Floats, seed: int = 0) -> tuple[Policy, float
 
 
 def clones(buffer: ReplayBuffer, seed: int = 0) -> dict[Key, tuple[Policy, float]]:
-    """A stand-in for every controller of a buffer: uniform for sessions drawn at every step, else a clone, with its residual spread."""
+    """Make a substitute for every controller of a buffer: uniform for sessions drawn at every step, else a clone, with its residual
+    spread."""
     result: dict[Key, tuple[Policy, float]] = {}
     for key, indices in controllers(buffer).items():
         bounds = [buffer.sessions[i].uniform_bound for i in indices]
@@ -108,7 +109,7 @@ def clones(buffer: ReplayBuffer, seed: int = 0) -> dict[Key, tuple[Policy, float
 
 
 def rule_of_thumb_bandwidth(buffer: ReplayBuffer) -> float:
-    """Silverman's rule for the kernel around a deterministic target, with sessions as the sample size: 1.06 sd(a) n^(-1/5).
+    """Apply Silverman's rule for the kernel around a deterministic target, with sessions as the sample size: 1.06 sd(a) n^(-1/5).
 
     A weight is a product over a session, so sessions are what there are n of. Kept within [0.03, 0.3].
     """

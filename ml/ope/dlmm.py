@@ -65,7 +65,7 @@ class DlmmConfig:
     seed: int = 0
 
     def to_json(self) -> dict[str, Any]:
-        """All settings, by name."""
+        """Return all settings, by name."""
         return asdict(self)
 
 
@@ -78,14 +78,15 @@ class DlmmNetworks(nn.Module):
         self.decoder = GaussianHead(config.latent + 1, 2, config.hidden)
 
     def bound(self, states: Tensor, actions: Tensor, targets: Tensor, noise: Tensor) -> Tensor:
-        """Evidence lower bound of log p(s_{t+1}, r_t) per transition, [N]; states [N, W], actions [N, 1], targets [N, 2], noise [N, Z]."""
+        """Compute the evidence lower bound of log p(s_{t+1}, r_t) per transition, [N]; states [N, W], actions [N, 1], targets [N, 2], noise
+        [N, Z]."""
         mean, log_std = self.encoder(states)
         kl = gaussian_kl(mean, log_std, torch.zeros_like(mean), torch.zeros_like(log_std)).sum(1)
         out_mean, out_log_std = self.decoder(torch.cat([mean + log_std.exp() * noise, actions], dim=1))
         return gaussian_log_prob(targets, out_mean, out_log_std).sum(1) - kl
 
     def draw(self, states: Tensor, actions: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """A drawn newest beta and the mean reward, [N] each; noise [N, Z + 1]."""
+        """Draw the newest beta and compute the mean reward, [N] each; noise [N, Z + 1]."""
         mean, log_std = self.encoder(states)
         z = mean + log_std.exp() * noise[:, :-1]
         out_mean, out_log_std = self.decoder(torch.cat([z, actions], dim=1))
@@ -102,13 +103,13 @@ class _Transitions:
     session: NDArray[np.int64]
 
     def rows(self, index: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
-        """Some rows."""
+        """Select some rows."""
         chosen = torch.from_numpy(index)
         return self.states[chosen], self.actions[chosen], self.targets[chosen]
 
 
 def _transitions(batch: Batch) -> _Transitions:
-    """Rows of the usable steps of a padded batch."""
+    """Collect the rows of the usable steps of a padded batch."""
     step, session = torch.nonzero(batch.usable > 0, as_tuple=True)
     targets = torch.stack([batch.states[step + 1, session, -1], batch.rewards[step, session]], dim=1)
     return _Transitions(batch.states[step, session], batch.actions[step, session].unsqueeze(1), targets, session.numpy())
@@ -145,7 +146,7 @@ class Dlmm:
 
 
 def _train(rows: _Transitions, held: list[int], window: int, config: DlmmConfig, seed: int, report: Report) -> DlmmNetworks:
-    """One member, as it was at its best held-out bound."""
+    """Train one member, and restore it at its best held-out bound."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         networks = DlmmNetworks(window, config)
@@ -215,7 +216,7 @@ class FittedDlmm:
         return {name: self._estimate(i, policy, runs, support, horizon) for i, (name, policy) in enumerate(policies.items())}
 
     def _simulate(self, networks: DlmmNetworks, policies: list[Policy], horizon: int, seed: int) -> _Simulated:
-        """M trajectories per policy; all policies share starts and noise."""
+        """Simulate M trajectories per policy; all policies share starts and noise."""
         settings, scale, m, p = self.buffer.settings, self.scale, self.config.rollouts, len(policies)
         rng = np.random.default_rng(seed)
         starts = make_batch(self.buffer, scale).states[0].numpy().astype(np.float64)
@@ -298,5 +299,5 @@ def _single(values: Floats) -> Tensor:
 
 
 def build(key: str, seed: int, size: Size) -> Dlmm:
-    """The estimator at a size of `ml.ope.registry`."""
+    """Build the estimator at a size of `ml.ope.registry`."""
     return Dlmm(DlmmConfig(members=1, updates=800, rollouts=64, seed=seed) if size == "demo" else DlmmConfig(seed=seed), key)

@@ -1,7 +1,7 @@
 """Weighted doubly robust estimation with fitted Q functions as control variates. Source: Thomas and Brunskill 2016, eq. 9.
 
-The value function says what a policy is worth; what it got wrong at each logged step is added, weighted by how likely the policy is to have
-come there. Where the weights rest on few sessions the correction is their noise: read the effective sample size beside the value.
+The value function estimates what a policy is worth. Its error at each logged step is added, weighted by how likely the policy is to have
+come there. Where the weights rest on few sessions the correction is their noise: read the effective sample size with the value.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Mask = NDArray[np.bool_]
 
 
 def step_weights(log_ratio: Floats, mask: Mask) -> Floats:
-    """Products of ratios up to each step, normalised at each step among the sessions that have it, [N, H]; 0 elsewhere.
+    """Multiply ratios up to each step, normalised at each step among the sessions that have it, [N, H]; 0 elsewhere.
 
     Args:
         log_ratio: log pi - log mu, [N, H]; may be -inf. mask: steps that count, [N, H].
@@ -44,7 +44,7 @@ def step_weights(log_ratio: Floats, mask: Mask) -> Floats:
 
 
 def weighted_doubly_robust(first: Floats, weights: Floats, errors: Floats, discount: float) -> float:
-    """First values plus weighted temporal errors: with no step missing, eq. 9 of Thomas and Brunskill with its sum telescoped.
+    """Add weighted temporal errors to first values: with no step missing, eq. 9 of Thomas and Brunskill with its sum telescoped.
 
     Args:
         first: V_H(s_0) of each session, [N]. weights: `step_weights`, [N, H].
@@ -62,7 +62,7 @@ class DoublyRobust:
     method: str = "wdr"
 
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedDoublyRobust:
-        """Features, penalties and behaviour densities; seconds, so nothing is kept in `checkpoint_dir`.
+        """Fit features, penalties and behaviour densities; this takes seconds, so nothing is written to `checkpoint_dir`.
 
         Raises:
             ValueError: fewer than two sessions with usable steps, or no session with a complete s_0.
@@ -85,7 +85,7 @@ class FittedDoublyRobust:
     bandwidth: float
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
-        """Estimate of every policy; value functions and sessions are resampled together."""
+        """Estimate every policy; value functions and sessions are resampled together."""
         horizon = checked_horizon(self.fqe.buffer, horizon_steps)
         support = AmplitudeSupport(self.fqe.buffer)
         estimates = {}
@@ -134,7 +134,7 @@ class FittedDoublyRobust:
         return log_ratio, mask
 
     def _value(self, view: _View, pick: Indices, log_ratio: Floats, mask: Mask, horizon: int) -> tuple[Floats, float]:
-        """Corrected sums of the heads [R] of the picked sessions, and the correction of r_end."""
+        """Compute the corrected sums of the heads [R] of the picked sessions, and the correction of r_end."""
         fqe, table = self.fqe, self.fqe.table
         gamma = fqe.buffer.settings.gamma
         weights, _ = view.member.weights(view.products, pick, horizon, gamma)
@@ -154,7 +154,7 @@ class FittedDoublyRobust:
 
 
 class _View:
-    """What one set of features sees of a policy: features now, then, at the start, and their products."""
+    """A policy as one set of features sees it: features now, then, at the start, and their products."""
 
     def __init__(self, member: QMember, fqe: FittedFqe, target: TargetActions) -> None:
         table = fqe.table
@@ -166,7 +166,7 @@ class _View:
         self._ends = np.searchsorted(table.step[self._order], np.arange(int(table.step.max()) + 2))
 
     def errors(self, weights: Floats, horizon: int, gamma: float) -> Floats:
-        """Temporal errors of the heads with H - t steps to go, [n, H, R]; 0 where a session has no usable step."""
+        """Compute temporal errors of the heads with H - t steps to go, [n, H, R]; 0 where a session has no usable step."""
         table = self.table
         discount = discounts(gamma)
         result = np.zeros((table.sessions, horizon, len(discount)))
@@ -179,6 +179,6 @@ class _View:
 
 
 def build(key: str, seed: int, size: Size) -> DoublyRobust:
-    """The estimator at a size of `ml.ope.registry`."""
+    """Build the estimator at a size of `ml.ope.registry`."""
     members, refits = {"full": (3, 30), "demo": (1, 20), "held_out": (1, 25)}[size]
     return DoublyRobust(FqeConfig(seed=seed, members=members, refits=refits), method=key)

@@ -3,8 +3,9 @@
 min over nu, max over zeta of E_D[(nu(s, a) - gamma nu(s', pi(s'))) zeta(s, a) - zeta^2 / 2] - (1 - gamma) E[nu(s_0, pi(s_0))]; at the
 saddle zeta is the ratio. All policies and ensemble members are trained together as one stack of small networks.
 
-Two approximations, both stated in the estimate: the method knows no horizon, so its average reward is multiplied by the discounted length
-of the session; and r_end follows from averages under the *discounted* distribution, which leans towards the session's beginning.
+There are two approximations, both stated in the estimate. The method knows no horizon, so its average reward is multiplied by the
+discounted length of the session. And r_end follows from averages under the *discounted* distribution, which leans towards the session's
+beginning.
 """
 
 from __future__ import annotations
@@ -91,13 +92,13 @@ class StackedMlp:
 
 
 def saddle(nu_now: Tensor, nu_then: Tensor, nu_first: Tensor, zeta: Tensor, gamma: float) -> Tensor:
-    """The objective of every network of the stack, [S], from nu(s, a), nu(s', pi), zeta(s, a) [S, B] and nu(s_0, pi) [S, M]."""
+    """Compute the objective of every network of the stack, [S], from nu(s, a), nu(s', pi), zeta(s, a) [S, B] and nu(s_0, pi) [S, M]."""
     inner = ((nu_now - gamma * nu_then) * zeta - 0.5 * zeta**2).mean(1)
     return inner - (1 - gamma) * nu_first.mean(1)
 
 
 def ratios(now: Floats, then: Floats, first: Floats, shares: Floats, gamma: float, config: DiceConfig, report: Report = silent) -> Floats:
-    """zeta at every logged step, [P, M, N].
+    """Compute zeta at every logged step, [P, M, N].
 
     Args:
         now: inputs at (s, a), [N, F]. then: at (s', pi(s')), [P, N, F]. first: at (s_0, pi(s_0)), [P, m, F].
@@ -146,11 +147,11 @@ def ratios(now: Floats, then: Floats, first: Floats, shares: Floats, gamma: floa
 
 
 def flow_gap(zeta: Floats, now: Floats, then: Floats, first: Floats, gamma: float) -> float:
-    """By how much the ratios of one policy break the equation that defines them; 0 at the saddle.
+    """Compute by how much the ratios of one policy break the equation that defines them; 0 at the saddle.
 
-    E_D[zeta f(s, a)] = (1 - gamma) E[f(s_0, pi)] + gamma E_D[zeta f(s', pi(s'))] for every f: here for every input, in its standard
-    deviations over the logged steps; and for 1, which asks that ratios average to 1. The largest of all, over members. Ratios that are
-    nearly 0 everywhere break the second alone, and are what training that stopped short leaves where gamma is near 1.
+    E_D[zeta f(s, a)] = (1 - gamma) E[f(s_0, pi)] + gamma E_D[zeta f(s', pi(s'))] for every f. It is tested for every input, in its standard
+    deviations over the logged steps, and for 1, which requires that ratios average to 1. The largest gap of all counts, over members.
+    Ratios that are nearly 0 everywhere break the second alone. Training that stopped short leaves them where gamma is near 1.
 
     Args:
         zeta: [M, N]. now, then: inputs at (s, a) and (s', pi(s')), [N, F]. first: at (s_0, pi(s_0)), [m, F].
@@ -211,7 +212,8 @@ class FittedDualDice:
         return {name: self._estimate(policy, z, gap, horizon, support) for (name, policy), z, gap in rows}
 
     def _shares(self) -> Floats:
-        """Probability of each step per member: all sessions for the first, a resample of the sessions for each of the others."""
+        """Compute the probability of each step per member: all sessions for the first, a resample of the sessions for each of the
+        others."""
         table = self.table
         times = [np.ones(table.sessions)]
         picks = resamples(table.sessions, max(1, self.config.members - 1), self.config.seed + 1)
@@ -256,5 +258,5 @@ class FittedDualDice:
 
 
 def build(key: str, seed: int, size: Size) -> DualDice:
-    """The estimator at a size of `ml.ope.registry`."""
+    """Build the estimator at a size of `ml.ope.registry`."""
     return DualDice(DiceConfig(seed=seed, members=1, updates=300) if size == "demo" else DiceConfig(seed=seed), key)

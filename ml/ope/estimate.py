@@ -1,4 +1,4 @@
-"""What every off-policy estimator takes and gives. Source of the quantity: Gao et al. 2023, eq:ope_total_return."""
+"""Input and output of every off-policy estimator. Source of the quantity: Gao et al. 2023, eq:ope_total_return."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Estimate:
                 raise ValueError(f"{self.method}: {name} of an estimate must be finite, not {getattr(self, name)}")
 
     def to_json(self) -> dict[str, Any]:
-        """Every field and the version of their form, JSON-able."""
+        """Convert every field and the version of their form to JSON."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return values | {"flags": [flag.to_json() for flag in self.flags], "version": STORED_VERSION}
 
@@ -85,7 +85,7 @@ class Fitted(Protocol):
     """An estimator that has seen the data."""
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
-        """Estimate of every policy, by its name; the horizon H defaults to the buffer's median session length."""
+        """Estimate every policy, by its name; the horizon H defaults to the buffer's median session length."""
 
 
 class Estimator(Protocol):
@@ -100,7 +100,7 @@ class Estimator(Protocol):
 
 
 def require_two_sessions(what: str, with_steps: int) -> None:
-    """Refuse to fit where nothing tells how sessions differ.
+    """Refuse to fit where no second session shows how sessions differ.
 
     Args:
         what: is fitted, as a sentence begins with it. with_steps: sessions with usable steps.
@@ -113,7 +113,7 @@ def require_two_sessions(what: str, with_steps: int) -> None:
 
 
 def checked_horizon(buffer: ReplayBuffer, horizon_steps: int | None) -> int:
-    """H, defaulting to the median session length. Raises ValueError when it is not a positive number of steps."""
+    """Check H, defaulting to the median session length. Raises ValueError when it is not a positive number of steps."""
     horizon = buffer.median_steps() if horizon_steps is None else horizon_steps
     if horizon < 1:
         raise ValueError(f"the horizon must be at least 1 step, not {horizon}")

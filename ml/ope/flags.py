@@ -1,4 +1,4 @@
-"""What is to be known about an estimate as typed values. Whoever shows them makes the sentences; nothing here is read by people."""
+"""Typed warnings on an estimate. Pages turn them into sentences."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Flag:
     Attributes:
         code: what was found, such as `thin`; `wording` of the service knows every code.
         value: what was measured; None where the finding has no number.
-        limit: what the value is held against; None where there is no limit.
+        limit: what the value is compared with; None where there is no limit.
         unit: of value and limit: `share`, `sessions`, `controllers`, `reward`, ...; empty without a value.
         refuses: whether the data cannot speak about the policy because of it.
         source: the steps that it is about: `logged` ones, or those that the method `simulated`.
@@ -44,11 +44,11 @@ class Flag:
         source: Source = "logged",
         **facts: Fact,
     ) -> Flag:
-        """A flag with its facts by name."""
+        """Make a flag with its facts by name."""
         return cls(code, value, limit, unit, refuses, source, tuple(facts.items()))
 
     def fact(self, name: str) -> Any:
-        """One of the facts. Raises KeyError where the flag has none of that name."""
+        """Return one of the facts. Raises KeyError where the flag has none of that name."""
         return dict(self.facts)[name]
 
     @property
@@ -57,7 +57,7 @@ class Flag:
         return (self.code, self.refuses, _round(self.value), tuple((name, _round(v)) for name, v in self.facts))
 
     def to_json(self) -> dict[str, Any]:
-        """Every field, JSON-able."""
+        """Convert every field to JSON."""
         return {
             "code": self.code,
             "value": self.value,
@@ -80,11 +80,11 @@ FEW_END_REWARDS = Flag("few_end_rewards", None, 3.0, "sessions")
 """Fewer sessions than the limit have an end-of-session reward: the estimate is the step return alone."""
 
 DAYS_UNKNOWN = Flag("days_unknown")
-"""How returns differ from day to day cannot be told from these sessions: the intervals leave it out."""
+"""These sessions do not show how returns differ from day to day: the intervals omit it."""
 
 
 def stopped_sessions(stopped: int, counted: float, measured: float) -> Flag:
-    """How much of an estimate hangs on sessions that were stopped for the participant's sake.
+    """Flag how much of an estimate depends on sessions that were stopped for the participant's sake.
 
     Args:
         stopped: sessions. counted, measured: r_end where they count as failures, and where they count as measured.
@@ -93,11 +93,11 @@ def stopped_sessions(stopped: int, counted: float, measured: float) -> Flag:
 
 
 def not_counted_tests(without_cdbs: int = 0, of_unknown_noise: int = 0, without_policy: int = 0) -> Flag | None:
-    """Sessions of tested policies that the posterior does not know of; None where it knows of all.
+    """Count sessions of tested policies that the posterior does not know of; None where it knows of all.
 
     Args:
-        without_cdbs: at visits without a cDBS session. of_unknown_noise: with a quantity of which nothing tells how far sessions differ by
-            chance. without_policy: of policies that cannot be replayed: their file is gone, or they take other windows.
+        without_cdbs: at visits without a cDBS session. of_unknown_noise: with a quantity whose scatter between sessions is unknown.
+            without_policy: of policies that cannot be replayed, since their file is gone or they take other windows.
     """
     number = without_cdbs + of_unknown_noise + without_policy
     why = {"without_cdbs": without_cdbs, "of_unknown_noise": of_unknown_noise, "without_policy": without_policy}
@@ -106,7 +106,7 @@ def not_counted_tests(without_cdbs: int = 0, of_unknown_noise: int = 0, without_
 
 
 def distinct(flags: Iterable[Flag]) -> tuple[Flag, ...]:
-    """The flags in their order, each once; two that nobody could tell apart when shown are one."""
+    """Return the flags in their order, each once; two that look equal when shown are one."""
     seen: dict[tuple[object, ...], Flag] = {}
     for flag in flags:
         seen.setdefault((flag.source, *flag.rounded), flag)

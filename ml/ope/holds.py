@@ -1,4 +1,4 @@
-"""Importance weights of sessions whose draws are held: one hold is one decision, so it has one ratio, at its first usable step.
+"""Importance weights of sessions with sustained draws: one hold is one decision, so it has one ratio, at its first usable step.
 
 A policy that acts within a hold cannot be weighed by it: the draw was made once, and nothing was decided at the steps after. Importance
 sampling abstains there by a typed flag; the session's weight is then zero.
@@ -21,7 +21,7 @@ Abstention = Literal["acts_within_hold", "hold_density_unknown"]
 
 
 def abstention(session: SessionTrajectory, steps: NDArray[np.int64], target: Floats, bandwidth: float) -> Abstention | None:
-    """Why a session of held draws cannot be weighed for a policy; None where it can, or where every step was a decision.
+    """Explain why a session of sustained draws cannot be weighed for a policy; None where it can, or where every step was a decision.
 
     Args:
         session: its holds. steps: usable steps, rising, [k]. target: what the policy does there, [k].
@@ -52,7 +52,7 @@ def held_log_ratios(session: SessionTrajectory, steps: NDArray[np.int64], target
 
 
 def flags(abstained: Iterable[Abstention | None], *, others: bool) -> tuple[Flag, ...]:
-    """What is to be known of sessions that were not weighed.
+    """Flag sessions that were not weighed.
 
     Args:
         abstained: of every session. others: whether random sessions remain that were weighed.
@@ -68,7 +68,7 @@ def flags(abstained: Iterable[Abstention | None], *, others: bool) -> tuple[Flag
 
 
 def _held(session: SessionTrajectory, steps: NDArray[np.int64]) -> Iterable[tuple[NDArray[np.int64], float | None]]:
-    """Places in `steps` of the usable steps of every hold that has one, and its log density."""
+    """Find the places in `steps` of the usable steps of every hold that has one, and its log density."""
     for hold in session.holds:
         own = np.flatnonzero((steps >= hold.start) & (steps < hold.start + hold.steps))
         if own.size:

@@ -1,8 +1,8 @@
 """Importance sampling in log space: per trajectory and per decision, plain and self-normalised. Source: Precup, Sutton and Singh 2000.
 
 The density of the random controller is known, 1 / (1 - B) on [B, 1]; that of the others is estimated. A deterministic target is given a
-Gaussian kernel truncated to [0, 1]; its bandwidth follows a stated rule and stands in every estimate. Weights at T = 300 rest on a session
-or two whatever is done: these are baselines.
+Gaussian kernel truncated to [0, 1]. Its bandwidth follows a stated rule and is written in every estimate. Weights at T = 300 rest on a
+session or two whatever is done: these are baselines.
 """
 
 from __future__ import annotations
@@ -54,19 +54,19 @@ def per_trajectory(log_ratio: Floats, mask: Mask, rewards: Floats, end: Floats, 
 
 
 def ordinary(log_weights: Floats, returns: Floats) -> float:
-    """Mean of weight x return, [N]: unbiased, and of enormous variance over long horizons. Finite at any length."""
+    """Average weight x return, [N]: unbiased, and of enormous variance over long horizons. Finite at any length."""
     return float(_signed_exp(log_weights, returns).mean()) if returns.size else 0.0
 
 
 def weighted(log_weights: Floats, returns: Floats) -> float:
-    """Self-normalised mean of returns, [N]; the plain mean where every weight is zero."""
+    """Average returns by normalised weights, [N]; the plain mean where every weight is zero."""
     top = log_weights.max()
     weights = np.exp(log_weights - top) if np.isfinite(top) else np.ones_like(log_weights)
     return float(weights @ returns / weights.sum())
 
 
 def per_decision_terms(log_ratio: Floats, mask: Mask, rewards: Floats, gamma: float) -> Floats:
-    """Per-decision contributions of each session, [N]: sum over t of gamma^t (product of ratios up to t) r_t, finite at any length.
+    """Compute per-decision contributions of each session, [N]: sum over t of gamma^t (product of ratios up to t) r_t, finite at any length.
 
     A step that does not count (unusable, or after a short session's end) takes the mean contribution of the sessions that have it.
     """
@@ -79,7 +79,8 @@ def per_decision_terms(log_ratio: Floats, mask: Mask, rewards: Floats, gamma: fl
 
 
 def consistent_weighted_per_decision(log_ratio: Floats, mask: Mask, rewards: Floats, gamma: float) -> float:
-    """Self-normalised per-decision estimate (Thomas 2015): at each step the weighted mean reward of the sessions that have the step.
+    """Compute the self-normalised per-decision estimate (Thomas 2015): at each step the weighted mean reward of the sessions that have the
+    step.
 
     A step that no session has takes the mean reward of the others; one at which every weight is zero takes its plain mean.
     """
@@ -105,9 +106,9 @@ def kernel_log_density(amplitude: Floats, centre: Floats, bandwidth: float) -> F
 def behaviour_log_density(session: SessionTrajectory, bandwidth: float, cloned: tuple[Policy, float] | None = None) -> Floats:
     """Log density of the logged amplitudes of a session, [T]; NaN where unusable.
 
-    Random sessions drawn at every step: uniform on [B, 1]; held draws: 0 here, their holds have the densities (`ml.ope.holds`). Others: a
-    kernel around `cloned`, what the controller does at the window and the spread around it, at least as wide as the one that smooths the
-    target, so that a target that acts alike has the ratio 1 and none grows without end.
+    Random sessions drawn at every step: uniform on [B, 1]. Sustained draws: 0 here, their holds have the densities (`ml.ope.holds`).
+    Others: a kernel around `cloned`, the controller's action at the window and the spread around it. It is at least as wide as the one that
+    smooths the target. So a target that acts alike has the ratio 1, and no ratio grows without end.
 
     Raises:
         ValueError: neither a known density nor a clone.
@@ -131,7 +132,7 @@ def behaviour_log_density(session: SessionTrajectory, bandwidth: float, cloned: 
 
 
 def behaviour_densities(buffer: ReplayBuffer, bandwidth: float | None, seed: int) -> tuple[list[Floats], float]:
-    """`behaviour_log_density` of every session, clones estimated where needed, and the bandwidth, by its rule where None is given."""
+    """Compute `behaviour_log_density` of every session, with clones where needed, and the bandwidth, by its rule where None is given."""
     width = rule_of_thumb_bandwidth(buffer) if bandwidth is None else bandwidth
     cloned: dict[Key, tuple[Policy, float]] = clones(buffer, seed)
     return [behaviour_log_density(s, width, cloned.get(controller_key(s))) for s in buffer.sessions], width
@@ -203,7 +204,7 @@ class FittedImportance:
     bandwidth: float
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
-        """Estimate of every policy; all share the resamples of sessions."""
+        """Estimate every policy; all share the resamples of sessions."""
         horizon = checked_horizon(self.buffer, horizon_steps)
         support = AmplitudeSupport(self.buffer)
         estimates = {}
@@ -226,7 +227,7 @@ class FittedImportance:
         return log_ratio, mask, rewards
 
     def _abstentions(self, policy: Policy, horizon: int) -> tuple[Flag, ...]:
-        """Flags of the sessions of held draws that this policy cannot be weighed in."""
+        """Flag the sessions of sustained draws that this policy cannot be weighed in."""
         reasons: list[Abstention | None] = []
         for s in self.sessions:
             k = np.flatnonzero(s.usable()[:horizon])
@@ -299,19 +300,19 @@ class FittedImportance:
 
 
 def _known_density(session: SessionTrajectory) -> bool:
-    """Whether the session's amplitudes were drawn from a density that is known."""
+    """Decide whether the session's amplitudes were drawn from a known density."""
     return session.uniform_bound is not None or any(h.log_density is not None for h in session.holds)
 
 
 def _signed_exp(log_weights: Floats, values: Floats) -> Floats:
-    """exp(log_weights) x values computed as one exponent, kept finite."""
+    """Compute exp(log_weights) x values as one exponent, so that it stays finite."""
     with np.errstate(divide="ignore"):
         logs = log_weights + np.log(np.abs(values))
     return np.asarray(np.sign(values) * np.exp(np.minimum(logs, LARGEST_LOG)), dtype=np.float64)
 
 
 def horizon_of_ten(log_ratio: Floats, mask: Mask) -> int:
-    """Steps until the effective sample size of the running weights first falls below ten."""
+    """Count the steps until the effective sample size of the running weights first falls below ten."""
     cumulative = np.cumsum(np.where(mask, log_ratio, 0.0), axis=1)
     for t in range(cumulative.shape[1]):
         if effective_sample_size(cumulative[:, t])[0] < FEW_EFFECTIVE:
@@ -320,5 +321,5 @@ def horizon_of_ten(log_ratio: Floats, mask: Mask) -> int:
 
 
 def build(key: str, seed: int, size: Size) -> ImportanceSampling:
-    """The estimator at a size of `ml.ope.registry`."""
+    """Build the estimator at a size of `ml.ope.registry`."""
     return ImportanceSampling(cast(Weighting, key), draws=100 if size == "held_out" else 1000, seed=seed)

@@ -1,9 +1,9 @@
-"""Which dose was in force before the sessions of a buffer.
+"""Dose that was in force before the sessions of a buffer.
 
-A session's log begins with its first step, yet stimulation acts over minutes: what was on before it is still at work while the discount is
-largest. Between sessions a participant is under clinical stimulation (cDBS), so that is what is expected; but a study may do otherwise, and
-some sessions do not say. Where the amplitude in force before a session is on record, that is it (`ml.ope.fqe.steps.lead_dose`); of the
-others the two accounts are weighed by the evidence of the linear model of beta under each.
+A session's log begins with its first step, yet stimulation acts over minutes. The dose before it is still at work while the discount is
+largest. Between sessions a participant is under clinical stimulation (cDBS), so that is expected. But a study may do otherwise, and some
+sessions do not record it. Where the amplitude in force before a session is on record, that is it (`ml.ope.fqe.steps.lead_dose`). For the
+others, the evidence of the linear model of beta weighs the two accounts.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PRIOR_LOG_ODDS = 2.0
 
 
 def dose_before(buffer: ReplayBuffer) -> float | None:
-    """Amplitude fraction before sessions without a record of it; None where each session's first amplitude explains beta better.
+    """Choose the amplitude fraction before sessions without a record of it; None where each session's first amplitude explains beta better.
 
     cDBS where every session has a record, or fewer than two sessions have usable steps, so that nothing can be weighed.
     """

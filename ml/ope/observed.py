@@ -1,4 +1,4 @@
-"""What the logged controllers were observed to return: the reference of every estimate, and what held-out predictions are held against."""
+"""Observed returns of the logged controllers: the reference of every estimate, and of held-out predictions."""
 
 from __future__ import annotations
 
@@ -45,14 +45,15 @@ class Observed:
 
 
 def session_returns(sessions: list[SessionTrajectory], settings: MdpSettings, horizon: int) -> tuple[Floats, Floats]:
-    """Actual step returns over the horizon and r_end of the sessions that have a step return; r_end is NaN where not measured, [n] each."""
+    """Compute actual step returns over the horizon and r_end of the sessions that have a step return; r_end is NaN where not measured, [n]
+    each."""
     found = [a for a in (actual_return(s, settings, horizon) for s in sessions) if a.step_return is not None]
     ends = [np.nan if a.end_reward is None else a.end_reward for a in found]
     return np.array([a.step_return for a in found], dtype=np.float64), np.array(ends, dtype=np.float64)
 
 
 def observed(buffer: ReplayBuffer, horizon: int, seed: int = 0) -> dict[Key, Observed]:
-    """Every controller of a buffer with a session that has a step return over the horizon."""
+    """Summarise every controller of a buffer with a session that has a step return over the horizon."""
     result = {}
     for key, indices in controllers(buffer).items():
         steps, ends = session_returns([buffer.sessions[i] for i in indices], buffer.settings, horizon)
@@ -74,14 +75,14 @@ def observed(buffer: ReplayBuffer, horizon: int, seed: int = 0) -> dict[Key, Obs
 
 
 def day_noise(buffer: ReplayBuffer, horizon: int, draws: int, seed: int) -> tuple[Floats, Flag | None]:
-    """What the few visits of a record leave open about the level of returns, as draws [draws] that all policies share.
+    """Draw what the few visits of a record leave open about the level of returns, [draws], shared by all policies.
 
     Resampling sessions alone takes the sessions of one day for independent; a bad day lowers them all. Returns less their controller's mean
-    are split into days and sessions by one-way analysis of variance; the draws are those of the mean over days, from Student's t with the
+    are split into days and sessions by one-way analysis of variance. The draws are those of the mean over days, from Student's t with the
     number of visits less one. They widen intervals and cancel between policies.
 
     Returns:
-        The draws, all 0 where days do not differ beyond chance, and a flag where the days cannot be told apart at all.
+        The draws, all 0 where days do not differ beyond chance, and a flag where the days cannot be distinguished at all.
     """
     groups = [i for i in controllers(buffer).values() if len({buffer.sessions[k].visit for k in i}) > 1]
     left, visit = [], []
@@ -128,7 +129,7 @@ class MeanOverDays:
 
 
 def mean_over_days(returns: Floats, visits: NDArray[np.int64], draws: int, seed: int) -> MeanOverDays:
-    """Mean over days of returns [P, n] of the same sessions under several policies: a one-way random effect of the visit.
+    """Estimate the mean over days of returns [P, n] of the same sessions under several policies: a one-way random effect of the visit.
 
     With few visits the error follows from the posterior of the visits' variance (`ml.statistics.mixed`), not from a point estimate.
     """

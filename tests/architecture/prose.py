@@ -44,7 +44,7 @@ class Finding(NamedTuple):
 
 def plain(text: str) -> str:
     """Take markup, code and addresses out of a text; each leaves one word."""
-    text = re.sub(r"`[^`]*`", "x", text)
+    text = re.sub(r"`[^`]*`", "x", text.replace("held out", "held-out"))
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
     text = re.sub(r"\bhttps?://\S+", "x", text)
     return re.sub(r"\*\*|__|&[a-z]+;", " ", text)

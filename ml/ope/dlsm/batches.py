@@ -23,7 +23,7 @@ class Batch:
 
     Attributes:
         states: s_0 ... s_T standardised, gaps filled with the last valid beta, [T + 1, B, W].
-        actions: a_0 ... a_{T-1}, unknown ones held from before, [T, B].
+        actions: a_0 ... a_{T-1}, unknown ones taken from before, [T, B].
         rewards: r_0 ... r_{T-1}, standardised, [T, B].
         alive: 1 where the session has this step, [T, B].
         usable: 1 where the step may be learnt from, [T, B]; never beyond `alive`.
@@ -53,7 +53,7 @@ class Batch:
         return int(self.actions.shape[0]), int(self.actions.shape[1])
 
     def select(self, columns: Sequence[int]) -> Batch:
-        """Some of the sessions, cut to the longest of them."""
+        """Select some of the sessions, cut to the longest of them."""
         index = torch.as_tensor(list(columns), dtype=torch.long)
         lengths = self.lengths[index]
         t = int(lengths.max())
@@ -73,7 +73,7 @@ class Batch:
         )
 
     def cut(self, steps: int) -> Batch:
-        """The first steps alone."""
+        """Cut the batch to its first steps."""
         window = self.states.shape[2]
         return replace(
             self,
@@ -86,7 +86,7 @@ class Batch:
 
 
 def make_batch(buffer: ReplayBuffer, scale: Scale, dtype: torch.dtype = torch.float32) -> Batch:
-    """All sessions of a buffer as one padded batch."""
+    """Make one padded batch of all sessions of a buffer."""
     settings, sessions = buffer.settings, buffer.sessions
     longest, n, w = max(s.steps for s in sessions), len(sessions), settings.window
     states = np.zeros((longest + 1, n, w))
@@ -125,7 +125,7 @@ def make_batch(buffer: ReplayBuffer, scale: Scale, dtype: torch.dtype = torch.fl
 
 
 def _held(values: Floats, start: float) -> Floats:
-    """Gaps filled with the value before them; gaps at the start with the first valid value, or `start` where there is none."""
+    """Fill gaps with the value before them; gaps at the start with the first valid value, or `start` where there is none."""
     valid = np.isfinite(values)
     if valid.all():
         return values

@@ -27,7 +27,8 @@ def gaussian_log_prob(x: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
 
 
 def gaussian_kl(mean_q: Tensor, log_std_q: Tensor, mean_p: Tensor, log_std_p: Tensor) -> Tensor:
-    """KL(q || p) = E_q[log q - log p] of diagonal Gaussians, elementwise; at least 0 (the paper's appendix has the sign reversed)."""
+    """Compute KL(q || p) = E_q[log q - log p] of diagonal Gaussians, elementwise; at least 0 (the paper's appendix has the sign
+    reversed)."""
     ratio = torch.exp(2 * (log_std_q - log_std_p))
     shift = ((mean_q - mean_p) * torch.exp(-log_std_p)).square()
     return 0.5 * (ratio + shift - 1) - (log_std_q - log_std_p)
@@ -52,7 +53,7 @@ class GaussianHead(nn.Module):
             self.body = nn.Sequential(*layers, last)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log standard deviation, each [..., n_out], for x [..., n_in]."""
+        """Compute mean and log standard deviation, each [..., n_out], for x [..., n_in]."""
         raw = self.affine(x)
         if self.body is not None:
             raw = raw + self.body(x)
@@ -142,7 +143,7 @@ def _rows(n: int) -> list[slice]:
 
 @compiled(fastmath=FAST_MATH, error_model="numpy")
 def _elu(values: Any, bias: Any) -> None:
-    """ELU of values [N, n] plus bias, in place: exp(x) - 1 = 2 t / (1 - t) with t = tanh(x / 2), which a compiler can vectorise."""
+    """Apply ELU to values [N, n] plus bias, in place: exp(x) - 1 = 2 t / (1 - t) with t = tanh(x / 2), which a compiler can vectorise."""
     half, one, zero = values.dtype.type(0.5), values.dtype.type(1), values.dtype.type(0)
     for i in range(values.shape[0]):
         row = values[i]
@@ -154,7 +155,7 @@ def _elu(values: Any, bias: Any) -> None:
 
 @compiled(fastmath=FAST_MATH, error_model="numpy")
 def _elu_backward(grad: Any, activated: Any) -> None:
-    """`grad` times the slope of ELU, in place, [N, n]: 1 above zero, activation + 1 below."""
+    """Multiply `grad` by the slope of ELU, in place, [N, n]: 1 above zero, activation + 1 below."""
     one, zero = grad.dtype.type(1), grad.dtype.type(0)
     for i in range(grad.shape[0]):
         row, value = grad[i], activated[i]
@@ -181,7 +182,7 @@ def _density(raw: Any, bias: Any, target: Any, residual: Any, share: Any, invers
 
 @compiled(fastmath=FAST_MATH, error_model="numpy")
 def _density_backward(grad: Any, residual: Any, share: Any, inverse: Any, d_raw: Any, span: float) -> None:
-    """Gradients of mean and raw log sigma, into `d_raw` [N, 2n], from those of the log densities [N]."""
+    """Compute gradients of mean and raw log sigma, into `d_raw` [N, 2n], from those of the log densities [N]."""
     n = residual.shape[1]
     one = residual.dtype.type(1)
     for i in range(residual.shape[0]):

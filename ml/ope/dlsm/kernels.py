@@ -1,7 +1,7 @@
 """The recurrences of `dlsm_recurrence`, forwards and backwards, as one compiled loop over time each.
 
-A step is a few small matrix products (BLAS) and about twenty elementwise operations; called one by one from an interpreter, the calls cost
-more than the arithmetic. Arrays are contiguous, time first, of one floating type. Gates stand in the order g, i, f, o.
+A step is a few small matrix products (BLAS) and about twenty elementwise operations. Called one by one from an interpreter, the calls cost
+more than the arithmetic. Arrays are contiguous, time first, of one floating type. Gates have the order g, i, f, o.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _Q = tuple(np.float32(c) for c in (1.0, 0.470142208, 2.72503043e-2, 3.94078346e-
 
 
 def squash(x: Any) -> Any:
-    """tanh; in float32 by a rational function, which a compiler can vectorise."""
+    """Compute tanh; in float32 by a rational function, which a compiler can vectorise."""
     return math.tanh(x)
 
 
@@ -50,13 +50,15 @@ def _rational_tanh(x: Any) -> Any:
 
 @compiled(inline="always")
 def _quarters(row: Any, hidden: int) -> Any:
-    """Views of the four gates: an index like `hidden + j` could be negative for all the compiler knows, which bars vectorisation."""
+    """Return views of the four gates. An index like `hidden + j` could be negative as far as the compiler knows, which prevents
+    vectorisation."""
     return row[:hidden], row[hidden : 2 * hidden], row[2 * hidden : 3 * hidden], row[3 * hidden : 4 * hidden]
 
 
 @compiled(fastmath=FAST_MATH, error_model="numpy")
 def _cell_forward(acts: Any, carried: Any, bias: Any, c: Any, c_next: Any, tanh_c: Any, h: Any) -> None:
-    """One LSTM cell: gates [B, >= 4H], what is carried [B, >= 4H] and bias are added and squashed in place; the rest [B, H] is written."""
+    """Run one LSTM cell: gates [B, >= 4H], what is carried [B, >= 4H] and bias are added and squashed in place; the rest [B, H] is
+    written."""
     batch, hidden = tanh_c.shape
     for b in range(batch):
         row, more = acts[b], carried[b]
@@ -80,7 +82,8 @@ def _cell_forward(acts: Any, carried: Any, bias: Any, c: Any, c_next: Any, tanh_
 
 @compiled(fastmath=FAST_MATH, error_model="numpy")
 def _cell_backward(d_h: Any, acts: Any, c: Any, tanh_c: Any, d_c: Any, d_acts: Any) -> None:
-    """Gradients of a cell's gates before squashing, into the first 4H columns of `d_acts` [B, >= 4H]; `d_c` [B, H] is moved on to c."""
+    """Compute gradients of a cell's gates before squashing, into the first 4H columns of `d_acts` [B, >= 4H]; `d_c` [B, H] is moved on to
+    c."""
     batch, hidden = d_c.shape
     for b in range(batch):
         g, i, f, o = _quarters(acts[b], hidden)
@@ -104,7 +107,7 @@ def _cell_backward(d_h: Any, acts: Any, c: Any, tanh_c: Any, d_c: Any, d_acts: A
 def _latent_forward(
     heads: Any, b_out: Any, acts: Any, eps: Any, z: Any, mean: Any, log_std: Any, share: Any, std: Any, low: float, span: float
 ) -> None:
-    """Mean, standard deviation and draw of z, [B, Z] each, from h's product [B, 2Z] and the skip path in the last Z columns of `acts`."""
+    """Draw z, with mean and standard deviation, [B, Z] each, from h's product [B, 2Z] and the skip path in the last Z columns of `acts`."""
     batch, latent = eps.shape
     skip = acts.shape[1] - latent
     for b in range(batch):
@@ -123,7 +126,7 @@ def _latent_forward(
 def _latent_backward(
     grad_z: Any, grad_mean: Any, grad_log_std: Any, share: Any, std: Any, eps: Any, d_carry: Any, d_head: Any, d_acts: Any, span: float
 ) -> None:
-    """Gradients of the heads, into `d_head` [B, 2Z], and of the skip path, into the last Z columns of `d_acts`.
+    """Compute gradients of the heads, into `d_head` [B, 2Z], and of the skip path, into the last Z columns of `d_acts`.
 
     `d_carry` [B, Z + H] is the gradient of (z, h) from the step that follows; the other gradients come from above.
     """
@@ -143,7 +146,7 @@ def stochastic_forward(
     acts: Any, carry: Any, c: Any, tanh_c: Any, eps: Any, z: Any, mean: Any, log_std: Any, share: Any, std: Any,
     joint: Any, bias: Any, w_out: Any, b_out: Any, low: float, span: float,
 ) -> None:  # fmt: skip
-    """All steps of the stochastic LSTM.
+    """Run all steps of the stochastic LSTM.
 
     Args:
         acts: [T, B, 4H + Z], input's share of gates and skip path; squashed gates afterwards.
@@ -168,7 +171,7 @@ def stochastic_backward(
     grad_z: Any, grad_mean: Any, grad_log_std: Any, acts: Any, c: Any, tanh_c: Any, eps: Any, share: Any, std: Any,
     joint_t: Any, out_t: Any, d_acts: Any, d_heads: Any, d_carry: Any, d_c: Any, span: float,
 ) -> None:  # fmt: skip
-    """Gradients of `stochastic_forward`, of all steps or of those after which `d_carry` and `d_c` are known.
+    """Compute gradients of `stochastic_forward`, of all steps or of those after which `d_carry` and `d_c` are known.
 
     Args:
         grad_z, grad_mean, grad_log_std: from above, [T, B, Z].
@@ -191,7 +194,7 @@ def stochastic_backward(
 
 @compiled(fastmath=FAST_MATH, error_model="numpy")
 def lstm_forward(acts: Any, h: Any, c: Any, tanh_c: Any, w_h: Any, bias: Any) -> None:
-    """All steps of an LSTM: acts [T, B, 4H] holds the input's share and is squashed; h, c [T + 1, B, H] have row 0; tanh_c [T, B, H]."""
+    """Run all steps of an LSTM. acts [T, B, 4H] has the input's share and is squashed; h, c [T + 1, B, H] have row 0; tanh_c [T, B, H]."""
     product = np.empty_like(acts[0])
     for t in range(len(acts)):
         np.dot(h[t], w_h, product)
@@ -200,7 +203,8 @@ def lstm_forward(acts: Any, h: Any, c: Any, tanh_c: Any, w_h: Any, bias: Any) ->
 
 @compiled(fastmath=FAST_MATH, error_model="numpy")
 def lstm_backward(grad_h: Any, acts: Any, c: Any, tanh_c: Any, back: Any, d_acts: Any, d_h: Any, d_c: Any) -> None:
-    """Gradients of `lstm_forward`: `d_acts` [T, B, 4H] is written from `grad_h` [T, B, H] and the transposed weights `back` [4H, H].
+    """Compute gradients of `lstm_forward`: `d_acts` [T, B, 4H] is written from `grad_h` [T, B, H] and the transposed weights `back` [4H,
+    H].
 
     `d_h` and `d_c` [B, H] are those after the last step, zeros at the end; afterwards those before the first.
     """

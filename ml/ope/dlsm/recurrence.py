@@ -30,7 +30,7 @@ def bounded(raw: Tensor) -> Tensor:
 
 
 def unbounded(log_std: float) -> float:
-    """The raw value of a log standard deviation, which is taken to lie within a hundredth of the bounds' width inside them."""
+    """Invert the bounds of a log standard deviation, which is taken to be within a hundredth of the bounds' width inside them."""
     low, high = LOG_STD_BOUNDS
     share = min(max((log_std - low) / (high - low), 0.01), 0.99)
     return math.log(share / (1 - share))
@@ -55,7 +55,7 @@ class LatentWeights(NamedTuple):
 
 
 def stochastic_lstm_loop(x: Tensor, z0: Tensor, eps: Tensor, weights: LatentWeights) -> tuple[Tensor, Tensor, Tensor]:
-    """The recurrence as it is written above; the slow twin of `stochastic_lstm`.
+    """Run the recurrence as it is written above; the slow twin of `stochastic_lstm`.
 
     Args:
         x: exogenous input, [T, B, X]. z0: first latent, [B, Z]. eps: standard normal noise, [T, B, Z].
@@ -85,7 +85,7 @@ def stochastic_lstm_loop(x: Tensor, z0: Tensor, eps: Tensor, weights: LatentWeig
 
 
 def lstm_loop(x: Tensor, w_x: Tensor, bias: Tensor, w_h: Tensor) -> Tensor:
-    """h_1 ... h_T of an LSTM whose every input is known beforehand, [T, B, H]; the slow twin of `lstm`.
+    """Compute h_1 ... h_T of an LSTM whose every input is known beforehand, [T, B, H]; the slow twin of `lstm`.
 
     Args:
         x: [T, B, X]. w_x: [X, 4H]. bias: [4H]. w_h: [H, 4H].
@@ -102,46 +102,46 @@ def lstm_loop(x: Tensor, w_x: Tensor, bias: Tensor, w_h: Tensor) -> Tensor:
 
 
 def stochastic_lstm(x: Tensor, z0: Tensor, eps: Tensor, weights: LatentWeights) -> tuple[Tensor, Tensor, Tensor]:
-    """`stochastic_lstm_loop` at a fraction of its cost: no graph per step, the loop compiled, one product less per direction."""
+    """Run `stochastic_lstm_loop` at a fraction of its cost: no graph per step, the loop compiled, one product less per direction."""
     result: tuple[Tensor, Tensor, Tensor] = _StochasticLstm.apply(x, z0, eps, *weights)
     return result
 
 
 def lstm(x: Tensor, w_x: Tensor, bias: Tensor, w_h: Tensor) -> Tensor:
-    """`lstm_loop` at a fraction of its cost."""
+    """Run `lstm_loop` at a fraction of its cost."""
     result: Tensor = _Lstm.apply(x, w_x, bias, w_h)
     return result
 
 
 CHUNK = 1 << 18
-"""Numbers per piece of a [T, B, n] array that is worked on at once, so that it is still in the cache when it is read again."""
+"""Numbers per piece of a [T, B, n] array that is processed at once. A piece is still in the cache when it is read again."""
 
 
 def _pieces(steps: int, per_step: int) -> list[slice]:
-    """Steps in pieces of about `CHUNK` numbers."""
+    """Split steps into pieces of about `CHUNK` numbers."""
     length = max(1, CHUNK // per_step)
     return [slice(first, min(first + length, steps)) for first in range(0, steps, length)]
 
 
 def _starting_at_zero(steps: int, batch: int, width: int, like: Tensor) -> Tensor:
-    """Uninitialised memory for a state at times 0 ... T, [T + 1, B, n], of which only time 0 is filled, with zeros."""
+    """Make memory for a state at times 0 ... T, [T + 1, B, n], of which only time 0 is filled, with zeros."""
     states = like.new_empty(steps + 1, batch, width)
     states[0].zero_()
     return states
 
 
 def _arrays(*tensors: Tensor) -> list[NDArray[Any]]:
-    """The same memory, as the compiled loops take it."""
+    """Convert tensors to arrays of the same memory, as the compiled loops take it."""
     return [t.detach().numpy() for t in tensors]
 
 
 def _states(t: slice) -> slice:
-    """States before and after the steps of a piece."""
+    """Select the states before and after the steps of a piece."""
     return slice(t.start, t.stop + 1)
 
 
 def _flat(values: Tensor) -> Tensor:
-    """[T, B, n] as [T B, n]."""
+    """Flatten [T, B, n] to [T B, n]."""
     return values.reshape(-1, values.shape[2])
 
 

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Simulated sessions of P policies, M each; shape [P, M] unless said.
+    """Simulated sessions of P policies, M each; shape [P, M] unless stated.
 
     Attributes:
         return_head: discounted step return by the learnt reward head's mean.
@@ -121,7 +121,7 @@ def _roll_block(
     dtype = networks.decoder.bias.dtype
 
     def shared(*shape: int) -> torch.Tensor:
-        """Noise for m trajectories, the same for every policy, [P m, ...]."""
+        """Draw noise for m trajectories, the same for every policy, [P m, ...]."""
         return torch.as_tensor(rng.standard_normal((m, *shape)), dtype=dtype).repeat(p, *([1] * len(shape)))
 
     if prior:
@@ -184,7 +184,7 @@ class LinearRun:
         self._rest = np.empty(0)
 
     def predicted(self, window: Floats, a: Floats) -> Floats:
-        """Standardised beta [P m] after the windows [P m, W] under the amplitudes [P m]."""
+        """Predict standardised beta [P m] after the windows [P m, W] under the amplitudes [P m]."""
         amplitudes = a.reshape(self._policies, 1, -1)
         if self._response is None:
             self._response = self._part.response(amplitudes, self._doses)
@@ -197,14 +197,14 @@ class LinearRun:
 
 
 def _minutes(summed: Floats, counts: NDArray[np.int64], policies: int) -> Minutes:
-    """Sums [minutes, F, P M] over the steps of each minute as sessions [P, M]."""
+    """Convert sums [minutes, F, P M] over the steps of each minute to sessions [P, M]."""
     means = np.moveaxis(summed / counts[:, None, None], 2, 0)
     means = means.reshape(policies, -1, *means.shape[1:])
     return with_shares(means, np.broadcast_to(counts.astype(np.float64), means.shape[:3]))
 
 
 def _within(beta: Floats, scale: Scale) -> Floats:
-    """Simulated beta kept within one logged range beyond the logged range, and above zero where the log is: a stop for wild models only."""
+    """Limit simulated beta to one logged range beyond the logged range, and above zero where the log is: a stop for wild models only."""
     span = scale.beta_high - scale.beta_low
     low = scale.beta_low - span
     return np.clip(beta, max(low, 0.0) if scale.beta_low >= 0 else low, scale.beta_high + span)

@@ -1,10 +1,10 @@
 """Fitted Q evaluation with the horizon as an index, in closed form. Source: Le, Voloshin and Yue 2019; linear: Duan and Wang 2020.
 
 Q_tau(s, a) is the return of the next tau steps. It is linear in fixed features (polynomial ones and random tanh units), so that one
-backward step is one product with a small matrix: 300 steps cost milliseconds, refits on resampled sessions are affordable, and no
-stopping rule, target network or learning rate is left to choose. r_end is not discounted (gamma^299 = 0.05 would erase it): what
-it follows in a session are averages over steps, so their expectations are undiscounted Q functions of the same features. There is one
-head for each column of `fqe.steps.RATES`: the discounted sum of rewards, and sums of what outcomes follow.
+backward step is one product with a small matrix. 300 steps cost milliseconds, and refits on resampled sessions are affordable. No stopping
+rule, target network or learning rate is left to choose. r_end is not discounted (gamma^299 = 0.05 would erase it). It follows averages over
+the steps of a session, so their expectations are undiscounted Q functions of the same features. There is one head for each column of
+`fqe.steps.RATES`: the discounted sum of rewards, and the sums that outcomes follow.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ CHECK_STEPS = 50
 
 
 def backward_induction(transition: Floats, reward: Floats, discount: Floats, horizon: int) -> Floats:
-    """Weights of Q_0 ... Q_H.
+    """Compute the weights of Q_0 ... Q_H.
 
     Args:
         transition: regression of the next step's features on this step's, [F, F]. reward: of the K rewards, [F, K].
@@ -63,7 +63,7 @@ def backward_induction(transition: Floats, reward: Floats, discount: Floats, hor
 
 
 def discounts(gamma: float) -> Floats:
-    """Discount of every head, [R]: sums that outcomes follow are not discounted."""
+    """Return the discount of every head, [R]: sums that outcomes follow are not discounted."""
     return np.array([gamma] + [1.0] * (RATES - 1))
 
 
@@ -94,12 +94,13 @@ class Grams:
         self.reward = self.product(table.rates)
 
     def product(self, other: Floats) -> Floats:
-        """Phi^T other, per session, [n, F, ...]."""
+        """Compute Phi^T other, per session, [n, F, ...]."""
         parts = [self.phi[i:j].T @ other[i:j] for i, j in zip(self.bounds, self.bounds[1:], strict=False)]
         return np.stack(parts)
 
     def solve(self, pick: Indices, penalty: float, *sides: Floats) -> tuple[Floats, ...]:
-        """Ridge regressions of per-session products [n, F, .] on the features, over the picked sessions; the constant is not penalised."""
+        """Solve ridge regressions of per-session products [n, F, .] on the features, over the picked sessions; the constant is not
+        penalised."""
         gram = self.square[pick].sum(0)
         ridge = np.full(len(gram), penalty * gram[0, 0])
         ridge[0] = 1e-9 * gram[0, 0]
@@ -117,11 +118,12 @@ class QMember:
     penalty: float
 
     def next_products(self, target: TargetActions) -> Floats:
-        """Phi^T Phi' under a policy, per session, [n, F, F]."""
+        """Compute Phi^T Phi' under a policy, per session, [n, F, F]."""
         return self.grams.product(self.features(self.grams.table.next_states, target.then, target.memory))
 
     def weights(self, products: Floats, pick: Indices, horizon: int, gamma: float) -> tuple[Floats, float]:
-        """Weights of Q_0 ... Q_H for every head, [H + 1, F, R], and the penalty used: raised until nothing grows over the horizon."""
+        """Compute the weights of Q_0 ... Q_H for every head, [H + 1, F, R], and the penalty used: raised until nothing grows over the
+        horizon."""
         penalty = self.penalty
         while True:
             transition, reward = self.grams.solve(pick, penalty, products, self.grams.reward)
@@ -131,18 +133,18 @@ class QMember:
 
 
 def spectral_radius(matrix: Floats) -> float:
-    """Largest modulus of an eigenvalue."""
+    """Compute the largest modulus of an eigenvalue."""
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
 def fit_member(table: UsableSteps, folds: Sequence[Sequence[int]], gamma: float, units: int, seed: int) -> QMember:
-    """Features of one seed with the penalty whose predictions of `CHECK_STEPS`-step returns on left-out sessions are best."""
+    """Fit features of one seed with the penalty whose predictions of `CHECK_STEPS`-step returns on held-out sessions are best."""
     features = ValueFeatures(table, units, seed)
     phi = features(table.states, table.actions, table.memory)
     grams = Grams(table, phi)
     rows, returns = logged_returns(table, gamma, CHECK_STEPS)
     follows = table.follows >= 0
-    # The logged next step stands for the policy here: what is predicted is what the logged controllers went on to collect.
+    # The logged next step replaces the policy here: the prediction is of what the logged controllers went on to collect.
     logged = Grams(replace_steps(table, follows), phi[follows])
     products = logged.product(phi[table.follows[follows]])
     errors = np.full(len(PENALTIES), np.inf)
@@ -163,7 +165,7 @@ def fit_member(table: UsableSteps, folds: Sequence[Sequence[int]], gamma: float,
 
 
 def logged_returns(table: UsableSteps, gamma: float, steps: int) -> tuple[Indices, Floats]:
-    """Rows that are followed by enough usable steps, and the discounted sums of their next `steps` rewards."""
+    """Find rows that are followed by enough usable steps, and the discounted sums of their next `steps` rewards."""
     rewards = table.rates[:, 0]
     if len(rewards) < steps:
         return np.empty(0, dtype=np.int64), np.empty(0)
@@ -176,7 +178,7 @@ def logged_returns(table: UsableSteps, gamma: float, steps: int) -> tuple[Indice
 
 
 def replace_steps(table: UsableSteps, keep: NDArray[np.bool_]) -> UsableSteps:
-    """The table with some of its steps; `follows` loses its meaning and is -1."""
+    """Select some steps of the table; `follows` loses its meaning and is -1."""
     return UsableSteps(
         table.scale,
         table.states[keep],
@@ -196,14 +198,14 @@ def replace_steps(table: UsableSteps, keep: NDArray[np.bool_]) -> UsableSteps:
 
 
 def minutes_of(sums: Floats, horizon: int) -> Minutes:
-    """Sessions as the outcome model sees them, [...], from sums over the horizon [..., R]: one minute that stands for all."""
+    """Convert sums over the horizon [..., R] to sessions as the outcome model sees them, [...]: one minute that represents all."""
     return Minutes.of_means(sums[..., 1:] / horizon)
 
 
 def within_reach(
     sums: Floats, settings: MdpSettings, horizon: int, beta_range: tuple[float, float], span: tuple[float, float] = (0.0, 1.0)
 ) -> Floats:
-    """Sums of the heads [..., R] cut to what H steps can hold at all of a policy whose amplitudes lie within `span`."""
+    """Limit sums of the heads [..., R] to what H steps can reach under a policy whose amplitudes are within `span`."""
     discounted = float(np.sum(settings.gamma ** np.arange(horizon)))
     low, high = horizon * step_features(np.array(beta_range), np.array(span), settings.xi_beta)
     low[ABOVE], high[ABOVE] = 0.0, horizon
@@ -220,7 +222,7 @@ class Fqe:
     method: str = "fqe"
 
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedFqe:
-        """Features and penalties; takes seconds, so nothing is kept in `checkpoint_dir`.
+        """Fit features and penalties; this takes seconds, so nothing is written to `checkpoint_dir`.
 
         Raises:
             ValueError: fewer than two sessions with usable steps, or no session with a complete s_0.
@@ -249,7 +251,7 @@ class FittedFqe:
     end: EndModel
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
-        """Estimate of every policy from the sessions' own s_0."""
+        """Estimate every policy from the sessions' own s_0."""
         horizon = checked_horizon(self.buffer, horizon_steps)
         support = AmplitudeSupport(self.buffer)
         estimates = {}
@@ -294,7 +296,7 @@ class Seeded(Protocol):
 
 
 class ValueSource(Protocol):
-    """What `value_estimate` needs of a fitted method."""
+    """Parts of a fitted method that `value_estimate` needs."""
 
     @property
     def method(self) -> str: ...
@@ -318,7 +320,7 @@ def value_estimate(
     details: Mapping[str, object],
     end_shift: tuple[float, Floats] | None = None,
 ) -> Estimate:
-    """An estimate from sums of the heads [R] and those of every refit [D, R]; `end_shift` is added to r_end and to its refits [D]."""
+    """Build an estimate from sums of the heads [R] and those of every refit [D, R]; `end_shift` is added to r_end and to its refits [D]."""
     with_end = fitted.end.seen[0]
     minutes = minutes_of(main, horizon)
     outcomes, means = fitted.end.predict(minutes), minutes.means
@@ -362,7 +364,7 @@ def value_estimate(
 
 
 def build(key: str, seed: int, size: Size) -> Fqe:
-    """The estimator at a size of `ml.ope.registry`."""
+    """Build the estimator at a size of `ml.ope.registry`."""
     configs = {
         "full": FqeConfig(seed=seed),
         "demo": FqeConfig(seed=seed, members=1, refits=30),

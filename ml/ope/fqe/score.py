@@ -1,4 +1,4 @@
-"""A quick score of a policy by fitted Q evaluation, for learning sweeps: sessions left out, no returns looked at."""
+"""A quick score of a policy by fitted Q evaluation, for learning sweeps: on held-out sessions, without their returns."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def fqe_value(
     units: int = 48,
     seed: int = 0,
 ) -> FqeScore:
-    """Score a policy on sessions left out of its training, in a fraction of a second; deterministic.
+    """Score a policy on held-out sessions of its training, in a fraction of a second; deterministic.
 
-    The value function is fitted to the training sessions and read at the s_0 of the left-out ones (of the training sessions where no
-    left-out one starts without gaps).
+    The value function is fitted to the training sessions and read at the s_0 of the held-out ones. Where no held-out session starts without
+    gaps, it is read at those of the training sessions.
 
     Raises:
         ValueError: no usable step in the training sessions, or none of all sessions starts without gaps.

@@ -1,7 +1,7 @@
 """A buffer's usable steps in one table with memories of past amplitudes, and the features that value functions are linear in.
 
-The window of beta alone is no Markov state: stimulation acts over minutes. Exponential averages of the amplitudes so far are known in
-the log and under any policy, so they stand beside the window.
+The window of beta alone is no Markov state: stimulation acts over minutes. Exponential averages of the amplitudes so far are known in the
+log and under any policy, so they are added to the window.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ RATES = 1 + FEATURES
 
 
 def remember(memory: Floats, a: Floats) -> Floats:
-    """Memories [N, 3] after the amplitudes [N]."""
+    """Update memories [N, 3] by the amplitudes [N]."""
     decay = np.array(DECAYS)
     return memory * decay + (1 - decay) * a[:, None]
 
 
 def fresh_memory(a: Floats) -> Floats:
-    """Memories [N, 3] as if the amplitudes [N] had been on for long."""
+    """Make memories [N, 3] as if the amplitudes [N] had been on for long."""
     return np.tile(a[:, None], (1, len(DECAYS)))
 
 
 def held_amplitude(session: SessionTrajectory) -> Floats:
-    """Amplitudes [T] within [0, 1]; unknown ones held from before, those at the start from the first known (0 where none is)."""
+    """Fill amplitudes [T] within [0, 1]: unknown ones take the value before, those at the start the first known (0 where none is)."""
     a = np.clip(session.amplitude, 0.0, 1.0)
     known = np.isfinite(a)
     if not known.any():
@@ -51,22 +51,24 @@ def held_amplitude(session: SessionTrajectory) -> Floats:
 
 
 def lead_dose(session: SessionTrajectory, otherwise: float | None) -> float | None:
-    """Amplitude fraction within [0, 1] that had been on before a session: the one on record, else `otherwise`; None: its first one."""
+    """Find the amplitude fraction within [0, 1] that had been on before a session: the one on record, else `otherwise`. None: its first
+    one."""
     return otherwise if session.lead_amplitude is None else min(max(session.lead_amplitude, 0.0), 1.0)
 
 
 def lead_doses(sessions: Sequence[SessionTrajectory], otherwise: float | None) -> Floats:
-    """`lead_dose` every session, [n]; NaN where that is None."""
+    """Apply `lead_dose` to every session, [n]; NaN where that is None."""
     return np.array([np.nan if (dose := lead_dose(s, otherwise)) is None else dose for s in sessions], dtype=np.float64)
 
 
 def after_doses(first: Floats, before: Floats) -> Floats:
-    """The amplitudes [..., n] that had been on before sessions [n]: `lead_doses`, and their first ones [..., n] where those are NaN."""
+    """Combine the amplitudes [..., n] that had been on before sessions [n]: `lead_doses`, and their first ones [..., n] where those are
+    NaN."""
     return np.where(np.isnan(before), first, before)
 
 
 def memories(a: Floats, before: float | None = None) -> Floats:
-    """Memories [T, 3] of a session's amplitudes [T], each row with its own step in it.
+    """Compute memories [T, 3] of a session's amplitudes [T], each row with its own step in it.
 
     Args:
         before: amplitude that had been on for long before the session; its own first one where that is None.
@@ -109,13 +111,14 @@ class UsableSteps:
     otherwise: float | None = None
 
     def first_memory(self, a: Floats, sessions: Sequence[SessionTrajectory] | None = None) -> Floats:
-        """Memories [m, 3] at the first step under the amplitudes [m] of the table's first sessions, or of other ones, after their doses."""
+        """Compute memories [m, 3] at the first step under the amplitudes [m] of the table's first sessions, or of other ones, after their
+        doses."""
         before = self.before if sessions is None else lead_doses(sessions, self.otherwise)
         return remember(fresh_memory(after_doses(a, before)), a)
 
 
 def usable_steps(buffer: ReplayBuffer, scale: Scale | None = None, otherwise: float | None = None) -> UsableSteps:
-    """The table of a buffer; `otherwise` is the dose before sessions of which no record says it.
+    """Build the table of a buffer; `otherwise` is the dose before sessions without a record of it.
 
     Raises:
         ValueError: no step is usable, or no session starts without gaps.
@@ -168,7 +171,7 @@ class ValueFeatures:
         self._spread[raw.std(0) < 1e-6] = 1.0
 
     def __call__(self, states: Floats, actions: Floats, memory: Floats) -> Floats:
-        """Features [N, F], the first of them constant, the others centred and of unit spread over the logged steps."""
+        """Compute features [N, F], the first of them constant, the others centred and of unit spread over the logged steps."""
         raw = self._raw(states, actions, memory)
         return np.concatenate([np.ones((len(raw), 1)), (raw - self._centre) / self._spread], axis=1)
 
@@ -186,7 +189,7 @@ _SUMMARIES = 3 + 1 + len(DECAYS)
 
 @dataclass(frozen=True)
 class TargetActions:
-    """What a policy does at the states of a table; computed once, because the policy is fixed.
+    """Actions of a policy at the states of a table; computed once, because the policy is fixed.
 
     Attributes:
         at: pi(s_k), [N]. then: pi(s_{k+1}), [N]. memory: of that next step, [N, 3]. first: pi(s_0), [m].
@@ -199,7 +202,7 @@ class TargetActions:
 
     @classmethod
     def of(cls, table: UsableSteps, policy: Policy) -> TargetActions:
-        """Actions of a policy on a table."""
+        """Compute the actions of a policy on a table."""
         then = _act(policy, table.next_states)
         return cls(_act(policy, table.states), then, remember(table.memory, then), _act(policy, table.first_states))
 

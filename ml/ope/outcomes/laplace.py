@@ -50,14 +50,14 @@ class Problem:
     precision: Floats
 
     def only(self, k: int) -> Problem:
-        """The k-th of the regressions."""
+        """Select the k-th of the regressions."""
         part = slice(k, k + 1)
         return replace(self, design=self.design[part], prior_mean=self.prior_mean[part], precision=self.precision[part])
 
 
 @dataclass(frozen=True)
 class Solved:
-    """What was found for each of K regressions.
+    """Solutions of K regressions.
 
     Attributes:
         mode: coefficients, [K, q]. factor: L^-T with L L^T the information, [K, q, q]. dispersion: [K]. degrees: of freedom of it.
@@ -71,14 +71,14 @@ class Solved:
     log_evidence: Floats
 
     def left_out(self, p: Problem, at: Floats, groups: Sequence[Indices], extra: Floats, weights: Floats | None = None) -> Floats:
-        """Expected outcome of every session from the sessions of the other groups, [n].
+        """Predict the expected outcome of every session from the sessions of the other groups, [n].
 
         One Newton step from the mode of all. Dispersions are those of all.
 
         Args:
             p: what was solved. at: design to predict from, shape of `p.design`.
-            groups: indices of the sessions that are left out together; each session is in one group.
-            extra: variance of the predictor of a session whose group is left out, beside that of its noise, [K].
+            groups: indices of the sessions that are held out together; each session is in one group.
+            extra: variance of the predictor of a session whose group is held out, in addition to that of its noise, [K].
             weights: of the regressions, [K]; by default by the evidence of what is left.
         """
         group, surprise = np.zeros(len(p.y), dtype=np.int64), np.zeros((len(self.mode), len(groups)))
@@ -94,7 +94,8 @@ class Solved:
         return np.asarray(np.sum((shares / shares.sum(0))[:, group] * each, axis=0), dtype=np.float64)
 
     def _without(self, one: Problem, k: int, members: Indices) -> tuple[Floats, Floats]:
-        """Mode of regression k without each of G groups, [G, q], and the log density of the group given the rest, [G]; members [G, m]."""
+        """Compute the mode of regression k without each of G groups, [G, q], and the log density of the group given the rest, [G]; members
+        [G, m]."""
         mode, dispersion = self.mode[k : k + 1], self.dispersion[k : k + 1]
         jacobian, weight, residual = (v[0] for v in _terms(one, mode, dispersion))
         root, there = np.sqrt(weight), members >= 0
@@ -111,7 +112,7 @@ class Solved:
 
 
 def _padded(groups: Sequence[Indices]) -> Indices:
-    """Indices of groups side by side, [G, m]; -1 where a group has fewer."""
+    """Pad indices of groups to equal length, [G, m]; -1 where a group has fewer."""
     result = np.full((len(groups), max(len(g) for g in groups)), -1, dtype=np.int64)
     for row, members in zip(result, groups, strict=True):
         row[: len(members)] = members
@@ -119,7 +120,7 @@ def _padded(groups: Sequence[Indices]) -> Indices:
 
 
 def solve(p: Problem) -> Solved:
-    """Modes by Fisher scoring with halved steps, the dispersion by its moments between the steps."""
+    """Find modes by Fisher scoring with halved steps, and the dispersion by its moments between the steps."""
     theta, dispersion = p.prior_mean.copy(), np.full(len(p.design), DISPERSION[p.kind])
     value = _objective(p, theta, dispersion)
     for _ in range(ROUNDS):
@@ -152,7 +153,7 @@ def solve(p: Problem) -> Solved:
 
 
 def mean_of(kind: Kind, eta: Floats, parts: Floats, dispersion: Floats | float, extra: Floats | float = 0.0) -> Floats:
-    """Expected outcome [...] from predictors [..., M]; `extra`, a variance of eta, is averaged over (levels of a new day)."""
+    """Compute the expected outcome [...] from predictors [..., M]; `extra`, a variance of eta, is averaged over (levels of a new day)."""
     if kind == "binomial":
         flat = eta / np.sqrt(1 + np.pi * np.asarray(extra)[..., None] / 8)
         return np.asarray((parts * expit(flat)).sum(-1), dtype=np.float64)
@@ -181,7 +182,7 @@ def log_likelihood(kind: Kind, y: Floats, size: Floats, eta: Floats, parts: Floa
 
 
 def _interval(y: Floats, mean: Floats, width: Floats) -> tuple[Floats, Floats, Floats]:
-    """P(rounds to y), mean and mean square of (z - mean) / width given that it does."""
+    """Compute P(rounds to y), and mean and mean square of (z - mean) / width given that it does."""
     low = np.where(y <= RATING_LOW, -np.inf, (y - 0.5 - mean) / width)
     high = np.where(y >= RATING_HIGH, np.inf, (y + 0.5 - mean) / width)
     low, high = np.clip(low, -30.0, 30.0), np.clip(high, -30.0, 30.0)
@@ -210,7 +211,8 @@ def _objective(p: Problem, theta: Floats, dispersion: Floats) -> Floats:
 
 
 def _terms(p: Problem, theta: Floats, dispersion: Floats) -> tuple[Floats, Floats, Floats]:
-    """Per session: slope J of its mean (or predictor) [K, n, q], weight w and residual r [K, n]. Score J r, information w J J^T."""
+    """Compute per session the slope J of its mean (or predictor) [K, n, q], weight w and residual r [K, n]. Score J r, information w J
+    J^T."""
     eta, s = _eta(p, theta), dispersion[:, None]
     if p.kind == "binomial":
         each = expit(eta)
@@ -229,7 +231,7 @@ def _terms(p: Problem, theta: Floats, dispersion: Floats) -> tuple[Floats, Float
 
 
 def _derivatives(p: Problem, theta: Floats, dispersion: Floats) -> tuple[Floats, Floats]:
-    """Slope [K, q] and information [K, q, q] of the log posterior."""
+    """Compute slope [K, q] and information [K, q, q] of the log posterior."""
     jacobian, weight, residual = _terms(p, theta, dispersion)
     slope = np.einsum("knq,kn->kq", jacobian, residual) - p.precision * (theta - p.prior_mean)
     information = np.matmul(np.swapaxes(jacobian * weight[..., None], 1, 2), jacobian)
@@ -238,7 +240,7 @@ def _derivatives(p: Problem, theta: Floats, dispersion: Floats) -> tuple[Floats,
 
 
 def _dispersion(p: Problem, theta: Floats, dispersion: Floats) -> Floats:
-    """The dispersion given the coefficients, [K]: sessions less what the fit has used up, and the prior for `PRIOR_SESSIONS`."""
+    """Compute the dispersion given the coefficients, [K]: sessions less what the fit has used up, and the prior for `PRIOR_SESSIONS`."""
     eta, s = _eta(p, theta), dispersion[:, None]
     mean = (p.parts * (expit(eta) if p.kind == "binomial" else eta)).sum(-1)
     if p.kind == "binomial":

@@ -1,4 +1,4 @@
-"""How far medication has worn off at a session, by the time since the last dose: outcomes are adjusted for it, and no policy moves it."""
+"""Wearing off of medication at a session, by the time since the last dose. Outcomes are adjusted for it, and no policy moves it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ml.trajectories import ReplayBuffer
 Floats = NDArray[np.float64]
 
 WORN_OFF_H: Final = {"worn early": 2.0, "worn late": 3.5}
-"""Hours after which half of the effect of a dose is gone, by column: a single dose of levodopa works for two to four hours (ours)."""
+"""Hours after which half of the effect of a dose is gone, by column. A single dose of levodopa works for two to four hours (our choice)."""
 
 WIDTH_H: Final = 0.4
 """Width of the logistic by which it goes."""
@@ -21,11 +21,12 @@ FEWEST_KNOWN: Final = 6
 """Sessions with a known time below which nothing is adjusted for it."""
 
 LEAST_SPREAD: Final = 0.05
-"""Standard deviation of a column between sessions below which it tells nothing."""
+"""Standard deviation of a column between sessions below which it is ignored."""
 
 
 def worn_off(buffer: ReplayBuffer) -> dict[str, Floats]:
-    """Columns of every session by name, [n], less their mean over the sessions that know the time; 0, which is that mean, for the others.
+    """Compute columns of every session by name, [n], less their mean over sessions with a known time; 0, which is that mean, for the
+    others.
 
     Sessions of one visit differ by it, and what is given late in a visit is not what makes symptoms come back.
     Empty where fewer than `FEWEST_KNOWN` sessions, or less than half of them, know it.

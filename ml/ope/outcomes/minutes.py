@@ -1,4 +1,4 @@
-"""What the outcomes of a session are predicted from: dose and burden of beta, minute by minute."""
+"""Predictors of a session's outcomes: dose and burden of beta, minute by minute."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ All but beta lie within [0, 1] and those of the amplitude grow with it."""
 
 
 def each_feature(beta: Floats, amplitude: Floats, xi_beta: float) -> Iterator[Floats]:
-    """The `FEATURES` of steps one after the other, each of the shape of beta; the amplitude is cut to [0, 1]."""
+    """Yield the `FEATURES` of steps one after the other, each of the shape of beta; the amplitude is cut to [0, 1]."""
     a = np.clip(amplitude, 0.0, 1.0)
     square = a * a
     yield square
@@ -50,7 +50,7 @@ def each_feature(beta: Floats, amplitude: Floats, xi_beta: float) -> Iterator[Fl
 
 
 def step_features(beta: Floats, amplitude: Floats, xi_beta: float) -> Floats:
-    """`FEATURES` of steps, [..., F]; beta and amplitude must be known."""
+    """Compute `FEATURES` of steps, [..., F]; beta and amplitude must be known."""
     return np.stack(list(each_feature(beta, amplitude, xi_beta)), axis=-1)
 
 
@@ -70,7 +70,7 @@ class Minutes:
 
     @classmethod
     def of_means(cls, means: Floats) -> Minutes:
-        """Sessions of which only means over the whole are known, [..., F]: one minute that stands for all."""
+        """Make sessions of which only means over the whole are known, [..., F]: one minute that represents all."""
         ones = np.ones((*means.shape[:-1], 1))
         return cls(means[..., None, :], ones, ones)
 
@@ -81,10 +81,10 @@ class Minutes:
 
 
 def by_minute(beta: Floats, amplitude: Floats, settings: MdpSettings) -> Minutes:
-    """Sessions by minute, counted from the end, so that the last one is whole.
+    """Split sessions into minutes, counted from the end, so that the last one is whole.
 
     Args:
-        beta: unit of the buffer, [..., T]. amplitude: fraction, [..., T]. Steps where either is NaN are left out.
+        beta: unit of the buffer, [..., T]. amplitude: fraction, [..., T]. Steps where either is NaN are ignored.
     """
     shape, steps = beta.shape[:-1], beta.shape[-1]
     bounds = minute_bounds(steps, settings.period_s)
@@ -102,14 +102,14 @@ def by_minute(beta: Floats, amplitude: Floats, settings: MdpSettings) -> Minutes
 
 
 def minute_bounds(steps: int, period_s: float) -> list[tuple[int, int]]:
-    """First step and end of every minute; the first minute may be shorter."""
+    """List first step and end of every minute; the first minute may be shorter."""
     per = max(1, round(MINUTE_S / period_s))
     ends = list(range(steps, 0, -per))[::-1]
     return [(max(0, end - per), end) for end in ends]
 
 
 def with_shares(features: Floats, counts: Floats) -> Minutes:
-    """Minutes of sessions from means over their steps [..., M, F] and numbers of known steps [..., M]."""
+    """Make minutes of sessions from means over their steps [..., M, F] and numbers of known steps [..., M]."""
     last = np.where(np.arange(counts.shape[-1]) >= counts.shape[-1] - LATE_MINUTES, counts, 0.0)
     return Minutes(features, _shares(counts), _shares(np.where(last.sum(-1, keepdims=True) > 0, last, counts)))
 

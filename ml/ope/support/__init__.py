@@ -1,1 +1,1 @@
-"""What the logged data can say about a policy, before any estimate is made."""
+"""Support of a policy by the logged data, tested before any estimate is made."""

@@ -1,4 +1,5 @@
-"""What policies ask for at which beta, and where sessions have ever been: the numbers behind one picture, small enough to be stored."""
+"""Map of policies: their amplitude by level of beta, and where sessions have ever been. It is the data of one picture, small enough to be
+stored."""
 
 from __future__ import annotations
 
@@ -14,13 +15,13 @@ from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer
 
 COLUMNS = 24
-"""Columns of beta, of equal width over the middle 98 % of the recorded windows; what lies outside counts in the outermost two."""
+"""Columns of beta, of equal width over the middle 98 % of the recorded windows; windows outside count in the outermost two."""
 
 DOSES = 20
 """Rows of amplitude, 5 % of cDBS each."""
 
 FEWEST = 5
-"""Windows in a column below which nothing is said of it."""
+"""Fewest windows of a column; one with fewer stays empty."""
 
 
 @dataclass(frozen=True)
@@ -59,19 +60,19 @@ class BehaviourMap:
         return found if found is not None else self.apart.get(other, {}).get(one)
 
     def to_json(self) -> dict[str, Any]:
-        """As stored; `from_json` takes it back."""
+        """Convert the map to its stored form, which `from_json` reads."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> BehaviourMap:
-        """A stored map."""
+        """Read a stored map."""
         curves = {name: Curve(*(tuple(c[member]) for member in ("middle", "low", "high"))) for name, c in stored["policies"].items()}
         tried = tuple(tuple(column) for column in stored["tried"])
         return cls(tuple(stored["edges"]), tried, curves, {name: dict(to) for name, to in stored["apart"].items()})
 
 
 def behaviour_map(buffer: ReplayBuffer, policies: Mapping[str, Policy]) -> BehaviourMap:
-    """What each policy asks for on the recorded windows, by their mean beta. Raises ValueError where the buffer has no usable step.
+    """Compute what each policy does on the recorded windows, by their mean beta. Raises ValueError where the buffer has no usable step.
 
     Args:
         buffer: of the recorded sessions. policies: by name.

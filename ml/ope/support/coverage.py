@@ -1,4 +1,4 @@
-"""What the logged data can say about a policy, before any number is believed."""
+"""Coverage of a policy by the logged data: checks before any number is believed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Coverage:
     """Coverage of one policy.
 
     Attributes:
-        outside_range: share of states whose pi(s) lies outside the logged amplitudes.
+        outside_range: share of states whose pi(s) is outside the logged amplitudes.
         thin: share of states whose pi(s) has next to no logged amplitude near it (this includes those outside).
         logged_low, logged_high: range of the logged amplitudes.
         n_states: states looked at.
@@ -62,7 +62,7 @@ class Coverage:
         return self.thin <= UNSUPPORTED_SHARE
 
     def flags(self, source: Source = "logged") -> tuple[Flag, ...]:
-        """Failing and noteworthy checks: what the data cannot say, and what a clinician should know before picking the policy.
+        """List failing and noteworthy checks: what the data cannot show, and what a clinician should know before picking the policy.
 
         Args:
             source: of the steps that this is the coverage of.
@@ -77,18 +77,18 @@ class Coverage:
         return tuple(found)
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers, by name."""
+        """Return all numbers, by name."""
         return asdict(self)
 
 
 def thin(share: float, source: Source, **span: Fact) -> Flag:
-    """Amplitudes with hardly any logged step near them in a share of the steps; `span` gives `low` and `high` of the logged ones."""
+    """Flag amplitudes with hardly any logged step near them in a share of the steps; `span` gives `low` and `high` of the logged ones."""
     limit = UNSUPPORTED_SHARE
     return Flag("thin", share, limit, "share", share > limit, source, tuple(span.items()))
 
 
 class AmplitudeSupport:
-    """Which amplitudes a buffer holds data of.
+    """Amplitudes for which a buffer has data.
 
     Raises:
         ValueError: the buffer has no usable step.
@@ -100,7 +100,7 @@ class AmplitudeSupport:
         self.sorted_actions = np.sort(steps.actions)
 
     def look(self, amplitudes: NDArray[Any]) -> Coverage:
-        """Coverage of a set of chosen amplitudes, any shape."""
+        """Compute the coverage of a set of chosen amplitudes, any shape."""
         logged = self.sorted_actions
         chosen = np.asarray(amplitudes, dtype=np.float64).ravel()
         low, high = float(logged[0]), float(logged[-1])
@@ -112,18 +112,18 @@ class AmplitudeSupport:
         return Coverage(float(outside.mean()), float(thin.mean()), low, high, chosen.size, q99 - q01, median, off)
 
     def of_policy(self, policy: Policy) -> Coverage:
-        """Coverage of a policy over the states of the buffer."""
+        """Compute the coverage of a policy over the states of the buffer."""
         return self.look(policy.act(self.states))
 
 
 def flags_of(logged: Coverage, simulated: Coverage) -> tuple[Flag, ...]:
-    """Flags of the logged steps under a policy, then what its simulated sessions show beyond them."""
+    """List the flags of the logged steps under a policy, then what its simulated sessions show beyond them."""
     known = {flag.rounded for flag in logged.flags()}
     return (*logged.flags(), *(flag for flag in simulated.flags("simulated") if flag.rounded not in known))
 
 
 def few_effective(code: str, effective: float, sessions: int, *, refuses: bool = False) -> Flag:
-    """Importance weights that rest on a handful of sessions.
+    """Flag importance weights that rest on a handful of sessions.
 
     Args:
         code: what rests on them. effective: sample size. sessions: that were weighted. refuses: whether nothing else speaks.
@@ -132,7 +132,8 @@ def few_effective(code: str, effective: float, sessions: int, *, refuses: bool =
 
 
 def effective_sample_size(log_weights: NDArray[Any]) -> tuple[float, float]:
-    """Effective sample size (sum w)^2 / sum w^2 and the largest weight's share, from log weights, shape [N]; 0 and 1 where all are zero."""
+    """Compute the effective sample size (sum w)^2 / sum w^2 and the largest weight's share, from log weights, shape [N]; 0 and 1 where all
+    are zero."""
     logs = np.asarray(log_weights, dtype=np.float64)
     if logs.size == 0 or not np.isfinite(logs.max()):
         return 0.0, 1.0

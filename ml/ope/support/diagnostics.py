@@ -32,7 +32,7 @@ from ml.trajectories import ReplayBuffer
 Floats = NDArray[np.float64]
 
 FAR = 2.0
-"""A pair (s, pi(s)) is far when no logged pair is within this many times the distance that 95 % of the logged pairs keep to each other."""
+"""Factor that makes a pair (s, pi(s)) far: no logged pair is within so many times the distance that 95 % of the logged pairs keep."""
 
 FAR_SHARE = 0.20
 """Above this share of far pairs a policy is not supported by the data."""
@@ -53,8 +53,8 @@ class Check:
     Attributes:
         name: `outside_range`, `thin`, `far`, `below_random_bound`, `unseen_dose` (shares of steps), `distance` (95 % of the logged pairs
             are within 1), `effective_sessions`, `largest_weight_share` (share), `horizon_of_ten` (steps).
-        value: None where the data cannot tell.
-        limit: what the value is held against; None where it has none.
+        value: None where it is unknown.
+        limit: what the value is compared with; None where it has none.
         at_least: whether the limit is the least value that passes; else it is the greatest.
         verdict: `refused`: the data cannot speak about the policy. `weights`: importance weights cannot, models may. `noted`: to be known
             before a policy is picked, and no refusal. `told`: a number without a limit.
@@ -120,7 +120,7 @@ class Diagnostics:
 
     @property
     def notes(self) -> tuple[Flag, ...]:
-        """What is to be known though it makes no policy unsupported."""
+        """Facts to know though they make no policy unsupported."""
         found = []
         if self.below_random_bound is not None and self.below_random_bound > NOTICE_SHARE:
             found.append(Flag.of("below_random_bound", self.below_random_bound, NOTICE_SHARE, "share", bound=self.random_bound))
@@ -130,11 +130,11 @@ class Diagnostics:
 
     @property
     def supported(self) -> bool:
-        """Whether methods that predict may speak about the policy."""
+        """True where methods that predict may estimate the policy."""
         return not self.failing
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers, by name, every check and every flag."""
+        """Return all numbers, by name, every check and every flag."""
         flags = {"failing": self.failing, "notes": self.notes, "weights_failing": self.weights_failing}
         shown = {name: [flag.to_json() for flag in found] for name, found in flags.items()}
         return asdict(self) | shown | {"supported": self.supported, "checks": [asdict(c) for c in self.checks]}
@@ -155,7 +155,7 @@ def _weights(name: str, value: float, limit: float) -> Check:
 def diagnose(
     buffer: ReplayBuffer, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent
 ) -> dict[str, Diagnostics]:
-    """Every check of every policy. Raises ValueError when the buffer has no usable step or no session with a complete s_0."""
+    """Check every policy. Raises ValueError when the buffer has no usable step or no session with a complete s_0."""
     horizon = checked_horizon(buffer, horizon_steps)
     support, table = AmplitudeSupport(buffer), usable_steps(buffer)
     weights = ImportanceSampling("wis").fit(buffer)
@@ -220,12 +220,13 @@ class _Neighbours:
         self._unit = usual if usual > 0 else 1.0
 
     def of(self, policy: Policy) -> Floats:
-        """Distance of every kept state with the policy's amplitude to the nearest logged pair of another session."""
+        """Compute the distance of every state, with the policy's amplitude, to the nearest logged pair of another session."""
         actions = np.clip(policy.act(self._states.copy()), 0.0, 1.0)
         return self._distances(np.column_stack([self._levels_kept, actions]) / self._spread) / self._unit
 
     def unseen_dose(self, policy: Policy) -> float:
-        """Share of steps at a dose with hardly any logged dose near it, the policy acting on the logged windows in their order."""
+        """Compute the share of steps at a dose with hardly any logged dose near it, the policy acting on the logged windows in their
+        order."""
         table, doses = self._table, []
         chosen = np.clip(policy.act(table.states.copy()), 0.0, 1.0)
         for i in np.unique(table.session):
