@@ -67,7 +67,7 @@ def flags(abstained: Iterable[Abstention | None], *, others: bool) -> tuple[Flag
     return tuple(found)
 
 
-def _held(session: SessionTrajectory, steps: NDArray[np.int64]) -> Iterable[tuple[NDArray[np.int64], float | None]]:
+def _usable_holds(session: SessionTrajectory, steps: NDArray[np.int64]) -> Iterable[tuple[NDArray[np.int64], float | None]]:
     """Find the places in `steps` of the usable steps of every hold that has one, and its log density."""
     for hold in session.holds:
         own = np.flatnonzero((steps >= hold.start) & (steps < hold.start + hold.steps))

@@ -124,7 +124,7 @@ def make_batch(buffer: ReplayBuffer, scale: Scale, dtype: torch.dtype = torch.fl
     )
 
 
-def _held(values: Floats, start: float) -> Floats:
+def _fill_gaps(values: Floats, start: float) -> Floats:
     """Fill gaps with the value before them; gaps at the start with the first valid value, or `start` where there is none."""
     valid = np.isfinite(values)
     if valid.all():

@@ -203,7 +203,7 @@ def _minutes(summed: Floats, counts: NDArray[np.int64], policies: int) -> Minute
     return with_shares(means, np.broadcast_to(counts.astype(np.float64), means.shape[:3]))
 
 
-def _within(beta: Floats, scale: Scale) -> Floats:
+def _limit_beta(beta: Floats, scale: Scale) -> Floats:
     """Limit simulated beta to one logged range beyond the logged range, and above zero where the log is: a stop for wild models only."""
     span = scale.beta_high - scale.beta_low
     low = scale.beta_low - span

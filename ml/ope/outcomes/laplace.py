@@ -93,7 +93,7 @@ class Solved:
         shares = np.exp(left - left.max(0)) if weights is None else np.tile(weights[:, None], len(groups))
         return np.asarray(np.sum((shares / shares.sum(0))[:, group] * each, axis=0), dtype=np.float64)
 
-    def _without(self, one: Problem, k: int, members: Indices) -> tuple[Floats, Floats]:
+    def _leave_group_out(self, one: Problem, k: int, members: Indices) -> tuple[Floats, Floats]:
         """Compute the mode of regression k without each of G groups, [G, q], and the log density of the group given the rest, [G]; members
         [G, m]."""
         mode, dispersion = self.mode[k : k + 1], self.dispersion[k : k + 1]
@@ -111,7 +111,7 @@ class Solved:
         return mode - moved @ self.factor[k].T, density
 
 
-def _padded(groups: Sequence[Indices]) -> Indices:
+def _pad(groups: Sequence[Indices]) -> Indices:
     """Pad indices of groups to equal length, [G, m]; -1 where a group has fewer."""
     result = np.full((len(groups), max(len(g) for g in groups)), -1, dtype=np.int64)
     for row, members in zip(result, groups, strict=True):
