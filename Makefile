@@ -26,7 +26,7 @@ demo: install ## Start betaloop with a synthetic study at http://127.0.0.1:8000.
 	$(BIN)/betaloop demo
 
 smoke: install ## Walk once from an upload to a signed controller and back, within a minute: the first thing to run after a change.
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/app/test_smoke.py
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/app/pipeline/test_smoke.py
 
 test: install ## Run the test suite.
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow"

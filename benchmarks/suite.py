@@ -6,7 +6,7 @@
 
 Processor seconds are user and system together, of every process that `make test` starts, PostgreSQL's and browsers' included: this process
 adopts what lost its parent and waits for all of it. They move with what else the machine does, so two checkouts are compared in one call.
-`benchmarks/support/dear_tests.py` says what is counted to a test.
+`benchmarks/support/suite_costs/dear_tests.py` says what is counted to a test.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import time
 from pathlib import Path
 
 import psutil
-from support.dear_tests import ADOPTER, COSTS
+from support.suite_costs.dear_tests import ADOPTER, COSTS
 
 HERE = Path(__file__).resolve().parent
 QUICK = "tests/app/accounts/test_permissions.py tests/test_compose.py"
@@ -59,7 +59,7 @@ def wait_for_all() -> None:
 def measure(checkout: Path, options: str) -> tuple[float, float, list[tuple[str, float]]]:
     """Processor and wall seconds of the suite of a checkout, and what each of its tests cost, the dearest first."""
     with tempfile.TemporaryDirectory() as costs:
-        plugin = {"PYTEST_ADDOPTS": f"-p dear_tests {options}", "PYTHONPATH": str(HERE / "support")}
+        plugin = {"PYTEST_ADDOPTS": f"-p dear_tests {options}", "PYTHONPATH": str(HERE / "support" / "suite_costs")}
         env = os.environ | plugin | {COSTS: costs, ADOPTER: str(os.getpid())}
         before, begun = children_s(), time.monotonic()
         ended = subprocess.run(["make", "-s", "test"], cwd=checkout, env=env, stdout=sys.stderr, check=False)

@@ -1,0 +1,1 @@
+"""What `benchmarks/suite.py` gives to pytest."""
