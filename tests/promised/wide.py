@@ -98,6 +98,9 @@ WIDE: list[Promise] = [
     Promise("answers are those of the description", "app/study/api.py", 'APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))',
             'APIRouter(tags=["study"], responses=problems(401, 403, 422))',
             f"{ROUTES}::test_the_interface_keeps_to_its_own_description", at_start=True),
+    Promise("the interface is the recorded one", "app/study/api.py", 'APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))',
+            'APIRouter(tags=["study"], responses=problems(401, 403, 422))',
+            "tests/app/test_openapi.py::test_the_interface_is_the_recorded_one", at_start=True),
     *of(
         "platform/web/middleware",
         ("refusals of generated input are answered as described", 'error.status, headers, "application/problem+json")',

@@ -157,7 +157,7 @@ def _of_plans(world: World) -> dict[str, Call]:
     rated = {"kind": "rating", "value": "7", "uuid": RATED["uuid"], "attempt": "1", "plan_item_id": slot, "plan_id": day["json"]["plan_id"]}
     return {
         f"{plan}/approve": draft | {"data": {"plan_id": str(number), "password": PASSWORD}},
-        plan: {"data": {"policy_ids": "2"}},
+        plan: {"data": {"policy_ids": str(world.forms["post", plan]["json"]["policy_ids"][0])}},
         "/participants/{code}/plan/draft": {
             "code": "P2", "data": {"policy_ids": str(tested), "visit_number": "94", "visit_date": "2199-01-01"}
         },
