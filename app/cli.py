@@ -152,7 +152,7 @@ def demo(
     port: Annotated[int | None, typer.Option(help="Port to listen on.")] = None,
 ) -> None:
     """Start everything with a small synthetic study: database, web, worker, uploads, and the first ranking."""
-    from app.simulation.demo import run_demo
+    from app.simulation.demo.command import run_demo
 
     settings = get_settings()
     run_demo(host or settings.host, port or settings.port)

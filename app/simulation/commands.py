@@ -44,7 +44,7 @@ def demo_files(
 ) -> None:
     """Learn the policies of the demo's participants on their earlier visits, and hold the sessions that tested them; takes minutes."""
     from app.platform.tables import load_tables
-    from app.simulation.demo_making import make
+    from app.simulation.demo.making import make
 
     load_tables()
     out = Console(stderr=True)
@@ -55,4 +55,4 @@ def demo_files(
 def register(study: typer.Typer) -> None:
     """Add the commands."""
     study.command("simulate", epilog="Example: betaloop study simulate --participants P1 --preset quick")(simulate)
-    study.command("demo-files", epilog="Example: betaloop study demo-files app/simulation/demo_files --participants P3")(demo_files)
+    study.command("demo-files", epilog="Example: betaloop study demo-files app/simulation/demo/files --participants P3")(demo_files)

@@ -30,7 +30,7 @@ from app.platform.errors import BetaloopError, Conflict, NotFound
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.models import Job, JobStatus
 from app.platform.jobs.watch import POLL_S, look
-from app.simulation.demo_study import participant_body
+from app.simulation.demo.study import participant_body
 from app.simulation.design import BETWEEN_VISITS, MORNING, Design, Remembered
 from app.simulation.sessions import VisitDay
 from app.study import repository as study_repository

@@ -20,7 +20,7 @@ from app.planning.plans.models import PlanItem
 from app.planning.visit_day import service as clinic_day
 from app.planning.visit_day.schemas import EntryIn
 from app.platform.errors import BetaloopError
-from app.simulation.demo_study import device_session, session_file
+from app.simulation.demo.study import device_session, session_file
 from app.simulation.tablet import Moment, run_slot_of
 from app.study import service as study
 from app.study.models import Controller, Participant, StudySession, Visit

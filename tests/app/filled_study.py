@@ -22,7 +22,7 @@ from app.platform.jobs.context import StepOutcome
 from app.platform.jobs.registry import load_compute
 from app.platform.jobs.steps import JobRunner
 from app.settings import private_folder
-from app.simulation.demo_study import DAY, participant_body, session_file
+from app.simulation.demo.study import DAY, participant_body, session_file
 from ml.designs import DesignedSession, DesignSettings, lay_out
 from ml.population import run_session
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from app.platform.database import now, transaction
 from app.platform.jobs.models import Job, JobStatus
 from app.platform.web.numbers import minutes_left, time_left
-from app.simulation import demo, demo_loader
+from app.simulation.demo import command, loader
 
 PAGES = ("/", "/participants/P1", "/participants/P1/ranking")
 
@@ -101,7 +101,7 @@ def job(status: str, progress: float, left: float | None) -> dict[str, object]:
 @pytest.mark.parametrize("terminal", [True, False])
 def test_the_terminal_says_how_far_it_is(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
-    monkeypatch.setattr(demo_loader, "_LINE_S", 0.0)
+    monkeypatch.setattr(loader, "_LINE_S", 0.0)
     jobs = [job("queued", 0.0, None), job("running", 0.02, None), job("running", 0.5, 150.0), job("succeeded", 1.0, None)]
 
     def come():  # type: ignore[no-untyped-def]
@@ -109,7 +109,7 @@ def test_the_terminal_says_how_far_it_is(terminal: bool, monkeypatch: pytest.Mon
             yield one
             time.sleep(0.15)  # a terminal is drawn ten times a second
 
-    last = demo_loader.show(Console(file=out, width=80, force_terminal=terminal), come())
+    last = loader.show(Console(file=out, width=80, force_terminal=terminal), come())
     assert last["status"] == "succeeded"
     said = out.getvalue()
     for words in ("First ranking", "waits for the worker", "time left not known yet", "about 3 min left", "Fit DLSM"):
@@ -120,7 +120,7 @@ def test_the_terminal_says_how_far_it_is(terminal: bool, monkeypatch: pytest.Mon
 def test_the_password_stays_beside_its_label(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     monkeypatch.setattr(demo, "console", Console(file=out, width=80, force_terminal=terminal, color_system=None))
-    demo.say_welcome("http://a-long-name-of-a-machine.of-a-clinic.example:8000", 12.3, "beta-0123abcd")
+    command.say_welcome("http://a-long-name-of-a-machine.of-a-clinic.example:8000", 12.3, "beta-0123abcd")
     lines = out.getvalue().splitlines()
     assert any(line.strip() == "password: beta-0123abcd" for line in lines)
     assert any(line.strip() == "address:  http://a-long-name-of-a-machine.of-a-clinic.example:8000" for line in lines)

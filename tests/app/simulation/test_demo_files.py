@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from app.platform.errors import BetaloopError
-from app.simulation.demo_content import LINES, Participant
-from app.simulation.demo_data import DAY_WITH_POLICIES, FOLDER, MOST_BYTES, read, write
-from app.simulation.demo_loader import LoadFailed, State, run_all
-from app.simulation.demo_making import STUDY
-from app.simulation.demo_study import TESTED_VISITS, demo_visits
+from app.simulation.demo.content import LINES, Participant
+from app.simulation.demo.data import DAY_WITH_POLICIES, FOLDER, MOST_BYTES, read, write
+from app.simulation.demo.loader import LoadFailed, State, run_all
+from app.simulation.demo.making import STUDY
+from app.simulation.demo.study import TESTED_VISITS, demo_visits
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.population import PARTICIPANTS
 

@@ -11,7 +11,7 @@ import pytest
 
 from app.planning.protocol.schedule import SESSION_MINUTES
 from app.platform.errors import Conflict, Invalid
-from app.simulation.demo_study import demo_visits
+from app.simulation.demo.study import demo_visits
 from app.simulation.design import PRESETS, design, remember, visit_day
 from app.study.schemas import ConditionsChange
 from ml.population import PARTICIPANTS

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from app.simulation.keeper import MODULE, READY
+from app.simulation.demo.keeper import MODULE, READY
 
 SERVICE = """
 import signal, sys, time
@@ -31,7 +31,7 @@ PROGRAM = f"""
 import subprocess, sys, time
 from pathlib import Path
 import numpy  # of the libraries that the former program needed
-from app.simulation.keeper import become_keeper
+from app.simulation.demo.keeper import become_keeper
 folder = Path(sys.argv[1])
 started = [subprocess.Popen([sys.executable, "-c", {SERVICE!r}, name, str(folder)]) for name in ("web", "worker")]
 while not all((folder / name).exists() for name in ("web", "worker")):

@@ -22,10 +22,10 @@ from app.learning.policies.learned_earlier import Learned, add_learned
 from app.learning.snapshots.service import take_snapshot
 from app.platform.database import now, transaction
 from app.settings import get_settings
-from app.simulation.demo_accounts import ADMIN, CLINICIAN, ENGINEER, password
-from app.simulation.demo_data import REPEATS, SESSION_MINUTES, WASHOUT_MINUTES, Generation, RecordedSession, Story, read
-from app.simulation.demo_loader import Door, LoadFailed, State, Step, follow, run_all, show
-from app.simulation.demo_study import DemoSession, characteristics_body, demo_visits, participant_body, trajectories
+from app.simulation.demo.accounts import ADMIN, CLINICIAN, ENGINEER, password
+from app.simulation.demo.data import REPEATS, SESSION_MINUTES, WASHOUT_MINUTES, Generation, RecordedSession, Story, read
+from app.simulation.demo.loader import Door, LoadFailed, State, Step, follow, run_all, show
+from app.simulation.demo.study import DemoSession, characteristics_body, demo_visits, participant_body, trajectories
 from app.study import repository as study
 from ml.population import PARTICIPANTS
 from ml.trajectories import ReplayBuffer

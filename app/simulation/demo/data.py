@@ -16,7 +16,7 @@ from ml.qoc import Qoc
 from ml.trajectories import SessionTrajectory
 
 Floats = NDArray[np.float64]
-FOLDER: Final = Path(__file__).parent / "demo_files"
+FOLDER: Final = Path(__file__).parent / "files"
 MOST_BYTES: Final = 300_000
 _PERIOD_S = 2
 _STORY = "story.json"

@@ -27,9 +27,9 @@ from app.platform.errors import BetaloopError, Conflict
 from app.platform.migrate import migrate
 from app.platform.start import require_data_folder, require_free
 from app.settings import get_settings, private_folder
-from app.simulation.demo_accounts import add_accounts
-from app.simulation.demo_loader import State
-from app.simulation.keeper import ENDED_BY_ITSELF, ENDING, become_keeper, stop
+from app.simulation.demo.accounts import add_accounts
+from app.simulation.demo.keeper import ENDED_BY_ITSELF, ENDING, become_keeper, stop
+from app.simulation.demo.loader import State
 
 START_TIMEOUT_S = 180.0
 
@@ -167,4 +167,4 @@ def _start_loader(url: str, state_path: Path) -> subprocess.Popen[bytes] | None:
     """Start the process that loads the study, whose simulation needs memory that nothing else does; None where all is loaded."""
     if State.at(state_path, now().date()).complete:
         return None
-    return subprocess.Popen([sys.executable, "-m", "app.simulation.demo_loader", url, str(state_path)], start_new_session=True)
+    return subprocess.Popen([sys.executable, "-m", "app.simulation.demo.loader", url, str(state_path)], start_new_session=True)

@@ -27,8 +27,8 @@ from app.platform import files
 from app.platform.errors import Invalid
 from app.platform.jobs import StepReport
 from app.settings import get_settings
-from app.simulation.demo_data import DAY_WITH_POLICIES, Generation, LearnedPolicy, RecordedSession, Story, write
-from app.simulation.demo_study import trajectories
+from app.simulation.demo.data import DAY_WITH_POLICIES, Generation, LearnedPolicy, RecordedSession, Story, write
+from app.simulation.demo.study import trajectories
 from ml.mdp import MdpSettings
 from ml.ope.posterior.gains import PosteriorGain, Tests, gains_over_cdbs
 from ml.ope.posterior.tested import TestSession, differences_to_cdbs, spread_of_random

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
             """End it."""
 
 
-MODULE = "app.simulation.keeper"
+MODULE = "app.simulation.demo.keeper"
 ENDING = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 STOP_TIMEOUT_S = 20.0
 ENDED_BY_ITSELF = "The web service or the worker ended by itself."
