@@ -119,7 +119,7 @@ def test_the_terminal_says_how_far_it_is(terminal: bool, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("terminal", [True, False])
 def test_the_password_stays_beside_its_label(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
-    monkeypatch.setattr(demo, "console", Console(file=out, width=80, force_terminal=terminal, color_system=None))
+    monkeypatch.setattr(command, "console", Console(file=out, width=80, force_terminal=terminal, color_system=None))
     command.say_welcome("http://a-long-name-of-a-machine.of-a-clinic.example:8000", 12.3, "beta-0123abcd")
     lines = out.getvalue().splitlines()
     assert any(line.strip() == "password: beta-0123abcd" for line in lines)
