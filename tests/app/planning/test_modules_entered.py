@@ -26,8 +26,9 @@ PAGE = {"Accept": "text/html"}
 
 
 @pytest.fixture
-def caller(client: TestClient) -> TestClient:
-    """A client whose requests run in threads of their own, as the tracer needs."""
+def caller(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> TestClient:
+    """A client; requests run in threads of their own from now on, as the tracer needs."""
+    monkeypatch.setattr(TestClient, "portal", None)
     return TestClient(client.app, headers=client.headers)
 
 
