@@ -118,6 +118,8 @@ def recordings_by_id(db: Session, ids: Sequence[int]) -> Sequence[Recording]:
 def recordings_of_minutes(db: Session, like: Recording) -> Sequence[Recording]:
     """List recordings of the device and side of another one that share minutes with it and were not superseded, oldest first.
 
+    Recordings without a known start share no minutes with any other.
+
     Args:
         like: it need not be stored; one of no known side is of both.
     """
@@ -127,7 +129,9 @@ def recordings_of_minutes(db: Session, like: Recording) -> Sequence[Recording]:
     end = like.started_at + timedelta(seconds=like.duration_s)
     shared = func.extract("epoch", func.least(last, end) - func.greatest(Recording.started_at, like.started_at))
     own = (Recording.device_id == like.device_id) & Recording.superseded_by_id.is_(None)
-    return db.scalars(select(Recording).where(own, either, shared > SLACK_S).order_by(Recording.id)).all()
+    # LEAST and GREATEST ignore NULL, so that a recording without a start would share all minutes
+    dated = Recording.started_at.is_not(None)
+    return db.scalars(select(Recording).where(own, dated, either, shared > SLACK_S).order_by(Recording.id)).all()
 
 
 def fullest(db: Session, recordings: Sequence[Recording]) -> list[Recording]:

@@ -174,7 +174,8 @@ def same_minutes(db: Session, recording: Recording, begin: datetime, end: dateti
         .join(SessionSegment, SessionSegment.session_id == StudySession.id)
         .join(Recording, Recording.id == SessionSegment.recording_id)
         .where(Recording.device_id == recording.device_id, Recording.id != recording.id, own_side, SessionSegment.is_control)
-        .where(shared > SLACK_S, StudySession.id != (besides or 0))
+        # LEAST and GREATEST ignore NULL, so that a recording without a start would share all minutes
+        .where(Recording.started_at.is_not(None), shared > SLACK_S, StudySession.id != (besides or 0))
         .order_by(StudySession.id)
     )
     return [SameMinutes(i, r, float(seconds), bool(counting)) for i, r, seconds, counting in db.execute(query)]
