@@ -25,6 +25,10 @@ LEAST_FRAMES = 20
 """So many intervals, nearly all under the shortest plausible one, are the frames of a hand tracker."""
 
 COUNTERS = frozenset({"", "n", "i", "index", "number", "grasp", "count", "unnamed:_0"})
+EVENTS = frozenset({"event", "state", "phase", "gesture"})
+"""Names of a column that says what happened at a time."""
+OPENED = frozenset({"open", "opened", "open_fist", "open fist", "open_hand", "open hand"})
+CLOSED = frozenset({"close", "closed", "closed_fist", "closed fist", "closed_hand", "closed hand", "fist"})
 HANDS: dict[str, Hemisphere] = {"l": "left", "left": "left", "r": "right", "right": "right"}
 
 
@@ -39,27 +43,36 @@ def looks_like_grasps(headers: Sequence[str]) -> bool:
 
 
 def decode_grasps(path: Source, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
-    """Decode a table of open-fist times (`t_s` or `t_us`, optional `hand`).
+    """Decode a table of open-fist times (`t_s` or `t_us`, optional `hand` and `event`).
 
-    Implausible intervals (under 80 ms, over 3 s) are flagged and kept.
+    Rows of closed fists are excluded where an `event` names them. Implausible intervals (under 80 ms, over 3 s) are flagged and kept.
 
     Raises:
-        UndecodableFile: no time column, text for a number, times that do not increase, an unknown hand; names line and column.
+        UndecodableFile: no time column, text for a number, times that do not increase, an unknown hand or event; names line and column.
     """
     table = read_delimited(path, (options or DecodeOptions()).max_table_rows, "t_s (or t_us) and optionally hand")
     names = [column_name(header) for header in table.headers]
     column, scale = _time_column(table, names)
     hand_column = next((i for i, (key, _) in enumerate(names) if key == "hand"), None)
+    event_column = next((i for i, (key, _) in enumerate(names) if key in EVENTS), None)
     times = table.numbers(column, table.decimal_mark([column]), "t_s") * scale
     report = FileReport(name or path.name)
     report.repaired.extend(table.notes)
-    report.removed.extend(removed_columns(header for i, header in enumerate(table.headers) if i not in (column, hand_column)))
+    known = (column, hand_column, event_column)
+    report.removed.extend(removed_columns(header for i, header in enumerate(table.headers) if i not in known))
     hands: dict[Hemisphere | None, list[int]] = {}
+    closed = 0
     for i, row in enumerate(table.rows):
+        if event_column is not None and _is_closed(row[event_column], table, i, event_column):
+            closed += 1
+            continue
         hands.setdefault(None if hand_column is None else _hand(row[hand_column], table.lines[i]), []).append(i)
+    if closed:
+        report.ignored.append(f"{closed} {'row' if closed == 1 else 'rows'} of closed fists")
     logs = tuple(_one_hand(hand, np.array(rows), times, table, report) for hand, rows in hands.items())
     if not logs:
-        raise UndecodableFile("the table has a header but no rows", "after line 1", "Add one row per open fist.")
+        what = "the table has no rows of open fists" if closed else "the table has a header but no rows"
+        raise UndecodableFile(what, "after line 1", "Add one row per open fist.")
     return DecodedFile((), (report,), grasps=logs)
 
 
@@ -75,6 +88,15 @@ def _time_column(table: TextTable, names: list[tuple[str, str | None]]) -> tuple
     found = ", ".join(shown(header.strip()) for header in table.headers[:20])
     what = "no column of times"
     raise UndecodableFile(f"{what}; found: {found}", "line 1", "Name the column t_s (seconds) or t_us (microseconds).", what)
+
+
+def _is_closed(cell: str, table: TextTable, row: int, column: int) -> bool:
+    event = cell.strip().lower()
+    if event not in OPENED | CLOSED:
+        where = f"line {table.lines[row]}, column {shown(table.headers[column].strip())}"
+        hint = "Write open or closed, or leave the column out and keep one row per open fist."
+        raise UndecodableFile(f"unknown event {shown(cell)}", where, hint, "unknown event")
+    return event in CLOSED
 
 
 def _hand(cell: str, line: int) -> Hemisphere:

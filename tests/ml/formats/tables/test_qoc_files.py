@@ -54,12 +54,21 @@ def test_a_single_open_fist_is_kept_and_said_to_be_too_few(write):
     assert any("fewer than two" in text for text in decode_grasps(write("t_s\n1\n")).reports[0].flagged)
 
 
+def test_closed_fists_are_not_counted(write):
+    rows = "".join(f"{k},open,R\n{k + 0.5},Closed,R\n" for k in range(20))
+    decoded = decode_grasps(write(f"t_s,event,hand\n{rows}"))
+    assert grasp_frequency(decoded.grasps[0].open_fist_s) == pytest.approx(1.0)
+    assert decoded.reports[0].ignored == ["20 rows of closed fists"]
+
+
 @pytest.mark.parametrize(
     ("text", "what", "where"),
     [
         ("t_s\n1\n1\n", "must increase", "line 3"),
         ("t_s,n\n1,2\n\n1,2,3\n", "3 cells where the header has 2", "line 4"),
         ("t_s,hand\n1,B\n", "unknown hand", "line 2"),
+        ("t_s,event\n1,open\n2,wave\n", "unknown event", "line 3, column 'event'"),
+        ("t_s,event\n1,closed\n", "no rows of open fists", "after line 1"),
         ("when\n1\n", "no column of times; found: 'when'", "line 1"),
         ("t_s\nnow\n", "is text", "line 2"),
         ("t_s\n", "no rows", "after line 1"),
