@@ -23,7 +23,7 @@ def stored_map(policy: int) -> dict[str, object]:
     curve = Curve((0.4,) * COLUMNS, (0.3,) * COLUMNS, (0.5,) * COLUMNS)
     tried = tuple(tuple(7 if row == 10 else 0 for row in range(DOSES)) for _ in range(COLUMNS))
     edges = tuple(1.0 + 0.1 * k for k in range(COLUMNS + 1))
-    return {"policies": {}, "map": BehaviourMap(edges, tried, {str(policy): curve}).to_json()}
+    return {"policies": {}, "map": BehaviourMap(edges, tried, {str(policy): curve}, {}).to_json()}
 
 
 def test_lines_limits_and_doses_are_in_milliamperes_with_their_tables(

@@ -16,7 +16,6 @@ from app.ingest.models import UploadFile
 from app.ingest.quarantine.serializers import problem_of
 from app.ingest.uploads import reading
 from app.ingest.uploads.reading import Cleaned
-from app.ingest.uploads.reports import stored_reports
 from app.platform import files
 from app.platform.audit import AuditEvent
 from app.platform.files import StoredFile
@@ -214,18 +213,8 @@ def test_the_report_tells_files_of_one_name_apart_and_puts_what_is_of_use_first(
     assert len(set(places.values())) == 3
 
 
-def test_why_members_could_not_be_read_is_stored_beside_the_sentences_and_read_from_old_rows_too() -> None:
-    flag = "kept encrypted, because it could not be read: StimLog.json: damaged"
-    report = {"name": "rcs.zip", "understood": [], "repaired": [], "ignored": [], "flagged": [flag], "removed": [], "problem": None}
-    new = UploadFile(report={"reports": [{**report, "flagged": ["other words"]}], "unreadable": ["StimLog.json: damaged"]})
-    old = UploadFile(report={"reports": [report], "known_recordings": []})
-    assert problem_of(new) == problem_of(old) == flag
-
-
-def test_a_report_of_version_0_1_0_is_read_with_its_hint() -> None:
-    problem = {"what": "the file is empty", "where": "file", "mend": "Send it again."}
-    lists = {name: [] for name in ("understood", "repaired", "ignored", "flagged", "removed")}
-    row = UploadFile(report={"reports": [{"name": "a.csv", **lists, "problem": problem}]})
-    found = stored_reports(row)[0].problem
-    assert found is not None
-    assert found.hint == "Send it again."
+def test_why_members_could_not_be_read_is_stored_beside_the_sentences() -> None:
+    lists = {name: [] for name in ("understood", "repaired", "ignored", "removed")}
+    report = {"name": "rcs.zip", **lists, "flagged": ["other words"], "problem": None}
+    row = UploadFile(report={"reports": [report], "unreadable": ["StimLog.json: damaged"]})
+    assert problem_of(row) == "kept encrypted, because it could not be read: StimLog.json: damaged"
