@@ -153,7 +153,7 @@ def test_a_log_without_its_first_line_is_refused_in_words(logged: tuple[Device, 
     answer = client.post("/api/v1/uploads", data=data, files={"file": ("log.csv", bare)})
     assert answer.status_code == 422, answer.text
     assert "the log of a controller without its first line" in answer.text
-    assert "put '# betaloop controller log, version 1" in answer.text
+    assert "with its first line '# betaloop controller log, version 1" in answer.text
 
 
 @pytest.mark.hazard("H21")
