@@ -190,20 +190,21 @@ class Person:
     def works(self, deadline: float) -> None:
         """Sign in, wait for P1's page, and upload a session. Raises Fails."""
         self._post("/sign-in", email="clinician@demo.example", password=self._password)
-        while self._status("/participants/P1/upload") != 200:
+        while "There is none yet" in self._page("/participants/P1/upload", instead="There is none yet"):
             if time.monotonic() > deadline:
-                raise Fails("P1 has no page to upload to")
+                raise Fails("P1 has no visit to upload to")
             time.sleep(0.5)
         page = self._post("/participants/P1/upload", controller="random", file=SESSION)
         if "newcomer.csv" not in page or "Traceback" in page:
             raise Fails(f"the upload was answered: {re.sub('<[^>]+>', ' ', page)[-2000:]}")
 
-    def _status(self, path: str) -> int:
+    def _page(self, path: str, instead: str) -> str:
+        """Return a page's text, or other words where there is no such page yet."""
         try:
             with self._browser.open(self._address + path, timeout=60) as answer:
-                return int(answer.status)
-        except urllib.error.HTTPError as error:
-            return error.code
+                return str(answer.read().decode())
+        except urllib.error.HTTPError:
+            return instead
 
     def _post(self, path: str, **fields: str) -> str:
         """Send a form as a browser does; `file` goes as a file."""

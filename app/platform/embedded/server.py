@@ -30,7 +30,7 @@ from app.platform.embedded.access import DATABASE, OWNER, PORT, SERVICE, Access,
 from app.platform.embedded.cluster import make_cluster, shared_memory
 from app.platform.embedded.programs import Programs, runnable
 from app.platform.embedded.system_user import system_user
-from app.settings import stored_secret
+from app.settings import get_settings, stored_secret
 
 _START_TIMEOUT_S = 60.0
 _ENDING_AGAIN_S = 10.0
@@ -115,10 +115,14 @@ class EmbeddedPostgres:
             self._unlock()
             self._stop(_IMMEDIATE)
             return
+        self.stop_if_unused()
+
+    def stop_if_unused(self) -> None:
+        """Give up our own use, if any, and stop the server where no other process uses it, also one whose users were all killed."""
         guard = _exclusive(self._asked.with_name(f"{self._asked.name}.start"))
         try:
             self._unlock()
-            if not self._used_by_others():
+            if self.data.exists() and not self._used_by_others():
                 self._stop(_FAST)
         finally:
             os.close(guard)
@@ -338,3 +342,9 @@ def _exclusive(path: Path) -> int:
         ) from error
     fcntl.flock(fd, fcntl.LOCK_EX)
     return fd
+
+
+if __name__ == "__main__":  # stop a server without users: a killed user could not stop it
+    _settings = get_settings()
+    if not _settings.database_url and _settings.data_dir.exists():
+        EmbeddedPostgres(_settings.data_dir / "postgres", server_user=_settings.server_user).stop_if_unused()

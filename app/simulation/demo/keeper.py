@@ -117,6 +117,8 @@ def main(arguments: Sequence[str]) -> int:
     if problem is not None:
         sys.stderr.write(f"betaloop: {problem} See the files in {logs}.\n")
     stop([*services, *([loader] if loader is not None else [])])
+    # a service that was killed could not stop the database that it used last
+    os.spawnv(os.P_WAIT, sys.executable, [sys.executable, "-m", "app.platform.embedded.server"])  # noqa: S606 - our own words, no shell
     return 0 if problem is None else 1
 
 

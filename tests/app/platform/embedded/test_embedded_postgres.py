@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import psycopg
 import pytest
 
@@ -16,6 +17,7 @@ from app.platform.embedded.cluster import make_cluster
 from app.platform.embedded.programs import Programs
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.embedded.system_user import SystemUser
+from app.settings import get_settings
 
 
 @pytest.fixture
@@ -162,3 +164,23 @@ def test_a_user_without_an_entry_is_explained(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match=r"user number 54321, who has no entry in /etc/passwd\. .*BETALOOP_DATABASE_URL"):
         make_cluster(tmp_path / "postgres", unknown)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_server_whose_users_were_all_killed_is_stopped_by_the_command(tmp_path: Path) -> None:
+    folder = tmp_path / "data"
+    code = (
+        "import os, pathlib, signal; from app.platform.embedded.server import EmbeddedPostgres as E\n"
+        f"s = E(pathlib.Path({str(folder / 'postgres')!r}), durable=False, server_user={get_settings().server_user!r})\n"
+        "s.start(); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=False, timeout=120)
+    left = EmbeddedPostgres(folder / "postgres", durable=False, server_user=get_settings().server_user)
+    number = left.pid()
+    assert psutil.pid_exists(number)
+    env = {k: v for k, v in os.environ.items() if k != "BETALOOP_DATABASE_URL"} | {"BETALOOP_DATA_DIR": str(folder)}
+    try:
+        done = subprocess.run([sys.executable, "-W", "ignore", "-m", "app.platform.embedded.server"], env=env, check=False, timeout=120)
+        assert done.returncode == 0
+        assert not psutil.pid_exists(number)
+    finally:
+        left.remove()

@@ -143,9 +143,14 @@ def test_no_call_is_lost_where_calls_come_just_when_the_process_ends(kinds, tmp_
             time.sleep(0.02 * (number + thread))
         return servers
 
+    servers: set[int] = set()
     try:
-        with ThreadPoolExecutor(3) as pool:
-            servers = set().union(*pool.map(calls, range(3)))
+        for _ in range(20):  # on a busy machine the calls of a round may leave no pause
+            with ThreadPoolExecutor(3) as pool:
+                servers = servers.union(*pool.map(calls, range(3)))
+            if len(servers) > 1:
+                break
+            time.sleep(0.3)
     finally:
         children.close()
     assert len(servers) > 1, "it ended between calls"
