@@ -24,7 +24,7 @@ _PLAIN = re.compile(r"[\w./+-]+")
 
 
 def recorded(asked: Path) -> Path | None:
-    """The place that the data folder names, or None before the first start (and in folders of version 0.1.0 that lie in place)."""
+    """Return the place that the data folder names, or None before the first start has written it down."""
     try:
         text = record_path(asked).read_text().removesuffix("\n")
     except FileNotFoundError:
@@ -59,7 +59,7 @@ def existing(asked: Path, user: SystemUser | None) -> Path | None:
     if place is None:
         if not has_database(asked):
             return None
-        place = asked  # made by version 0.1.0, which recorded only places outside the data folder
+        place = asked  # of a first start that was killed before it wrote the place down
     if not has_database(place):
         raise RuntimeError(
             f"The database of {asked.parent} lies in {place}, as {record_path(asked)} says, and is not there any more. Restore that folder"
