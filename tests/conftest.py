@@ -41,6 +41,9 @@ settings.load_profile("betaloop")
 # Jobs of tests step back behind nothing: on a machine that is busy with other work they would hardly go on.
 os.environ.setdefault("BETALOOP_JOB_NICENESS", "0")
 
+# A test that asks for no database may not use the checkout's own installation, nor leave one behind: nothing can be made below a device.
+os.environ["BETALOOP_DATA_DIR"] = "/dev/null/of-no-test"
+
 ROOT = Path(__file__).resolve().parents[1]
 PASSWORD = "correct horse battery"
 MEMORY = Path("/dev/shm")

@@ -69,6 +69,7 @@ def test_a_command_logs_an_error_with_a_plain_traceback(monkeypatch: pytest.Monk
     assert PATIENT not in printed.out + printed.err
 
 
+@pytest.mark.usefixtures("fresh_database")
 def test_a_log_on_a_full_disk_loses_lines_and_no_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
