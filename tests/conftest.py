@@ -256,6 +256,15 @@ def new_sources() -> None:
 
 
 @pytest.fixture
+def data_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A data folder without a database, for a test that stores files alone."""
+    monkeypatch.setenv("BETALOOP_DATA_DIR", str(tmp_path / "data"))
+    get_settings.cache_clear()
+    yield tmp_path / "data"
+    get_settings.cache_clear()
+
+
+@pytest.fixture
 def db(fresh_database: str) -> Iterator[Session]:
     """A session on the test's database, acting as 'test'."""
     with database.new_session() as session:

@@ -39,6 +39,7 @@ def bundles(*parts: tuple[str, bytes]) -> tuple[list[set[str]], list[str]]:
 
 
 @pytest.mark.parametrize("other", [{"DeviceId": "NPC2"}, {"SessionId": "1700000900000"}])
+@pytest.mark.usefixtures("data_folder")
 def test_files_of_two_implants_or_sessions_become_two_recordings_and_that_is_said(other: dict[str, str]) -> None:
     device = other.get("DeviceId", "NPC1")
     held, said = bundles(made("RawDataPower"), made("TimeSync"), made("DeviceSettings", **other), made("StimLog", **other))
@@ -49,6 +50,7 @@ def test_files_of_two_implants_or_sessions_become_two_recordings_and_that_is_sai
     assert "2 implants or sessions" in said[0]
 
 
+@pytest.mark.usefixtures("data_folder")
 def test_a_file_that_names_its_implant_alone_joins_the_only_recording_of_it() -> None:
     name, content = made("StimLog")
     alone = json.loads(content)
@@ -57,6 +59,7 @@ def test_a_file_that_names_its_implant_alone_joins_the_only_recording_of_it() ->
     assert sorted(map(len, held)) == [1, 2]
 
 
+@pytest.mark.usefixtures("data_folder")
 def test_an_empty_file_among_two_recordings_is_left_out_and_said() -> None:
     held, said = bundles(made("RawDataPower"), made("TimeSync", DeviceId="NPC2"), ("ErrorLog.json", b"[]"))
     assert sorted(map(len, held)) == [1, 1]
@@ -64,12 +67,14 @@ def test_an_empty_file_among_two_recordings_is_left_out_and_said() -> None:
 
 
 @pytest.mark.parametrize("name", ["RawDataPower (1).json", "power of the left side.json", "RawDataPower_copy.txt"])
+@pytest.mark.usefixtures("data_folder")
 def test_a_loose_file_is_known_by_its_content_whatever_its_name(name: str) -> None:
     held, said = bundles((name, made("RawDataPower")[1]), made("StimLog"))
     assert held == [{"RawDataPower.json NPC1", "StimLog.json NPC1"}]
     assert said == []
 
 
+@pytest.mark.usefixtures("data_folder")
 def test_the_same_bytes_under_two_names_are_one_file() -> None:
     held, said = bundles(made("RawDataPower"), ("RawDataPower (1).json", made("RawDataPower")[1]))
     assert held == [{"RawDataPower.json NPC1"}]

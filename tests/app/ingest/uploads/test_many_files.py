@@ -106,6 +106,7 @@ def test_litter_of_operating_systems_is_left_aside_and_said(send: Any) -> None:
     assert any("operating system" in s for r in answer.json()["report"] if r["name"] == ".DS_Store" for s in r["ignored"])
 
 
+@pytest.mark.usefixtures("data_folder")
 def test_bundles_are_equal_bytes_for_equal_files() -> None:
     parts = [("RawDataTD.json", b"[1]"), ("x/../StimLog.json", b"[2]"), ("note.txt", b"hi")]
 
