@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import psutil
@@ -136,18 +137,18 @@ def test_a_call_that_lasts_longer_than_the_idle_time_keeps_its_process(kinds, tm
 def test_no_call_is_lost_where_calls_come_just_when_the_process_ends(kinds, tmp_path):
     children = ForkedProcesses(learns=True, idle_s=0.05)
 
-    def calls(thread: int) -> set[int]:
+    def calls(turn: int, thread: int) -> set[int]:
         servers = set()
         for number in range(6):
-            servers.add(who(children, tmp_path / f"{thread}-{number}"))
+            servers.add(who(children, tmp_path / f"{turn}-{thread}-{number}"))  # a folder that is used twice gives its first answer
             time.sleep(0.02 * (number + thread))
         return servers
 
     servers: set[int] = set()
     try:
-        for _ in range(20):  # on a busy machine the calls of a round may leave no pause
+        for turn in range(20):  # on a busy machine the calls of a round may leave no pause
             with ThreadPoolExecutor(3) as pool:
-                servers = servers.union(*pool.map(calls, range(3)))
+                servers = servers.union(*pool.map(partial(calls, turn), range(3)))
             if len(servers) > 1:
                 break
             time.sleep(0.3)
