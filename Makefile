@@ -50,6 +50,7 @@ audit: install ## Ask a public list for known flaws of the pinned packages, and 
 format: install ## Format the code and fix what the linter can.
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+	$(BIN)/python -m tests.architecture.templates --write
 
 lock: ## Pin the installed packages in requirements.lock.
 	$(BIN)/python -m pip freeze --exclude-editable --exclude betaloop --all | grep -v -i '^pip==' | sed 's/^torch==\([0-9.]*\).*/torch==\1/' > requirements.lock

@@ -24,6 +24,11 @@ _LITERAL = re.compile(
 """Comments and patterns of a script, which nobody reads, or (the group) a literal."""
 
 
+def flat(page: str) -> str:
+    """Return a page on one line, without white space between tags: where its template breaks lines means nothing."""
+    return re.sub(r"> <", "><", re.sub(r"\s+", " ", page))
+
+
 class _Reader(HTMLParser):
     def __init__(self) -> None:
         super().__init__()

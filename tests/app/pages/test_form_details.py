@@ -85,10 +85,10 @@ def test_no_confirmation_can_be_read_backwards() -> None:
         if path.name == "macros.html":
             continue
         html = path.read_text()
-        for tag, label in re.findall(r"<button([^>]*data-confirm=[^>]*)>([^<]*)<", html):
+        for tag, label in re.findall(r"<button([^>]*data-confirm=[^>]*)>([^<]*)<", html, re.S):
             asked += 1
             assert "data-confirm-yes=" in tag or len(label.split()) > 1, f"{path.name}: {label}"
-        for call in re.findall(r"(?:post_button|call form)\([^{}]*?confirm=.*?\) ?(?:%\}|\}\})", html):
+        for call in re.findall(r"(?:post_button|call form)\([^{}]*?confirm=.*?\) ?(?:%\}|\}\})", html, re.S):
             asked += 1
             assert "yes=" in call, f"{path.name}: {call}"
             assert "no=" in call, f"{path.name}: {call}"

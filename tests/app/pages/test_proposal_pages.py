@@ -12,6 +12,7 @@ from fastapi.testclient import TestClient
 
 from tests.app.ingest.conftest import device_zip, steady
 from tests.app.pages.test_stale_forms import fields_of
+from tests.app.words import flat
 
 URL = "/participants/P1/proposals"
 
@@ -167,7 +168,7 @@ def test_what_cannot_be_is_said_at_the_proposal_and_stays_typed(
 
 def test_one_button_adds_the_visit_of_a_recording_and_keeps_what_was_typed(browser: TestClient, client: TestClient, propose: Any) -> None:
     (number,) = propose(("a.zip", device_zip(("random",), minute=26 * 60)))
-    assert "Create visit 2026-03-03 from the recording" in browser.get(URL).text
+    assert "Create visit 2026-03-03 from the recording" in flat(browser.get(URL).text)
     done = press(browser, f"visit:{number}", **{f"controller_{number}": "random"})
     assert done.headers["location"].endswith("?done=visit")
     page = browser.get(done.headers["location"]).text

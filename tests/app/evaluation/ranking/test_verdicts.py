@@ -18,7 +18,7 @@ from app.study.margins.models import MarginsVersion
 from ml.ope.flags import Flag
 from ml.ope.posterior.further_sessions import Place
 from tests.app.evaluations import judged
-from tests.app.words import above_fold, methods_named
+from tests.app.words import above_fold, flat, methods_named
 from tests.conftest import PASSWORD
 from tests.ml.ope.posterior.draws import N, cdbs, share
 
@@ -344,7 +344,7 @@ def test_the_fold_tells_statistical_error_from_what_structures_get_wrong(client:
     told = judged(50.0)
     told["details"]["standard_errors"] = {"statistical": 1.23, "model_error": 4.56}
     judge({policies[0]: told, policies[1]: judged(60.0)})
-    page = client.get(PAGE).text
+    page = flat(client.get(PAGE).text)
     (table,) = [part for part in page.split("<table")[1:] if "<caption>Standard errors of the posterior" in part]
     numbers = re.findall(r'<td class="num">([^<]*)</td>', table.split("</table>")[0])
     assert numbers == ["1.23", "4.56"], "the other estimate has none"
@@ -356,7 +356,7 @@ def test_the_fold_says_how_well_outcomes_of_a_day_to_come_are_predicted(client: 
     grasp = {"session_error": 0.21, "session_skill": 0.9, "visit_error": 0.43, "visit_skill": 0.62}
     told["details"]["left_out_outcomes"] = {"grasp_hz": grasp, "rating": dict.fromkeys(grasp)}
     judge({policies[0]: told})
-    page = client.get(PAGE).text
+    page = flat(client.get(PAGE).text)
     (table,) = [part for part in page.split("<table")[1:] if "<caption>Errors of predicted outcomes" in part]
     rows = re.findall(r'<tr><td>([^<]*)</td><td class="num">([^<]*)</td><td class="num">([^<]*)</td><td class="num">([^<]*)</td>', table)
     assert rows == [("Grasp (Hz)", "0.21", "0.43", "0.62"), ("Rating (points)", "—", "—", "—")]

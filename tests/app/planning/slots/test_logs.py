@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 
 from app.planning.plans.models import Plan
 from ml.deploy.runtime.decision_log import description_line, kind_line
+from tests.app.words import flat
 
 DAY = date(2026, 4, 6)
 BOUNDS = {"min_ma": 0.5, "max_ma": 3.0, "cdbs_ma": 3.0, "ramp_ma_per_s": 1.5}
@@ -176,7 +177,7 @@ def test_the_page_of_a_visit_shows_its_slots_and_takes_its_logs(
     before = client.get(path, headers=page).text
     assert f"0 of {len(planned.items)} planned sessions found; " in before, "the day is over, and all are missing"
     assert 'data-after-upload="/visits/' in before
-    form = before.split("data-upload ")[1].split("</form>")[0]
+    form = flat(before).split("data-upload ")[1].split("</form>")[0]
     assert 'name="visit" value="2"' in form
     answer = client.post("/participants/P1/upload", data={"visit": "2"}, files={"file": ("log.csv", log_of(planned, 1, 0))}, headers=page)
     assert answer.status_code == 200, "without scripts the form leads to the report of the upload"

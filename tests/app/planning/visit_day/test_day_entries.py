@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 from app.planning.visit_day.record import SlotOutcome, outcomes_of
 from app.planning.visit_day.repository import entries, slot_times
 from app.platform.web.templates import STATIC
+from tests.app.words import flat
 from tests.conftest import PASSWORD
 
 TAPS = {
@@ -236,7 +237,7 @@ def test_adverse_events_stand_among_the_adverse_events_at_once(clinic_day: Any) 
 def test_the_form_of_an_adverse_event_says_to_stop_the_controller_first(clinic_day: Any) -> None:
     clinic_day.outcomes(clinic_day.entry("start"))
     page = clinic_day.client.get(f"/visit-day/{clinic_day.visit}", headers={"Accept": "text/html"}).text
-    (form,) = [part for part in page.split("<form ") if 'name="kind_of_event"' in part]
+    (form,) = [part for part in flat(page).split("<form ") if 'name="kind_of_event"' in part]
     first = "First stop the controller on its tablet (Ctrl-C): it returns to clinical settings at once."
     then = "Nothing that is entered on this page, Stop included, reaches the controller."
     assert form.index(first) < form.index(then) < form.index("Adverse event</label>")

@@ -11,6 +11,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.study.recordings.history_charts import MOST_POINTS
+from tests.app.words import flat
 
 BEGIN = datetime(2026, 2, 1, tzinfo=UTC)
 NAMES = ("Ada Lovelace", "NPA123456N")
@@ -83,7 +84,7 @@ def test_the_history_of_a_device_has_a_route_and_a_page_with_pictures(client: Te
     assert [(g["name"], g["active"], g["programs"][0]["amplitude_ma"]) for g in told["groups"]] == [
         ("A", True, 1.8), ("B", False, 0.0), ("A", True, 2.4)
     ]  # fmt: skip
-    page = client.get(f"/participants/{uploaded}/device-history", headers={"Accept": "text/html"}).text
+    page = flat(client.get(f"/participants/{uploaded}/device-history", headers={"Accept": "text/html"}).text)
     for chart in ("trend-power", "trend-amplitude", "groups", "snapshot-left"):
         assert f'id="{chart}-{told["recording_id"]}"' in page
     assert "left: 290 averages" in page
@@ -93,7 +94,7 @@ def test_the_history_of_a_device_has_a_route_and_a_page_with_pictures(client: Te
 
 
 def test_missing_averages_are_a_gap_and_the_table_has_a_row_per_day(client: TestClient, uploaded: str) -> None:
-    page = client.get(f"/participants/{uploaded}/device-history", headers={"Accept": "text/html"}).text
+    page = flat(client.get(f"/participants/{uploaded}/device-history", headers={"Accept": "text/html"}).text)
     table = page.split('id="trend-power-')[1].split("</figure>")[0]
     assert [day in table for day in ("2026-02-01", "2026-02-02", "2026-02-03", "2026-02-04")] == [True, True, True, False]
     assert "null" in table, "ten missing averages break the line"
