@@ -26,7 +26,6 @@ from app.platform.audit.commands import app as audit_app
 from app.platform.bucket import bucket
 from app.platform.database import database_place, supervise_database, transaction
 from app.platform.start import in_one_line, require_data_folder, require_free
-from app.platform.tables import load_tables
 from app.platform.terminal import ACTOR, AsJson, Code, say, show
 from app.platform.upkeep.commands import app as upkeep_app
 from app.settings import Settings, get_settings
@@ -76,7 +75,6 @@ def decide_cookies(settings: Settings, host: str, *, tls: bool) -> None:
 def main() -> None:
     """Entry point: runs a command and turns errors into one line and an exit code."""
     _end_in_order_on_signals()
-    load_tables()
     try:
         logs.configure_own()
         app(standalone_mode=True)

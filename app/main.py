@@ -25,7 +25,6 @@ from app.platform import logs
 from app.platform.database import Db, check_connection
 from app.platform.errors import DatabaseAway
 from app.platform.files import prune_copies_beside, remove_abandoned
-from app.platform.tables import load_tables
 from app.platform.upkeep.doctor import newest_revision, revision
 from app.platform.web import middleware as web
 from app.platform.web.compression import CompressedFiles
@@ -149,7 +148,6 @@ def create_app() -> FastAPI:
 
 
 def _built() -> FastAPI:
-    load_tables()
     logs.configure_own()
     app = FastAPI(
         title="betaloop", version=__version__, openapi_url=None, docs_url=None, redoc_url=None, lifespan=_lifespan

@@ -26,7 +26,6 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM
 from app.main import create_app, leave_to_itself
 from app.platform import kept
@@ -34,8 +33,12 @@ from app.platform.database import new_session, set_actor, transaction
 from app.platform.migrate import migrate
 from app.settings import get_settings
 from app.study import blinding, repository
-from app.study.models import Controller, Device, QocRevision, Recording, SessionSegment, StudySession, Trace, Visit
 from app.study.traces import pack
+from app.tables.accounts import Role
+from app.tables.outcomes import QocRevision
+from app.tables.recordings import Device, Recording, Trace
+from app.tables.sessions import Controller, SessionSegment, StudySession
+from app.tables.visits import Visit
 
 out = sys.stdout.write
 VISITS, PER_VISIT, STEPS = 20, 10, 300

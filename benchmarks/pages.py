@@ -42,12 +42,13 @@ from app.learning.repository import candidates
 from app.main import create_app
 from app.pipeline.service import start_job
 from app.platform.database import get_engine, transaction
-from app.platform.jobs.models import Job
 from app.platform.jobs.service import cancel
 from app.platform.migrate import migrate
 from app.settings import get_settings
-from app.study.models import StudySession, Visit
 from app.study.repository import participant_by_code
+from app.tables.jobs import Job
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 
 ROOT = Path(__file__).resolve().parents[1]
 KEPT = ROOT / "var" / "benchmarks" / "pages"

@@ -33,7 +33,7 @@ from app.analysis.evidence.facts import Facts
 from app.analysis.primary.verdict import LockedMargins, verdicts
 from app.planning.protocol.schedule import MOST_REPEATS, SESSION_MINUTES, Candidate, Rules, most_policies, schedule
 from app.study.blinding import Arm
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.policies.policy import ConstantPolicy
 from ml.population import PARTICIPANTS, run_sessions
 from ml.qoc import Margins, failed_qoc

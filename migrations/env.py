@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from alembic import context
 
-from app.platform.database import Base, get_engine
-from app.platform.tables import load_tables
-
-load_tables()
+from app.platform.database import get_engine
+from app.tables import METADATA
 
 
 def _include(_object, name, type_, _reflected, _compare_to):  # type: ignore[no-untyped-def]
@@ -26,7 +24,7 @@ def run() -> None:
 
 def _migrate(connection) -> None:  # type: ignore[no-untyped-def]
     connection.exec_driver_sql("set local lock_timeout = '10s'")
-    context.configure(connection=connection, target_metadata=Base.metadata, include_object=_include, compare_server_default=False)
+    context.configure(connection=connection, target_metadata=METADATA, include_object=_include, compare_server_default=False)
     context.run_migrations()
 
 

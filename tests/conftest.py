@@ -25,7 +25,6 @@ from sqlalchemy.orm import Session
 
 import app.platform.database as database
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.accounts.pages import failed_sign_ins
 from app.accounts.passwords import FewAtOnce
 from app.platform import service_role
@@ -33,6 +32,7 @@ from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.jobs import engine as jobs_engine
 from app.platform.web.body_limit import sent
 from app.settings import get_settings
+from app.tables.accounts import Role
 
 # Machines that are busy with other work make single examples slow; in CI the same examples are drawn every time.
 settings.register_profile("betaloop", deadline=None, derandomize=bool(os.environ.get("CI")))

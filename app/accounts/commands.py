@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 
 from app.accounts import service as accounts
-from app.accounts.models import Role, Scope
 from app.platform.database import transaction
 from app.platform.terminal import ACTOR, AsJson, bad_call, reason, show
+from app.tables.accounts import Role, Scope
 
 user_app = typer.Typer(no_args_is_help=True, help="Users.")
 token_app = typer.Typer(no_args_is_help=True, help="API tokens.")

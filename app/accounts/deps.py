@@ -12,13 +12,13 @@ from starlette.concurrency import run_in_threadpool
 
 from app.accounts import service
 from app.accounts.blinded import is_open
-from app.accounts.models import Scope
 from app.accounts.permissions import Caller
 from app.platform.database import Db, new_session, set_actor
 from app.platform.errors import EntriesOfAnother, Forbidden, Unauthorized
 from app.platform.sources import from_this_machine
 from app.platform.web.forms import written_by
 from app.settings import get_settings
+from app.tables.accounts import Scope
 
 COOKIE = "betaloop_session"
 METRICS = "/metrics"

@@ -16,7 +16,6 @@ from app.accounts import repository, second_factor, service, totp
 from app.accounts.addresses import normal_address
 from app.accounts.browser import SIGNED_OUT, count_try, failed_sign_ins, local_path, signed_in
 from app.accounts.deps import COOKIE, CurrentCaller
-from app.accounts.models import Role, Scope, User
 from app.accounts.passwords import AT_ONCE, MIN_PASSWORD
 from app.accounts.permissions import Caller
 from app.platform.database import Db, new_session, now, set_actor
@@ -26,6 +25,7 @@ from app.platform.web.forms import FormValues, field_notes
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.settings import get_settings
+from app.tables.accounts import Role, Scope, User
 
 router = APIRouter()
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
-from app.accounts.models import Role, Scope
 from app.platform.database import now
 from app.platform.errors import Forbidden, NotFound
+from app.tables.accounts import Role, Scope
 
 STUDY_ENDED_HINT = "An administrator of the study can open it again."
 CONFIRMED_FOR = timedelta(minutes=5)

@@ -9,8 +9,8 @@ from sqlalchemy import delete, func, select, text, update
 from sqlalchemy.orm import Session, selectinload
 
 from app.accounts.addresses import normal_address
-from app.accounts.models import ApiToken, SignIn, SignInAttempt, SignOnLink, Study, User
 from app.platform.database import now
+from app.tables.accounts import ApiToken, SignIn, SignInAttempt, SignOnLink, Study, User
 
 
 def user_by_email(db: Session, email: str) -> User | None:

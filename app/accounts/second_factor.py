@@ -15,10 +15,10 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from sqlalchemy.orm import Session
 
 from app.accounts import totp
-from app.accounts.models import SecondFactor, User
 from app.platform.database import now
 from app.platform.errors import Conflict, Invalid
 from app.settings import get_settings
+from app.tables.accounts import SecondFactor, User
 
 RECOVERY_CODES = 10
 _NONCE_BYTES = 12

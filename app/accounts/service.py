@@ -14,7 +14,6 @@ from sqlalchemy.orm import Session
 
 from app.accounts import repository, second_factor
 from app.accounts.addresses import LONGEST_ADDRESS, normal_address
-from app.accounts.models import ApiToken, Membership, Role, Scope, SignIn, SignInAttempt, Study, User
 from app.accounts.passwords import MIN_PASSWORD, FewAtOnce, place, weakness
 from app.accounts.permissions import MANAGE_ACCOUNTS, READ_AUDIT, Caller, Grant
 from app.platform.audit import record, record_once
@@ -22,6 +21,7 @@ from app.platform.database import new_session, now, set_actor
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized, about
 from app.platform.sources import in_words
 from app.settings import get_settings
+from app.tables.accounts import ApiToken, Membership, Role, Scope, SignIn, SignInAttempt, Study, User
 
 FAILURES_ALLOWED = 5
 FAILURE_WINDOW = timedelta(minutes=15)

@@ -15,8 +15,8 @@ from app.accounts.permissions import Caller
 from app.accounts.service import confirm_password
 from app.accounts.sign_on.service import use_confirmation
 from app.platform.errors import Forbidden, about
-from app.platform.signatures.models import Signature
 from app.platform.signatures.service import Signer, record
+from app.tables.audit import Signature
 
 
 def sign(

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 from sqlalchemy import ColumnElement, and_, func, or_, select, text
 from sqlalchemy.orm import Session, defer
 
-from app.evaluation.models import EstimateRow, Evaluation
-from app.learning.models import Policy
-from app.platform.audit import AuditEvent
-from app.study.models import Participant
+from app.tables.audit import AuditEvent
+from app.tables.evaluations import EstimateRow, Evaluation
+from app.tables.learning import Policy
+from app.tables.participants import Participant
 
 Rows = list[dict[str, Any]]
 

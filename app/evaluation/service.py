@@ -12,16 +12,16 @@ from app.evaluation.estimates import coverage as checks
 from app.evaluation.estimates import dose_shapes, held_out
 from app.evaluation.estimates.held_out import combined, widened
 from app.evaluation.estimates.rows import row_of
-from app.evaluation.models import Evaluation
 from app.evaluation.ranking.service import current_ranking as current_ranking
 from app.evaluation.schemas import EvaluateParams
 from app.learning import repository as learning
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies.service import onnx_of, require_window, window_of
 from app.platform.errors import Invalid
 from app.platform.jobs import service as jobs
 from app.study import repository as study_repository
-from app.study.models import Participant
+from app.tables.evaluations import Evaluation
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.participants import Participant
 from ml.ope.compare.ranking import default_method
 from ml.ope.estimate import Estimate
 from ml.ope.registry import AGGREGATE, POSTERIOR, shown

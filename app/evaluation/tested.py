@@ -12,9 +12,9 @@ from app.accounts.permissions import Caller
 from app.evaluation import repository
 from app.evaluation.ranking.actual import actual
 from app.evaluation.ranking.results import DrivenSession, driven_sessions
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies.service import onnx_of, window_of
 from app.platform.errors import Invalid
+from app.tables.learning import BufferSnapshot, Policy
 from ml.mdp import MdpSettings
 from ml.ope.posterior.gaussian import QUANTITIES
 from ml.ope.posterior.tested import TestSession, differences_to_cdbs, spread_of_random

@@ -6,8 +6,9 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from app.study.models import Hemisphere, Recording, SettingsVersion, Trace
 from app.study.sessions.usable_steps import CONTROL_STREAMS, Worth, worth_of
+from app.tables.participants import Hemisphere, SettingsVersion
+from app.tables.recordings import Recording, Trace
 
 STIMULATED = ("STN", "GPi")
 """Targets whose beta follows the stimulation of Parkinson's disease; other deep targets come after them."""

@@ -36,7 +36,7 @@ def import_(
     """Import a file, as an upload does: with visit and controller its sessions count at once, else they wait for confirmation."""
     from app.ingest.uploads import api, service
     from app.study import repository as study
-    from app.study.models import Controller
+    from app.tables.sessions import Controller
 
     if controller is not None and controller not in set(Controller):
         raise typer.BadParameter(f"'{controller}' is none of {', '.join(Controller)}.", param_hint="--controller")

@@ -18,9 +18,10 @@ from sqlalchemy.orm import Session
 from app.ingest import repository
 from app.ingest.proposals import service as proposals
 from app.study import repository as study
-from app.study.models import Recording, SessionSegment, StudySession, Trace
 from app.study.sessions import conditions
 from app.study.traces import unpack
+from app.tables.recordings import Recording, Trace
+from app.tables.sessions import SessionSegment, StudySession
 from ml.formats.beta import ERROR_STREAM
 from ml.formats.recording import TraceLog
 

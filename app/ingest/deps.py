@@ -11,7 +11,7 @@ from app.ingest import repository
 from app.platform.database import Db
 from app.platform.web.schemas import RowId
 from app.study import repository as study
-from app.study.models import StudySession
+from app.tables.sessions import StudySession
 
 
 def current_proposal(session_id: RowId, db: Db, caller: CurrentCaller) -> StudySession:

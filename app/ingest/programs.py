@@ -8,9 +8,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from app.study.models import Trace
 from app.study.sessions.stimulation import SILENT_MA
 from app.study.traces import AMPLITUDE_STREAM, amplitude_program, unpack
+from app.tables.recordings import Trace
 
 
 class How(StrEnum):

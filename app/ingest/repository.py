@@ -9,11 +9,14 @@ from sqlalchemy import func, or_, select, true
 from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.permissions import Caller
-from app.ingest.models import SessionProposal, Upload, UploadFile
 from app.platform.errors import NotFound
-from app.study.models import Device, Participant, Recording, SessionSegment, StudySession, Visit
 from app.study.repository import in_scope
 from app.study.sessions.repository import SLACK_S
+from app.tables.participants import Participant
+from app.tables.recordings import Device, Recording
+from app.tables.sessions import SessionSegment, StudySession
+from app.tables.uploads import SessionProposal, Upload, UploadFile
+from app.tables.visits import Visit
 
 GRASP_KIND = "grasp"
 """Kind of a file with hand-grasp tests, which names no clock."""

@@ -8,8 +8,9 @@ from typing import Literal
 from pydantic import Field
 
 from app.platform.web.schemas import Int, Model, Moment, Number, Text
-from app.study.models import Controller, Hemisphere
 from app.study.schemas import SessionOut
+from app.tables.participants import Hemisphere
+from app.tables.sessions import Controller
 
 
 class UploadForm(Model):

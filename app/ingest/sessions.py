@@ -15,12 +15,15 @@ from app.ingest import channels, repository
 from app.platform.errors import Conflict, Invalid
 from app.study import blinding, cdbs_amplitude
 from app.study import repository as study
-from app.study.models import Controller, Hemisphere, Participant, Recording, SessionSegment, StudySession, Trace, Visit
 from app.study.sessions import repeated
 from app.study.sessions import repository as session_repository
 from app.study.sessions.usable_steps import CONTROL_STREAMS
 from app.study.traces import AMPLITUDE_STREAM, pack, unpack
 from app.study.visits.service import require_unlocked
+from app.tables.participants import Hemisphere, Participant
+from app.tables.recordings import Recording, Trace
+from app.tables.sessions import Controller, SessionSegment, StudySession
+from app.tables.visits import Visit
 
 TOGETHER = 0.5
 """Two recordings belong to one session when they share at least this part of the shorter one's time."""

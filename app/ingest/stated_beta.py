@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import cast
 
-from app.study.models import SettingsVersion
+from app.tables.participants import SettingsVersion
 from ml.formats.recording import DecodedFile, TraceLog, TraceSource
 from ml.formats.tables.numbers import unit_name
 

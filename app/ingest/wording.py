@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from app.ingest.models import ColumnMapping
 from app.ingest.proposals.evidence import Evidence, Reason, Source, stored_courses
 from app.platform.errors import BetaloopError, DatabaseAway, GivenUp, StorageFull
 from app.platform.web.numbers import stated
-from app.study.models import Recording
 from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern
+from app.tables.recordings import Recording
+from app.tables.uploads import ColumnMapping
 
 _TELLING = ("controller", "program")
 HIDDEN = "controller hidden"

@@ -9,12 +9,12 @@ from fastapi import Depends
 
 from app.accounts.deps import CurrentCaller
 from app.learning import repository
-from app.learning.models import BufferSnapshot, Policy, Sweep
 from app.platform.audit import record_view
 from app.platform.database import Db
 from app.platform.web.schemas import RowId
 from app.study import service as study
 from app.study.deps import CurrentParticipant
+from app.tables.learning import BufferSnapshot, Policy, Sweep
 
 
 def current_policy(policy_id: RowId, db: Db, caller: CurrentCaller) -> Policy:

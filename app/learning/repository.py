@@ -9,12 +9,12 @@ from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.orm import Session, defer, selectinload
 
-from app.accounts.models import Site
 from app.accounts.permissions import Caller
-from app.learning.models import BufferGateDecision, BufferSnapshot, Policy, SnapshotSession, Sweep
 from app.platform.errors import NotFound
-from app.study.models import Participant
 from app.study.repository import count, in_scope
+from app.tables.accounts import Site
+from app.tables.learning import BufferGateDecision, BufferSnapshot, Policy, SnapshotSession, Sweep
+from app.tables.participants import Participant
 
 
 def snapshot(db: Session, snapshot_id: int, caller: Caller) -> BufferSnapshot:

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from app.learning.models import GateChoice
 from app.platform.web.schemas import Int, Model, Number, Text
+from app.tables.learning import GateChoice
 from ml.rl import ALGORITHMS
 
 Preset = Literal["full", "quick"]

@@ -8,7 +8,6 @@ from sqlalchemy.orm import Session
 
 from app.learning import wording
 from app.learning.gate import service as gates
-from app.learning.models import BufferSnapshot, Policy, Sweep
 from app.learning.schemas import (
     BaselineScoreOut,
     GateDecisionOut,
@@ -22,7 +21,8 @@ from app.learning.schemas import (
 )
 from app.learning.sweeps import comparison
 from app.study import repository as study_repository
-from app.study.models import Participant
+from app.tables.learning import BufferSnapshot, Policy, Sweep
+from app.tables.participants import Participant
 
 
 def policy_out(db: Session, p: Policy, participant: Participant) -> PolicyOut:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from app.learning.gate.service import ALPHA, Gate, QocTest
-from app.learning.models import GateChoice
 from app.learning.sweeps.parallel import Standing
 from app.study.sessions.programming import Difference
+from app.tables.learning import GateChoice
 
 STANDINGS = {
     Standing.RETIRED: "retired",

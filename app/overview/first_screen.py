@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from app.overview.state import State
-from app.study.models import Participant
+from app.tables.participants import Participant
 
 
 @dataclass(frozen=True)

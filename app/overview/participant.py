@@ -30,10 +30,11 @@ from app.platform.web.templates import render
 from app.study import repository as study
 from app.study.characteristics.service import fields_of
 from app.study.deps import CurrentParticipant, ResultsViewed
-from app.study.models import Participant, SettingsVersion, Visit
 from app.study.service import may
 from app.study.visits.service import days_of
 from app.study.wording import characteristics_words
+from app.tables.participants import Participant, SettingsVersion
+from app.tables.visits import Visit
 
 router = APIRouter()
 

@@ -10,13 +10,16 @@ from sqlalchemy import Row, false, func, select
 from sqlalchemy.orm import Session, joinedload
 
 from app.accounts.permissions import Caller
-from app.evaluation.models import EstimateRow, Evaluation
 from app.evaluation.schemas import RANKING_KINDS
-from app.learning.models import BufferSnapshot, Policy
-from app.planning.plans.models import Plan
-from app.platform.jobs.models import Job, JobStatus
-from app.study.models import Participant, QocRevision, StudySession, Visit
 from app.study.repository import in_scope
+from app.tables.evaluations import EstimateRow, Evaluation
+from app.tables.jobs import Job, JobStatus
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.outcomes import QocRevision
+from app.tables.participants import Participant
+from app.tables.plans import Plan
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 
 
 def visit_days(db: Session, ids: Sequence[int], today: dt.date) -> Iterable[Row[int, int, dt.date | None, dt.date | None]]:

@@ -16,8 +16,9 @@ from app.analysis.pooled.service import readable
 from app.platform.database import Db
 from app.platform.web.templates import render
 from app.study.deps import ResultsViewed
-from app.study.models import Controller, Participant
 from app.study.service import withdrawn_codes
+from app.tables.participants import Participant
+from app.tables.sessions import Controller
 
 router = APIRouter()
 

@@ -11,8 +11,8 @@ from sqlalchemy.orm import Session
 from app.overview import repository
 from app.overview.tasks import Actor, NextStep, Task
 from app.overview.visit_progress import VisitProgress, visit_progress
-from app.platform.jobs.models import Job
-from app.study.models import Participant
+from app.tables.jobs import Job
+from app.tables.participants import Participant
 
 PHASES = (("I", "Collect"), ("II", "Learn"), ("III", "Evaluate"), ("IV", "Plan"))
 

@@ -13,7 +13,8 @@ from app.analysis.evidence.service import Evidence
 from app.platform.web.charts import ACCENT, GRID, MUTED, SYMBOLS, TEXT, WARN, Cell, Chart, Link, colour, counted, figure, marker
 from app.platform.web.numbers import hover
 from app.study.blinding import CONTROLLER_NAMES
-from app.study.models import SettingsVersion, Visit
+from app.tables.participants import SettingsVersion
+from app.tables.visits import Visit
 from ml.outcomes import OUTCOMES
 
 _GAP = 0.022

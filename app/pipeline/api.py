@@ -17,9 +17,9 @@ from app.pipeline.serializers import job_out
 from app.platform.database import Db
 from app.platform.jobs import repository as jobs
 from app.platform.jobs import stream
-from app.platform.jobs.models import JobStatus
 from app.platform.web.schemas import Page, PagingQuery, problems
 from app.study.deps import CurrentParticipant
+from app.tables.jobs import JobStatus
 
 router = APIRouter(tags=["jobs"], responses=problems(401, 403, 404, 422))
 

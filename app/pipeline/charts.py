@@ -6,8 +6,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-from app.platform.jobs.models import Job, JobEvent
 from app.platform.web.charts import MUTED, Chart, axis, counted, figure
+from app.tables.jobs import Job, JobEvent
 
 PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")
 

@@ -11,8 +11,8 @@ from app.accounts.deps import CurrentCaller
 from app.platform.database import Db
 from app.platform.errors import NotFound
 from app.platform.jobs import repository as jobs
-from app.platform.jobs.models import Job
-from app.study.models import Participant
+from app.tables.jobs import Job
+from app.tables.participants import Participant
 
 
 class ParticipantJob:

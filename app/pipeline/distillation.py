@@ -8,13 +8,13 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.learning import repository
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies import service
 from app.learning.schemas import DistilParams
 from app.learning.training.configs import distillation_config
 from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, plan_on_snapshot, policy_facts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
+from app.tables.learning import BufferSnapshot, Policy
 
 DISTIL_WEIGHT = 2.0
 

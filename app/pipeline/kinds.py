@@ -14,7 +14,7 @@ from app.pipeline.params import NEXT_GENERATION, NextGenerationParams, PipelineP
 from app.pipeline.training import training_starts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobKind, register
-from app.study.models import Participant
+from app.tables.participants import Participant
 
 _TRAINING = {"train": "app.learning.training.compute:train", "baselines": "app.learning.training.compute:baselines"}
 _DISTILLATION = {"distil": "app.learning.training.compute:distil"}

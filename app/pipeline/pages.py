@@ -22,15 +22,15 @@ from app.platform.errors import BetaloopError, Invalid
 from app.platform.jobs import registry
 from app.platform.jobs import repository as jobs
 from app.platform.jobs import service as job_service
-from app.platform.jobs.models import JobStatus
 from app.platform.jobs.titles import failure, numbered
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
 from app.study import repository as study
 from app.study.deps import CurrentParticipant
-from app.study.models import Participant
 from app.study.service import may, withdrawn_codes
+from app.tables.jobs import JobStatus
+from app.tables.participants import Participant
 from ml.ope import registry as estimators
 
 router = APIRouter()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from app.pipeline.schemas import JobOut, JobStepOut
 from app.platform.database import now
-from app.platform.jobs.models import Job
-from app.study.models import Participant
+from app.tables.jobs import Job
+from app.tables.participants import Participant
 
 
 def job_out(job: Job, participant: Participant) -> JobOut:

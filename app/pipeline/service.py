@@ -15,9 +15,9 @@ from app.learning.snapshots.service import collect
 from app.pipeline.stages import PLAN, snapshot_facts
 from app.platform.jobs import registry
 from app.platform.jobs import service as jobs
-from app.platform.jobs.models import Job
 from app.study import service as study
-from app.study.models import Participant
+from app.tables.jobs import Job
+from app.tables.participants import Participant
 
 
 class Started(NamedTuple):

@@ -9,12 +9,12 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.snapshots import service as snapshots
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
 from app.study.margins.service import margins_of
-from app.study.models import Participant
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.participants import Participant
 
 STORE_WEIGHT = 0.1
 """Share of a job's progress of a step that stores or reads."""

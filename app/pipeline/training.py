@@ -10,7 +10,6 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.evaluation.tested import tested
 from app.learning import repository
-from app.learning.models import BufferSnapshot
 from app.learning.policies import service
 from app.learning.schemas import ALGORITHM_NAMES, TrainParams
 from app.learning.snapshots.buffers import read_buffer
@@ -20,7 +19,8 @@ from app.learning.training.configs import HELD_BY, training_groups
 from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, acting, plan_on_snapshot, policy_facts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
-from app.study.models import Participant
+from app.tables.learning import BufferSnapshot
+from app.tables.participants import Participant
 
 TRAIN_WEIGHT, BASELINES_WEIGHT = 10.0, 3.0
 BASELINES = "baselines"

@@ -16,7 +16,6 @@ from app.evaluation.ranking.judged import Judged
 from app.evaluation.ranking.service import current
 from app.evaluation.verdict_wording import plainly
 from app.learning import repository as learning
-from app.learning.models import Policy
 from app.planning import wording
 from app.planning.grounds import HAPPENED, events_against
 from app.planning.plans.designs import offered
@@ -27,7 +26,9 @@ from app.planning.plans.view import PlanView
 from app.planning.protocol.schedule import most_policies, total_minutes
 from app.platform.errors import Invalid, NotFound
 from app.platform.web.forms import parse
-from app.study.models import Participant, Visit
+from app.tables.learning import Policy
+from app.tables.participants import Participant
+from app.tables.visits import Visit
 from ml.designs import EARLY_RANDOM_SESSIONS, LOW_AMPLITUDE
 from ml.ope.posterior.further_sessions import MOST_HELD, Place
 

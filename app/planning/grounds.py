@@ -9,16 +9,16 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation import repository as evaluations
-from app.evaluation.models import Evaluation
 from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.decisions import Decided
 from app.evaluation.ranking.judged import judged
 from app.evaluation.schemas import Decision
-from app.planning.plans.models import Plan
-from app.study.adverse_events.models import AdverseEvent
 from app.study.adverse_events.repository import events_of_participant
 from app.study.adverse_events.service import blocking_events
-from app.study.models import Participant
+from app.tables.adverse_events import AdverseEvent
+from app.tables.evaluations import Evaluation
+from app.tables.participants import Participant
+from app.tables.plans import Plan
 from ml.ope.flags import Flag
 
 Events = Mapping[int, tuple[AdverseEvent, ...]]

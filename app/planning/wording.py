@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from app.evaluation.verdict_wording import plainly
 from app.evaluation.wording import amplitude, chance, joined
 from app.planning.notices import OF_METHODS, Code, PlanWarning
-from app.planning.plans.designs import Bound, Planned, delivered_ma
-from app.planning.plans.models import NEAR, Plan, PlanItem, is_held
+from app.planning.plans.designs import NEAR, Bound, Planned, delivered_ma, is_held
 from app.planning.plans.suggested import Held
 from app.planning.protocol.session_order import Order
 from app.planning.slots.matching import Deviation
@@ -18,7 +17,8 @@ from app.planning.visit_day.screening import Found
 from app.platform.web.charts import counted
 from app.platform.web.numbers import stated
 from app.study.blinding import CONTROLLER_NAMES
-from app.study.models import Controller
+from app.tables.plans import Plan, PlanItem
+from app.tables.sessions import Controller
 from ml.deploy.manifest import BundleManifest
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS, NEAR_SPREAD
 from ml.ope.posterior.portfolio import Suggestion

@@ -15,19 +15,17 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO
 
 import structlog
-from sqlalchemy import BigInteger, CheckConstraint, String, func
 from sqlalchemy.dialects.postgresql import insert
-from sqlalchemy.orm import Mapped, Session, mapped_column
+from sqlalchemy.orm import Session
 
 from app.platform.bucket import Bucket, StoreAway, bucket
-from app.platform.database import Base
 from app.platform.errors import BetaloopError
 from app.settings import get_settings, private_folder
+from app.tables.uploads import StoredFile
 
 log = structlog.get_logger()
 
@@ -35,17 +33,6 @@ CHUNK = 1 << 20
 _LOCK = ".lock"
 _OPEN_FILES = Path("/proc")
 _LATELY_S = 3600.0
-
-
-class StoredFile(Base):
-    """Bytes that the content-addressed folder holds."""
-
-    __tablename__ = "stored_file"
-    __table_args__ = (CheckConstraint("sha256 ~ '^[0-9a-f]{64}$'", name="sha256"), CheckConstraint("size >= 0", name="size"))
-
-    sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
-    size: Mapped[int] = mapped_column(BigInteger)
-    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
 
 
 class MissingFile(BetaloopError):

@@ -43,10 +43,8 @@ def demo_files(
     seed: Annotated[int | None, typer.Option(min=0, help="Of what is learned; the demo's own when left out.")] = None,
 ) -> None:
     """Learn the policies of the demo's participants on their earlier visits, and hold the sessions that tested them; takes minutes."""
-    from app.platform.tables import load_tables
     from app.simulation.demo.making import make
 
-    load_tables()
     out = Console(stderr=True)
     for path in make(folder, tuple(participants.split(",")), lambda line: out.print(line, highlight=False), seed):
         out.print(f"{path}: {path.stat().st_size / 1000:.0f} kB", highlight=False)

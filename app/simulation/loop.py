@@ -28,7 +28,6 @@ from app.planning.slots import service as slots
 from app.platform.database import new_session, set_actor
 from app.platform.errors import BetaloopError, Conflict, NotFound
 from app.platform.jobs import repository as jobs
-from app.platform.jobs.models import Job, JobStatus
 from app.platform.jobs.watch import POLL_S, look
 from app.simulation.demo.study import participant_body
 from app.simulation.design import BETWEEN_VISITS, MORNING, Design, Remembered
@@ -38,8 +37,11 @@ from app.study import service as study
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.enrolment import service as enrolment
 from app.study.enrolment.schemas import ParticipantIn
-from app.study.models import Controller, Participant, Visit
 from app.study.schemas import VisitIn
+from app.tables.jobs import Job, JobStatus
+from app.tables.participants import Participant
+from app.tables.sessions import Controller
+from app.tables.visits import Visit
 
 LEARNED_KINDS = ("trained", "distilled")
 _WASHOUT_MINUTES = 5.0

@@ -13,7 +13,6 @@ from sqlalchemy import text
 
 from app.accounts import repository as accounts_repository
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM, Caller
 from app.platform.database import get_engine, new_session, now, transaction
 from app.platform.errors import BetaloopError, Conflict
@@ -22,6 +21,7 @@ from app.settings import get_settings
 from app.simulation.design import STATE_FILE, Design, remember
 from app.simulation.loop import ParticipantLoop, Signer, refuse_foreign
 from app.study import repository as study
+from app.tables.accounts import Role
 
 ACCOUNT = "simulated-clinician@simulation.example"
 """Enrols, uploads and drafts; nobody can sign in with it, for its password is thrown away."""

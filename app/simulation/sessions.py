@@ -16,16 +16,18 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.ingest.uploads import service as ingest
-from app.planning.plans.models import PlanItem
 from app.planning.visit_day import service as clinic_day
 from app.planning.visit_day.schemas import EntryIn
 from app.platform.errors import BetaloopError
 from app.simulation.demo.study import device_session, session_file
 from app.simulation.tablet import Moment, run_slot_of
 from app.study import service as study
-from app.study.models import Controller, Participant, StudySession, Visit
 from app.study.schemas import QocIn
 from app.study.threshold import mdp_settings
+from app.tables.participants import Participant
+from app.tables.plans import PlanItem
+from app.tables.sessions import Controller, StudySession
+from app.tables.visits import Visit
 from ml.outcomes import BY_FIELD
 from ml.population import SimulatedSession, run_session
 from ml.population.outcomes import GRASP_TEST_S, Outcomes

@@ -18,7 +18,7 @@ from app.accounts.permissions import Caller
 from app.planning.bundles import service as bundles
 from app.planning.bundles import slots
 from app.platform.errors import BetaloopError
-from app.study.models import Visit
+from app.tables.visits import Visit
 from app.tablet.command import verified
 from app.tablet.simulated import SimulatedDevice
 from ml.deploy.manifest import BundleManifest

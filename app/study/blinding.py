@@ -16,7 +16,9 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.errors import Conflict, Forbidden
 from app.study import repository
-from app.study.models import Controller, Participant, StudySession, Visit
+from app.tables.participants import Participant
+from app.tables.sessions import Controller, StudySession
+from app.tables.visits import Visit
 
 CONTROLLER_NAMES: dict[Controller, str] = {
     Controller.CDBS: "cDBS",

@@ -7,8 +7,10 @@ from datetime import date
 from typing import overload
 
 from app.platform.errors import Invalid
-from app.study.models import Hemisphere, Participant, SettingsVersion, StudySession, Visit
 from app.study.settings.schemas import CDBS_MA
+from app.tables.participants import Hemisphere, Participant, SettingsVersion
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 
 
 def stated_at(visit: Visit, hemisphere: Hemisphere | None, program: int | None = 0) -> float | None:

@@ -18,7 +18,9 @@ from app.platform.audit import record, record_view
 from app.platform.database import Db
 from app.platform.web.schemas import RowId
 from app.study import blinding, repository
-from app.study.models import Participant, StudySession, Visit
+from app.tables.participants import Participant
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 
 
 def current_participant(code: Annotated[str, Path(max_length=40, pattern=r"^[^\x00]*$")], db: Db, caller: CurrentCaller) -> Participant:

@@ -6,10 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, create_model
-from sqlalchemy import CheckConstraint, Double, SmallInteger
-from sqlalchemy.orm import mapped_column
 
-from app.platform.database import Base
 from app.platform.web.schemas import Int, Model, Number
 from ml.outcomes import OUTCOMES, Outcome
 
@@ -19,39 +16,6 @@ if TYPE_CHECKING:
 else:
     OutcomeField = Literal[tuple(o.field for o in OUTCOMES)]
     DerivedField = Literal[tuple(o.field for o in OUTCOMES if o.derived)]
-
-
-def value_checks() -> tuple[CheckConstraint, ...]:
-    """Return the range of each outcome as a constraint of its column."""
-    return tuple(CheckConstraint(_range(o), name=o.key) for o in OUTCOMES)
-
-
-def margin_check() -> CheckConstraint:
-    """Return the constraint that every margin is above 0, and a share below 1."""
-    shares = {o.margin.field for o in OUTCOMES if o.margin.kind == "share"}
-    bounds = (f"{o.margin.field} > 0" + (f" and {o.margin.field} < 1" if o.margin.field in shares else "") for o in OUTCOMES)
-    return CheckConstraint(" and ".join(bounds), name="margins")
-
-
-class HasOutcomes:
-    """A row with a column per outcome."""
-
-    def value(self, outcome: Outcome) -> float | None:
-        """Return the value of an outcome; None where not measured."""
-        found: float | None = getattr(self, outcome.field)
-        return found
-
-
-def add_value_columns(table: type[Base]) -> None:
-    """Add a column per outcome to a table, null where not measured."""
-    for o in OUTCOMES:
-        setattr(table, o.field, mapped_column(SmallInteger if o.whole else Double, nullable=True))
-
-
-def add_margin_columns(table: type[Base]) -> None:
-    """Add a column per margin to a table."""
-    for o in OUTCOMES:
-        setattr(table, o.margin.field, mapped_column(Double, nullable=False))
 
 
 def fields_model(name: str, field_of: Callable[[Outcome], Mapping[str, Any]], base: type[Model] = Model) -> type[Model]:
@@ -96,9 +60,3 @@ else:
     StatedMargins = fields_model("StatedMargins", _stated_margin)
     _Version = create_model("_Version", __base__=Model, version=(int, ...))
     VersionOfMargins = fields_model("VersionOfMargins", lambda o: {o.margin.field: (float, ...)}, _Version)
-
-
-def _range(o: Outcome) -> str:
-    if o.below is not None:
-        return f"{o.field} >= {o.low:g} and {o.field} < {o.below:g}"
-    return f"{o.field} between {o.low:g} and {o.high:g}"

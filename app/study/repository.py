@@ -11,21 +11,15 @@ from sqlalchemy import ARRAY, ColumnElement, Integer, Select, any_, cast, column
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session, contains_eager, joinedload, lazyload, selectinload
 
-from app.accounts.models import Site, Study
 from app.accounts.permissions import READ_ARMS, Caller
-from app.platform.audit import AuditEvent
 from app.platform.errors import NotFound
-from app.study.models import (
-    Participant,
-    QocRevision,
-    Recording,
-    SessionSegment,
-    SettingsVersion,
-    StudySession,
-    Trace,
-    Visit,
-    VisitLock,
-)
+from app.tables.accounts import Site, Study
+from app.tables.audit import AuditEvent
+from app.tables.outcomes import QocRevision
+from app.tables.participants import Participant, SettingsVersion
+from app.tables.recordings import Recording, Trace
+from app.tables.sessions import SessionSegment, StudySession
+from app.tables.visits import Visit, VisitLock
 
 CONFIRMED = StudySession.status == "confirmed"
 """Condition on `StudySession`: only what a person has confirmed counts in buffers, analyses, rankings and exports."""

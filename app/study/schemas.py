@@ -12,11 +12,11 @@ from pydantic_core import PydanticCustomError
 from app.platform.signatures.schemas import SignatureOut, Signing
 from app.platform.signatures.service import SignatureState
 from app.platform.web.schemas import Bool, Day, Int, Model, Number, Text
-from app.study.models import Controller, Hemisphere
 from app.study.outcome_fields import DerivedField, EnteredOutcomes, OutcomeField, StoredOutcomes
-from app.study.sessions.models import Activity
 from app.study.settings.schemas import CDBS_MA, SettingsOut
 from app.study.usual.values import SURE
+from app.tables.participants import Hemisphere
+from app.tables.sessions import Activity, Controller
 from ml.designs import SessionDesign
 from ml.outcomes import OUTCOMES
 

@@ -10,12 +10,10 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
-from app.accounts.models import Site
 from app.accounts.permissions import Caller
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import blinding, repository
-from app.study.models import CdbsAmplitude, Controller, Participant, QocRevision, SettingsVersion, StudySession, Visit
 from app.study.outcomes import service as outcomes
 from app.study.schemas import CdbsAmplitudeModel, DerivedChoice, QocIn, SessionChange, VisitChange, VisitIn
 from app.study.sessions import repeated
@@ -26,6 +24,11 @@ from app.study.traces import NO_CONTROL, control_programs
 from app.study.usual import questions
 from app.study.usual.values import Question, question
 from app.study.visits.service import require_unlocked
+from app.tables.accounts import Site
+from app.tables.outcomes import QocRevision
+from app.tables.participants import Participant, SettingsVersion
+from app.tables.sessions import Controller, StudySession
+from app.tables.visits import CdbsAmplitude, Visit
 from ml.mdp import MdpSettings
 from ml.outcomes import FIELDS, OUTCOMES, enumerated
 

@@ -12,8 +12,10 @@ from app.accounts.permissions import Caller
 from app.platform.errors import Invalid
 from app.platform.web.numbers import number
 from app.study import blinding, repository
-from app.study.models import Controller, Participant, SettingsVersion, Trace
 from app.study.traces import laid_out, traces_of
+from app.tables.participants import Participant, SettingsVersion
+from app.tables.recordings import Trace
+from app.tables.sessions import Controller
 from ml.mdp import MdpSettings
 
 MDP_FIELDS = (

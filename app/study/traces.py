@@ -13,7 +13,9 @@ from sqlalchemy.orm import Session
 from app.platform.errors import Invalid
 from app.platform.web.numbers import stated
 from app.study import cdbs_amplitude, repository
-from app.study.models import Recording, SettingsVersion, StudySession, Trace
+from app.tables.participants import SettingsVersion
+from app.tables.recordings import Recording, Trace
+from app.tables.sessions import StudySession
 from ml.formats.beta import ERROR_STREAM
 from ml.mdp import AMPLITUDE_TOLERANCE
 

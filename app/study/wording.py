@@ -6,17 +6,16 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from app.platform.web.numbers import stated
-from app.study.adverse_events.models import EventKind, Severity
 from app.study.characteristics.schemas import CharacteristicsFields, Symptom, Target
-from app.study.doses.drugs import DRUGS, Drug
-from app.study.doses.models import Dose
+from app.study.doses.drugs import DRUGS
 from app.study.enrolment.codes import CodeQuestion
-from app.study.models import Controller
 from app.study.sessions.contradictions import Contradiction, Kind
 from app.study.sessions.designs import Drawn
-from app.study.sessions.models import Activity
 from app.study.settings.form import LABELS as SETTING_LABELS
 from app.study.usual.values import Question, Why
+from app.tables.adverse_events import EventKind, Severity
+from app.tables.sessions import Activity, Controller
+from app.tables.visits import Dose, Drug
 from ml.outcomes import BY_FIELD, OUTCOMES
 
 DEVICE_NAMES = {"rcs": "RC+S", "percept": "Percept"}

@@ -37,11 +37,9 @@ _FORKING = "app.platform.jobs.children.fork_server"
 _PREPARE = """
 import json, sys
 from app.accounts import service
-from app.accounts.models import Role
+from app.tables.accounts import Role
 from app.platform.database import transaction
 from app.platform.migrate import migrate
-from app.platform.tables import load_tables
-load_tables()
 migrate()
 people, password = json.loads(sys.argv[1])
 with transaction("measurement") as db:

@@ -9,11 +9,11 @@ from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.analysis.energy.schemas import ImplantIn
 from app.learning.policies.baselines import constant_onnx
 from app.main import DESCRIPTION
 from app.platform.database import transaction
+from app.tables.accounts import Role
 from tests.app.filled_study import FilledStudy
 
 MAPPING = {

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from app.accounts import permissions as can
-from app.accounts.models import Role, Scope
 from app.accounts.permissions import PERMISSIONS, SCOPES
+from app.tables.accounts import Role, Scope
 
 READABLE = (
     "/api/v1/participants",

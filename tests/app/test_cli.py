@@ -23,8 +23,10 @@ from app.accounts.permissions import SYSTEM
 from app.cli import app, main
 from app.overview.package.export import export_participant
 from app.platform.database import owner_url, transaction
-from app.study.models import CdbsAmplitude, Hemisphere, StudySession
 from app.study.repository import participant_by_code
+from app.tables.participants import Hemisphere
+from app.tables.sessions import StudySession
+from app.tables.visits import CdbsAmplitude
 
 COMMANDS = (
     "serve", "worker", "demo", "migrate", "user add", "token create", "import", "pipeline", "rank", "export", "control",

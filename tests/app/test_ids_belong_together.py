@@ -14,13 +14,13 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.models import Policy
 from app.learning.policies import service as learning
 from app.pipeline import service as pipeline
 from app.planning.bundles import service as bundles
 from app.platform.errors import NotFound
-from app.platform.jobs.models import Job
 from app.study.repository import participant_by_code
+from app.tables.jobs import Job
+from app.tables.learning import Policy
 from ml.rl import MlpPolicy
 from tests.conftest import PASSWORD
 

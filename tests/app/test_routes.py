@@ -10,8 +10,8 @@ from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, Phase, given, settings
 
 from app.accounts import service as accounts
-from app.accounts.models import Role, Scope, Site, Study
 from app.platform.database import transaction
+from app.tables.accounts import Role, Scope, Site, Study
 from tests.app.every_route import TABLE, World, routes, token_of
 from tests.app.pages.page_calls import browser
 from tests.app.route_roles import BROWSER, may_call

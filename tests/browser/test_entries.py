@@ -11,8 +11,8 @@ from fastapi.testclient import TestClient
 from playwright.sync_api import expect
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.platform.database import transaction
+from app.tables.accounts import Role
 from tests.browser.conftest import PASSWORD, Watched
 
 pytestmark = pytest.mark.browser

@@ -10,8 +10,8 @@ from fastapi.testclient import TestClient
 from playwright.sync_api import expect
 from sqlalchemy.orm import Session
 
-from app.platform.jobs.models import Job, JobEvent, JobStatus, JobStep
-from app.study.models import Participant
+from app.tables.jobs import Job, JobEvent, JobStatus, JobStep
+from app.tables.participants import Participant
 
 pytestmark = pytest.mark.browser
 

@@ -13,9 +13,9 @@ from pydantic import TypeAdapter
 from sqlalchemy import text
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.planning.visit_day.schemas import DeviceTime
 from app.platform.database import transaction
+from app.tables.accounts import Role
 from tests.browser.conftest import FLAGS, PASSWORD, Watched, kill_browser, program
 from tests.browser.day_page import KEPT, fill, once_drawn, open_day, stored, tap, wait_for, wait_until_stored, worker_ready
 from tests.clinic_day import ClinicDay, clinic_day

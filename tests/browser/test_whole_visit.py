@@ -21,8 +21,8 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.platform.database import transaction
+from app.tables.accounts import Role
 from ml.population import run_session
 from ml.population.tables import session_table_csv
 from tests.app.conftest import ended, worker

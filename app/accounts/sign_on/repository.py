@@ -7,7 +7,7 @@ from datetime import datetime
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session, selectinload
 
-from app.accounts.models import SignIn, SignOnLink, User
+from app.tables.accounts import SignIn, SignOnLink, User
 
 
 def link_of(db: Session, issuer: str, subject: str) -> SignOnLink | None:

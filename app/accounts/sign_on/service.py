@@ -5,7 +5,6 @@ from __future__ import annotations
 from sqlalchemy.orm import Session
 
 from app.accounts import repository as accounts
-from app.accounts.models import SignIn, SignOnLink, User
 from app.accounts.permissions import CONFIRMED_FOR, Caller
 from app.accounts.service import open_session
 from app.accounts.sign_on import repository
@@ -13,6 +12,7 @@ from app.accounts.sign_on.provider import Identity, Refused
 from app.platform.audit import record
 from app.platform.database import now, set_actor
 from app.platform.errors import Forbidden
+from app.tables.accounts import SignIn, SignOnLink, User
 
 _AGAIN = "Begin again, and give your password there; or give the one of here."
 

@@ -7,13 +7,13 @@ from fastapi import APIRouter
 from app.accounts import permissions as can
 from app.accounts import repository as accounts
 from app.accounts.deps import CurrentCaller
-from app.accounts.models import Role
 from app.accounts.studies import repository, service
 from app.accounts.studies.deps import ManagedStudy
 from app.accounts.studies.schemas import Member, MemberIn, MemberOut, NameChange, SiteIn, SiteOut, StudyChange, StudyIn, StudyOut
 from app.accounts.studies.serializers import site_out, study_out
 from app.platform.database import Db
 from app.platform.web.schemas import problems
+from app.tables.accounts import Role
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 

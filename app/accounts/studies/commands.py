@@ -9,7 +9,6 @@ from pydantic import BaseModel, ValidationError
 
 from app.accounts import repository, second_factor
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM
 from app.accounts.sign_on.repository import remove_links
 from app.accounts.studies import service
@@ -17,6 +16,7 @@ from app.accounts.studies.schemas import HINT, NameChange, SiteIn, StudyChange, 
 from app.platform.database import now, transaction
 from app.platform.errors import Invalid, NotFound
 from app.platform.terminal import ACTOR, AsJson, Why, show
+from app.tables.accounts import Role
 
 Draft = TypeVar("Draft", bound=BaseModel)
 

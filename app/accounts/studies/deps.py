@@ -7,9 +7,9 @@ from typing import Annotated
 from fastapi import Depends, Path
 
 from app.accounts.deps import CurrentCaller
-from app.accounts.models import Study
 from app.accounts.studies import service
 from app.platform.database import Db
+from app.tables.accounts import Study
 
 
 def managed_study(study_code: Annotated[str, Path(max_length=40, pattern=r"^[^\x00]*$")], db: Db, caller: CurrentCaller) -> Study:

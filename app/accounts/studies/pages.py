@@ -14,7 +14,6 @@ from starlette.datastructures import FormData
 from app.accounts import permissions as can
 from app.accounts import repository as accounts
 from app.accounts.deps import CurrentCaller
-from app.accounts.models import Role
 from app.accounts.permissions import Caller
 from app.accounts.service import administers, manages
 from app.accounts.studies import repository, service
@@ -23,6 +22,7 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, field_notes
 from app.platform.web.templates import render
+from app.tables.accounts import Role
 
 router = APIRouter()
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from sqlalchemy.orm import Session
 
-from app.accounts.models import Study
 from app.accounts.studies import repository
 from app.accounts.studies.schemas import Prefix
 from app.platform.errors import Conflict, Invalid
+from app.tables.accounts import Study
 
 LONGEST = 20
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from sqlalchemy import column, func, select, table, text
 from sqlalchemy.orm import Session
 
-from app.accounts.models import Membership, Site, Study, User
+from app.tables.accounts import Membership, Site, Study, User
 
 _PARTICIPANTS = table("participant", column("code"), column("site_id"))
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from pydantic import Field, StringConstraints
 
-from app.accounts.models import Role
 from app.platform.web.schemas import Model, Text
+from app.tables.accounts import Role
 
 HINT = (
     "A code has 1 to 40 letters, digits, dots or hyphens; a name 1 to 200 characters; "

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from sqlalchemy.orm import Session
 
-from app.accounts.models import Site, Study
 from app.accounts.studies import repository
 from app.accounts.studies.schemas import SiteOut, StudyOut
+from app.tables.accounts import Site, Study
 
 
 def study_out(db: Session, study: Study) -> StudyOut:

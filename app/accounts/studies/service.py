@@ -7,13 +7,13 @@ from collections.abc import Iterable
 from sqlalchemy.orm import Session
 
 from app.accounts import repository as accounts
-from app.accounts.models import Membership, Role, Site, Study, User
 from app.accounts.permissions import READ, Caller
 from app.accounts.service import administers
 from app.accounts.studies import prefixes, repository
 from app.accounts.studies.schemas import SiteIn, StudyChange, StudyIn
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound
+from app.tables.accounts import Membership, Role, Site, Study, User
 
 
 def add_study(db: Session, draft: StudyIn, caller: Caller) -> Study:

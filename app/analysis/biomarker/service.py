@@ -14,7 +14,8 @@ from app.analysis.evidence.measurements import comparable_beta, with_comparable_
 from app.analysis.evidence.service import evidence
 from app.platform.kept import kept
 from app.study import repository as study
-from app.study.models import Controller, Participant
+from app.tables.participants import Participant
+from app.tables.sessions import Controller
 from ml.outcomes import KEYS
 from ml.statistics.association import Association, between_visits, within_visits
 from ml.statistics.within_visits.contrasts import Unavailable

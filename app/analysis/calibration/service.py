@@ -29,16 +29,18 @@ from app.analysis.calibration.schemas import (
 )
 from app.evaluation import repository
 from app.evaluation.estimates.rows import estimate_of
-from app.evaluation.models import Evaluation
 from app.evaluation.ranking.actual import QUANTITIES, Actual, actual
 from app.evaluation.ranking.results import DrivenSession, driven_sessions
-from app.learning.models import BufferSnapshot, Policy
 from app.planning.plans import repository as plans
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.models import Participant, StudySession, Visit
 from app.study.threshold import mdp_settings
+from app.tables.evaluations import Evaluation
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.participants import Participant
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 from ml.mdp import MdpSettings
 from ml.ope.estimate import LEVEL, Estimate
 from ml.ope.registry import method_keys

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from app.platform.web.schemas import Model, Text
-from app.study.models import Controller
+from app.tables.sessions import Controller
 
 Amount = Annotated[float, Field(allow_inf_nan=False)]
 

@@ -16,7 +16,8 @@ from app.analysis.evidence.service import Evidence, evidence
 from app.platform.errors import Invalid
 from app.platform.kept import kept
 from app.study.blinding import CONTROLLER_NAMES
-from app.study.models import Controller, Participant
+from app.tables.participants import Participant
+from app.tables.sessions import Controller
 from ml.energy import Implant, Range, saving_percent
 
 RELATIVE = (Measure.AMPLITUDE, Measure.SQUARE, Measure.ALL_SIDES)

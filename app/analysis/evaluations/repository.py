@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from sqlalchemy import select
 from sqlalchemy.orm import Session, selectinload
 
-from app.evaluation.models import EstimateRow, Evaluation
-from app.learning.models import SnapshotSession
+from app.tables.evaluations import EstimateRow, Evaluation
+from app.tables.learning import SnapshotSession
 
 
 def evaluations(db: Session, participant_id: int) -> Sequence[Evaluation]:

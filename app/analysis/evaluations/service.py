@@ -11,12 +11,12 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.analysis.evaluations import repository
-from app.evaluation.models import Evaluation
 from app.evaluation.ranking.results import DrivenSession, driven_sessions, results_by_policy
-from app.learning.models import BufferSnapshot
 from app.study import repository as study
-from app.study.models import Participant
 from app.study.threshold import mdp_settings
+from app.tables.evaluations import Evaluation
+from app.tables.learning import BufferSnapshot
+from app.tables.participants import Participant
 from ml.ope.compare.metrics import accuracy
 from ml.ope.registry import shown
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.analysis.evidence.facts import BetaKind, Facts, Missing
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.outcomes import OUTCOMES
 from ml.statistics.within_visits.contrasts import Measurements
 

@@ -9,13 +9,10 @@ from sqlalchemy import cast, func, literal, select
 from sqlalchemy.dialects.postgresql import JSONPATH
 from sqlalchemy.orm import Session, contains_eager, defer, joinedload, selectinload
 
-from app.study.models import (
-    Participant,
-    Recording,
-    SessionSegment,
-    StudySession,
-    Visit,
-)
+from app.tables.participants import Participant
+from app.tables.recordings import Recording
+from app.tables.sessions import SessionSegment, StudySession
+from app.tables.visits import Visit
 
 STIMULATION_EVENTS = '$.events[*] ? (@.kind == "stimulation")'
 

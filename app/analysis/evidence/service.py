@@ -14,9 +14,11 @@ from app.platform.errors import Invalid
 from app.platform.kept import keep, recalled
 from app.study import blinding
 from app.study import repository as study
-from app.study.models import Participant, Recording, StudySession, Trace
 from app.study.sessions.data import failed_qoc_of
 from app.study.sessions.repository import fingerprints
+from app.tables.participants import Participant
+from app.tables.recordings import Recording, Trace
+from app.tables.sessions import StudySession
 from ml.qoc import Qoc
 
 READ_AT_ONCE = 8

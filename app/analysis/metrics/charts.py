@@ -13,7 +13,7 @@ from app.analysis.metrics.shown import for_readers
 from app.platform.kept import kept
 from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, counted, figure, marker, side_by_side
 from app.platform.web.numbers import hover, p_text
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.outcomes import BY_KEY
 
 SHORT = {Controller.DISTILLED: "Distilled"}

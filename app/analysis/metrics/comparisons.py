@@ -13,7 +13,7 @@ import numpy as np
 
 from app.platform.web.numbers import p_text
 from app.study.blinding import CONTROLLER_NAMES
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.statistics.multiplicity import holm
 from ml.statistics.ranksum import rank_sum
 

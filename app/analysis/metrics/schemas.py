@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from app.platform.web.schemas import Model
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.outcomes import ANY
 
 

@@ -18,8 +18,9 @@ from app.analysis.primary import repository
 from app.platform.kept import kept
 from app.platform.web.charts import counted
 from app.study.blinding import CONTROLLER_NAMES
-from app.study.models import Controller, Participant
 from app.study.sessions.stimulation import MEAN_FRACTION, fits
+from app.tables.participants import Participant
+from app.tables.sessions import Controller
 from ml.energy import saving_percent
 
 LIMITS = (

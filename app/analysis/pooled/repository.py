@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from sqlalchemy import Row, func, select
 from sqlalchemy.orm import Session
 
-from app.platform.jobs.models import Job, JobStatus, JobStep
+from app.tables.jobs import Job, JobStatus, JobStep
 
 
 def step_seconds(db: Session, participant_ids: Sequence[int]) -> Sequence[Row[str, str, int, float, float]]:

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from app.analysis.primary.schemas import AverageOut, VerdictOut
 from app.platform.web.schemas import Model
-from app.study.models import Controller
+from app.tables.sessions import Controller
 
 
 class OfParticipantOut(Model):

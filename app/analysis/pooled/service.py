@@ -19,7 +19,8 @@ from app.analysis.primary.service import Primary
 from app.analysis.trial_time.service import TrialTime, of_evidence
 from app.platform.kept import kept
 from app.study import repository as study
-from app.study.models import Controller, Participant
+from app.tables.participants import Participant
+from app.tables.sessions import Controller
 from ml.statistics.pooling import Summary, pool
 from ml.statistics.within_visits.contrasts import Average, Reason, Unavailable
 

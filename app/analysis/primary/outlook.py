@@ -7,7 +7,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.analysis import wording
 from app.analysis.primary.service import verdicts_of
-from app.study.models import Participant
+from app.tables.participants import Participant
 from ml.statistics.noninferiority import PLANNED_SESSIONS
 
 

@@ -8,8 +8,8 @@ from datetime import datetime
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from app.learning.models import Policy
-from app.planning.plans.models import Plan, PlanItem
+from app.tables.learning import Policy
+from app.tables.plans import Plan, PlanItem
 
 
 def policy_names(db: Session, participant_ids: Collection[int]) -> dict[int, dict[int, str]]:

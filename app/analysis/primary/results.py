@@ -14,7 +14,7 @@ from functools import cached_property
 
 from app.analysis.evidence.facts import METRICS, Facts
 from app.analysis.evidence.measurements import Chosen, choose_each, of_controller
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.statistics.effects import Saving, cliffs_delta, energy_saving
 from ml.statistics.multiplicity import benjamini_hochberg, holm
 from ml.statistics.ranksum import RankSum, as_in_the_paper

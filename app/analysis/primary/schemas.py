@@ -7,8 +7,8 @@ from datetime import datetime
 from pydantic import Field
 
 from app.platform.web.schemas import Model
-from app.study.models import Controller
 from app.study.outcome_fields import VersionOfMargins
+from app.tables.sessions import Controller
 
 
 class AverageOut(Model):

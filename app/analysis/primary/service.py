@@ -20,7 +20,8 @@ from app.analysis.primary.verdict import LockedMargins, VerdictResult, earlier_v
 from app.platform.errors import NotFound
 from app.platform.kept import kept
 from app.study.margins.service import margins_of
-from app.study.models import Controller, Participant
+from app.tables.participants import Participant
+from app.tables.sessions import Controller
 from ml.outcomes import BY_KEY
 from ml.statistics.power import Power, Target, power
 from ml.statistics.within_visits.contrasts import Unavailable

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from app.analysis.evidence.facts import Facts
 from app.analysis.evidence.measurements import choose_each, of_controller
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.outcomes import KEYS, OUTCOMES, Outcome
 from ml.qoc import Margins, Qoc
 from ml.statistics.noninferiority import LEAST_VISITS, Assessment, assess

@@ -12,7 +12,8 @@ from app.analysis.evidence.facts import LeftOut
 from app.analysis.evidence.service import Evidence
 from app.study import repository as study
 from app.study.blinding import CONTROLLER_NAMES, Arm, visible_arms
-from app.study.models import Controller, Participant, StudySession
+from app.tables.participants import Participant
+from app.tables.sessions import Controller, StudySession
 
 PAPER_ORDER = (Controller.CDBS, Controller.RL, Controller.DISTILLED, Controller.NO_DBS)
 """The paper's columns; controllers that it does not list follow where some session has them."""

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from app.evaluation.models import Evaluation
 from app.evaluation.schemas import CheckOut, CoverageOut
 from app.evaluation.shown import flag_out
+from app.tables.evaluations import Evaluation
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag, distinct
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy.orm import Session
 
 from app.evaluation import repository
-from app.evaluation.models import Evaluation
-from app.study.models import Participant, SettingsVersion
+from app.tables.evaluations import Evaluation
+from app.tables.participants import Participant, SettingsVersion
 from ml.ope.outcomes.minutes import SHAPES
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
-from app.evaluation.models import Evaluation
+from app.tables.evaluations import Evaluation
 from ml.ope.compare.aggregate import combine
 from ml.ope.compare.skill import with_held_out_error
 from ml.ope.estimate import Estimate

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from app.evaluation.models import EstimateRow
+from app.tables.evaluations import EstimateRow
 from ml.ope.estimate import Estimate
 
 _COLUMNS = {column.key for column in EstimateRow.__table__.columns}

@@ -16,7 +16,6 @@ from app.evaluation.replay.preselected import other_than
 from app.evaluation.repository import PolicyHead
 from app.learning import repository as learning
 from app.learning.deps import CurrentOwnPolicy
-from app.learning.models import Policy
 from app.learning.policies.curves import curve_charts
 from app.learning.policies.service import retire
 from app.learning.schemas import ALGORITHM_NAMES, PolicyChange
@@ -27,8 +26,9 @@ from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.study import repository as study_repository
 from app.study.deps import CurrentParticipant, ResultsViewed
-from app.study.models import Participant
 from app.study.service import may, require
+from app.tables.learning import Policy
+from app.tables.participants import Participant
 from ml.policies.logged_range import LARGEST_SHARE_BELOW
 
 router = APIRouter()

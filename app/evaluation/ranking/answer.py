@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.evaluation.estimates.coverage import STORED
-from app.evaluation.models import Evaluation
 from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.evaluation.ranking.decisions import Decided
 from app.study.margins.service import margins_of
+from app.tables.evaluations import Evaluation
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.verdict import SAME_AMPLITUDE, chance_within, interval, outcome_draws
 from ml.ope.support.behaviour_map import BehaviourMap

@@ -9,13 +9,13 @@ from typing import Any
 
 from app.evaluation.estimates.coverage import coverage_by_policy, coverage_failed
 from app.evaluation.estimates.rows import estimate_of
-from app.evaluation.models import Evaluation
 from app.evaluation.ranking.decisions import Circumstances, Decided, decide, ordering_told, session_noise
 from app.evaluation.repository import PolicyHead
 from app.evaluation.schemas import CoverageOut, TestedBefore
 from app.platform.errors import Invalid
 from app.study import cdbs_amplitude
-from app.study.models import Participant, SettingsVersion
+from app.tables.evaluations import Evaluation
+from app.tables.participants import Participant, SettingsVersion
 from ml.ope.compare.ranking import rank_policies
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.further_sessions import Place

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from app.evaluation.models import Evaluation
 from app.evaluation.schemas import Decision, Standing
-from app.study.margins.models import MarginsVersion
 from app.study.margins.service import margins_of
+from app.tables.evaluations import Evaluation
+from app.tables.participants import MarginsVersion
 from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag

@@ -17,22 +17,22 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM, Caller
 from app.evaluation import repository
-from app.evaluation.models import Evaluation
 from app.evaluation.ranking.answer import Answer, Row, answer
 from app.evaluation.ranking.assessment import Assessed, Assessment, assess, cdbs_amplitude_now
 from app.evaluation.ranking.picture import Picture, picture
 from app.evaluation.ranking.results import RandomSessions, random_sessions, tested_before
 from app.evaluation.repository import PolicyHead
 from app.evaluation.schemas import TestedBefore
-from app.learning.models import BufferSnapshot
 from app.platform.errors import Invalid
 from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study.adverse_events.repository import events_of_participant
 from app.study.adverse_events.service import blocked_policies
-from app.study.models import Participant, SettingsVersion
 from app.study.sessions.repository import ReadOnce
+from app.tables.evaluations import Evaluation
+from app.tables.learning import BufferSnapshot
+from app.tables.participants import Participant, SettingsVersion
 from ml.ope.estimate import Estimate
 from ml.ope.registry import method_keys
 

@@ -24,12 +24,12 @@ from app.platform.database import Db
 from app.platform.errors import NotFound
 from app.platform.jobs import registry
 from app.platform.jobs import repository as jobs
-from app.platform.jobs.models import JobStatus
 from app.platform.web.forms import parse
 from app.platform.web.templates import render, render_part
 from app.study.deps import CurrentParticipant, ResultsViewed
-from app.study.models import Participant
 from app.study.service import may
+from app.tables.jobs import JobStatus
+from app.tables.participants import Participant
 from ml.designs import EARLY_RANDOM_SESSIONS
 from ml.ope import registry as estimators
 

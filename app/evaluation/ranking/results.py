@@ -10,23 +10,23 @@ from statistics import fmean, median
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.evaluation.models import Evaluation
 from app.evaluation.ranking.actual import Actual, actual, mean_of
 from app.evaluation.schemas import TestedBefore
-from app.learning.models import BufferSnapshot
 from app.learning.snapshots.trajectories import trajectory_of
 from app.platform.errors import Invalid
 from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study.blinding import Arm
-from app.study.margins.models import MarginsVersion
 from app.study.margins.service import margins_of
-from app.study.models import Controller, Participant, SettingsVersion, StudySession
 from app.study.sessions.data import failed_qoc_of
 from app.study.sessions.repository import ReadOnce
 from app.study.threshold import mdp_settings
 from app.study.traces import TracesOf, laid_out, traces_of
+from app.tables.evaluations import Evaluation
+from app.tables.learning import BufferSnapshot
+from app.tables.participants import MarginsVersion, Participant, SettingsVersion
+from app.tables.sessions import Controller, StudySession
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
 from ml.mdp import MdpSettings
 from ml.outcomes import BY_FIELD, OUTCOMES, Outcome

@@ -16,12 +16,12 @@ from app.evaluation.ranking.judged import Judged, judged
 from app.evaluation.ranking.staleness import stale_reasons
 from app.evaluation.schemas import CoverageOut, EstimateOut, FlagOut, GainOut, RankedPolicy, RankedSnapshot, RankingFilter, RankingOut
 from app.evaluation.shown import estimate_out, flag_out, reason_out
-from app.learning.models import BufferSnapshot
 from app.platform.errors import NotFound
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.models import Participant
 from app.study.sessions.repository import ReadOnce
+from app.tables.learning import BufferSnapshot
+from app.tables.participants import Participant
 from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag, distinct

@@ -15,17 +15,18 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation import repository
-from app.evaluation.models import Evaluation
 from app.learning import repository as learning
 from app.learning.gate.service import LEARNED, gate
-from app.learning.models import BufferSnapshot, SnapshotSession
 from app.platform.errors import Invalid
 from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
-from app.study.models import Participant, SettingsVersion, StudySession
 from app.study.sessions.repository import ReadOnce
 from app.study.traces import Sources, sources
+from app.tables.evaluations import Evaluation
+from app.tables.learning import BufferSnapshot, SnapshotSession
+from app.tables.participants import Participant, SettingsVersion
+from app.tables.sessions import StudySession
 from ml.ope.flags import Flag
 
 NAMED = 5

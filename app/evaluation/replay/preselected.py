@@ -9,9 +9,9 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.evaluation.ranking.answer import Answer
 from app.evaluation.ranking.service import current
-from app.learning.models import Policy
 from app.platform.errors import NotFound
-from app.study.models import Participant
+from app.tables.learning import Policy
+from app.tables.participants import Participant
 
 TWO = 2
 """Policies that a comparison begins with: they already show a difference, and a third is one choice away."""

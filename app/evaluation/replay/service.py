@@ -12,7 +12,6 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.evaluation.replay.schemas import AskedOut, DifferenceOut, ReplayOut
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies import foreign
 from app.learning.policies.service import onnx_of
 from app.platform import files
@@ -21,9 +20,12 @@ from app.platform.kept import kept
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.blinding import require_known
-from app.study.models import Participant, StudySession, Trace
 from app.study.sessions.data import SessionData, session_data
 from app.study.traces import StepTable
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.participants import Participant
+from app.tables.recordings import Trace
+from app.tables.sessions import StudySession
 from ml.energy import relative_energy
 from ml.ope.posterior.verdict import NEARLY_OFF, SAME_AMPLITUDE
 from ml.policies.onnx_policy import PolicyFileError

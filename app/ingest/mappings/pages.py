@@ -11,7 +11,6 @@ from sqlalchemy.orm import Session
 from starlette.datastructures import FormData
 
 from app.accounts.deps import CurrentCaller
-from app.accounts.models import Study
 from app.accounts.permissions import Caller
 from app.ingest import repository as uploads
 from app.ingest.mappings import repository, service
@@ -19,13 +18,14 @@ from app.ingest.mappings.rules import HOLDS_NAMES, ROLE_NAMES
 from app.ingest.mappings.schemas import MappingIn
 from app.ingest.mappings.serializers import mappings_out
 from app.ingest.mappings.service import WaitingTable
-from app.ingest.models import ColumnMapping
 from app.ingest.quarantine.serializers import problem_of
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
+from app.tables.accounts import Study
+from app.tables.uploads import ColumnMapping
 from ml.formats.tables.mapping.model import UNITS
 from ml.formats.tables.numbers import known_unit
 

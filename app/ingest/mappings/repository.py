@@ -8,10 +8,10 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
-from app.accounts.models import Study
 from app.accounts.permissions import Caller
-from app.ingest.models import ColumnMapping
 from app.platform.errors import NotFound
+from app.tables.accounts import Study
+from app.tables.uploads import ColumnMapping
 
 
 def versions(db: Session, study_id: int) -> Sequence[ColumnMapping]:

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from app.ingest.schemas import FileReportOut
 from app.platform.web.schemas import Int, Model, Number, Text
-from app.study.models import Hemisphere
+from app.tables.participants import Hemisphere
 from ml.formats.tables.mapping.model import Holds, TimeFormat
 
 Role = Literal[

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from app.ingest.mappings.schemas import MappedColumnIn, MappedOut, MappingOut, PreviewLineOut, PreviewOut
 from app.ingest.mappings.service import Applied, WaitingTable
-from app.ingest.models import ColumnMapping
 from app.ingest.quarantine.serializers import problem_of
 from app.ingest.schemas import FileReportOut
+from app.tables.uploads import ColumnMapping
 
 
 def mapping_out(row: ColumnMapping, current: bool) -> MappingOut:

@@ -13,13 +13,13 @@ from app.ingest import repository as uploads
 from app.ingest import wording
 from app.ingest.mappings import repository, rules
 from app.ingest.mappings.schemas import MappingIn
-from app.ingest.models import ColumnMapping, UploadFile
 from app.ingest.quarantine import service as quarantine
 from app.ingest.uploads.service import FileOutcome
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound
 from app.study import service as study_service
-from app.study.models import Participant
+from app.tables.participants import Participant
+from app.tables.uploads import ColumnMapping, UploadFile
 from ml.formats.tables.mapping import TableMapping
 
 

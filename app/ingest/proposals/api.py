@@ -30,8 +30,8 @@ from app.platform.web.schemas import RowId, problems
 from app.study import repository as study
 from app.study import service as study_service
 from app.study.deps import CurrentParticipant
-from app.study.models import StudySession
 from app.study.serializers import session_out, visit_out
+from app.tables.sessions import StudySession
 
 router = APIRouter(tags=["proposals"], responses=problems(401, 403, 404, 422))
 

@@ -11,9 +11,9 @@ from app.ingest import channels, programs
 from app.ingest.proposals.evidence import Evidence, Reason, Source
 from app.study import repository as study
 from app.study import service
-from app.study.models import StudySession
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.usable_steps import usable_steps
+from app.tables.sessions import StudySession
 
 
 def survey(session: StudySession) -> Evidence | None:

@@ -8,8 +8,9 @@ from datetime import UTC, date, datetime
 from enum import StrEnum
 from typing import Any
 
-from app.study.models import Controller, Visit
 from app.study.sessions.stimulation import Course, Delivered, Pattern, course
+from app.tables.sessions import Controller
+from app.tables.visits import Visit
 
 
 class Source(StrEnum):

@@ -12,15 +12,15 @@ from markupsafe import Markup
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.ingest.models import SessionProposal
 from app.ingest.proposals.visit_of_recording import VisitToAdd
 from app.ingest.schemas import PartIn, ProposalChange
 from app.platform.errors import Invalid
 from app.platform.web.forms import FieldNote, parse
 from app.study import blinding
 from app.study import repository as study
-from app.study.models import SessionSegment, StudySession
 from app.study.sessions.usable_steps import UsableSteps
+from app.tables.sessions import SessionSegment, StudySession
+from app.tables.uploads import SessionProposal
 
 LABELS = {
     "visit": "Visit", "controller": "Controller", "policy": "Policy", "hemisphere": "Hemisphere", "from": "From", "to": "To",

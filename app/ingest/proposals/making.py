@@ -9,7 +9,6 @@ from datetime import timedelta
 from sqlalchemy.orm import Session
 
 from app.ingest import repository, sessions, wording
-from app.ingest.models import SessionProposal, Upload
 from app.ingest.proposals import control_channel, guesses
 from app.ingest.proposals.evidence import BY_UPLOAD, Evidence, Reason, Source, guess_visit
 from app.ingest.proposals.parts import placement_of
@@ -19,11 +18,14 @@ from app.ingest.sessions import Placement, StatedSession, add_session
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.platform.web import numbers
 from app.study import repository as study
-from app.study.models import Participant, Recording, StudySession
 from app.study.sessions import conditions, logged
 from app.study.sessions.contradictions import contradictions, control_recording, local_day
 from app.study.sessions.usable_steps import sentence, usable_steps
 from app.study.wording import sentences
+from app.tables.participants import Participant
+from app.tables.recordings import Recording
+from app.tables.sessions import StudySession
+from app.tables.uploads import SessionProposal, Upload
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.ingest import repository, wording
 from app.ingest.deps import CurrentProposal
-from app.ingest.models import SessionProposal
 from app.ingest.proposals import service as proposals
 from app.ingest.proposals.forms import FIELDS, HIDDEN, ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
 from app.ingest.proposals.thumbnail import thumbnail
@@ -29,7 +28,6 @@ from app.study import repository as study
 from app.study import service as study_service
 from app.study.blinding import CONTROLLER_NAMES, may_know
 from app.study.deps import CurrentParticipant
-from app.study.models import Participant, StudySession, Visit
 from app.study.sessions import designs
 from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions
@@ -37,6 +35,10 @@ from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.usable_steps import usable_steps
 from app.study.traces import control_programs
 from app.study.wording import drawn_words, sentences
+from app.tables.participants import Participant
+from app.tables.sessions import StudySession
+from app.tables.uploads import SessionProposal
+from app.tables.visits import Visit
 
 router = APIRouter()
 

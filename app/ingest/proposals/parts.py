@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from app.ingest import sessions
 from app.ingest.sessions import Placement, StatedSession, set_segments
 from app.platform.errors import Invalid
-from app.study.models import StudySession
+from app.tables.sessions import StudySession
 
 
 def choose_side(db: Session, session: StudySession, given: dict[str, object]) -> None:

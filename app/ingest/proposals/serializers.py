@@ -8,16 +8,16 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.ingest import repository, wording
-from app.ingest.models import SessionProposal
 from app.ingest.schemas import (
     PartOut,
     ProposalOut,
     UsableStepsOut,
 )
 from app.study import repository as study
-from app.study.models import StudySession
 from app.study.serializers import session_out
 from app.study.sessions.usable_steps import on_any, usable_steps
+from app.tables.sessions import StudySession
+from app.tables.uploads import SessionProposal
 
 
 def proposals_out(db: Session, participant_id: int, caller: Caller) -> list[ProposalOut]:

@@ -10,7 +10,6 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
 from app.ingest import repository, sessions, wording
-from app.ingest.models import SessionProposal
 from app.ingest.proposals import control_channel, guesses
 from app.ingest.proposals.evidence import BY_CUT, Evidence, Reason, Source
 from app.ingest.proposals.parts import choose_part, choose_side, on_grid, placement_of
@@ -23,12 +22,13 @@ from app.study import blinding
 from app.study import repository as study
 from app.study import service as study_service
 from app.study.data_queries import repository as data_queries
-from app.study.models import Controller, StudySession
 from app.study.service import POLICY_CONTROLLERS
 from app.study.sessions import conditions, logged
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.visits.service import require_unlocked
 from app.study.wording import sentences
+from app.tables.sessions import Controller, StudySession
+from app.tables.uploads import SessionProposal
 
 RESTS_ON = frozenset({"visit", "hemisphere", "start_s", "stop_s", "started_at", "controller"})
 """Fields of a correction after which a guessed controller is guessed again."""

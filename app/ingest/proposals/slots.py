@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from app.ingest.proposals.evidence import Evidence, Reason, Source, VisitGuess
 from app.ingest.sessions import StatedSession
-from app.study.models import Visit
 from app.study.sessions.logged import LoggedSlot
+from app.tables.visits import Visit
 
 
 def differs_from_slot(slot: LoggedSlot | None, stated: StatedSession) -> bool:

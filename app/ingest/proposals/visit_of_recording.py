@@ -11,15 +11,16 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.ingest import repository
-from app.ingest.models import SessionProposal
 from app.ingest.proposals.evidence import Evidence, Reason, Source
 from app.ingest.proposals.service import locked, renew
 from app.platform.errors import Conflict, Invalid
 from app.study import repository as study
 from app.study import service as study_service
-from app.study.models import StudySession, Visit
 from app.study.schemas import VisitIn
 from app.study.sessions.contradictions import control_recording, local_day
+from app.tables.sessions import StudySession
+from app.tables.uploads import SessionProposal
+from app.tables.visits import Visit
 
 
 def day_to_add(session: StudySession, proposal: SessionProposal, visits: Sequence[Visit]) -> date | None:

@@ -20,7 +20,7 @@ from app.platform.web.forms import FormValues, field_notes
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
-from app.study.models import Participant
+from app.tables.participants import Participant
 
 router = APIRouter()
 

@@ -8,9 +8,9 @@ from fastapi import Response
 from fastapi.responses import StreamingResponse
 
 from app.ingest import wording
-from app.ingest.models import UploadFile
 from app.ingest.schemas import QuarantinedOut
 from app.ingest.uploads import service
+from app.tables.uploads import UploadFile
 
 
 def original(content: Iterator[bytes], file_id: int) -> Response:

@@ -18,7 +18,6 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.ingest import encryption, repository
 from app.ingest.mappings import repository as mappings
-from app.ingest.models import PREVIEW, UploadFile
 from app.ingest.stated_beta import BetaStated
 from app.ingest.uploads import reading, service
 from app.ingest.uploads.receiving import Receiver, StoredContent
@@ -30,7 +29,8 @@ from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
 from app.platform.raw_bytes import RawFile, raw_file
 from app.study import service as study_service
-from app.study.models import Participant
+from app.tables.participants import Participant
+from app.tables.uploads import PREVIEW, StoredFile, UploadFile
 from ml.formats.recording import UndecodableFile
 from ml.formats.redaction_record import REDACTOR_VERSION
 
@@ -204,5 +204,5 @@ def _erase(db: Session, file: UploadFile) -> None:
     if file.stored_sha256 == sealed:
         file.stored_sha256 = None
     db.flush()
-    db.delete(db.get_one(files.StoredFile, sealed))
+    db.delete(db.get_one(StoredFile, sealed))
     db.commit()

@@ -10,7 +10,6 @@ from sqlalchemy.orm import Session
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.ingest import repository
-from app.ingest.models import UploadFile as UploadFileRow
 from app.ingest.proposals.serializers import proposal_out
 from app.ingest.schemas import FileReportOut, UploadedFileOut, UploadOut
 from app.ingest.uploads import service
@@ -20,9 +19,11 @@ from app.platform.database import Db
 from app.platform.errors import Invalid
 from app.platform.web.schemas import Moment, RowId, Text, problems
 from app.study import repository as study
-from app.study.models import Controller, Hemisphere
 from app.study.serializers import session_out
 from app.study.settings.schemas import BetaSource
+from app.tables.participants import Hemisphere
+from app.tables.sessions import Controller
+from app.tables.uploads import UploadFile as UploadFileRow
 from ml.formats.tables.numbers import unit_name
 
 router = APIRouter(route_class=UploadRoute, tags=["uploads"], responses=problems(401, 403, 404, 422))

@@ -10,7 +10,6 @@ import structlog
 from sqlalchemy.orm import Session
 
 from app.ingest import wording
-from app.ingest.models import Upload
 from app.ingest.sessions import StatedSession
 from app.ingest.stated_beta import BetaStated
 from app.ingest.uploads import service
@@ -21,7 +20,8 @@ from app.platform.database import transaction
 from app.platform.errors import Conflict, Invalid
 from app.platform.jobs.children.child import places
 from app.study import service as study
-from app.study.models import Participant
+from app.tables.participants import Participant
+from app.tables.uploads import Upload
 
 log = structlog.get_logger()
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from sqlalchemy.orm import Session
 
-from app.ingest.models import UploadFile
 from app.platform.errors import Invalid
-from app.study.models import StudySession
 from app.study.outcomes import service as outcomes
+from app.tables.sessions import StudySession
+from app.tables.uploads import UploadFile
 from ml.formats.recording import GraspLog, TremorLog
 
 NO_SESSION = (

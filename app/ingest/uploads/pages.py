@@ -12,7 +12,6 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.ingest import repository, wording
-from app.ingest.models import Upload
 from app.ingest.schemas import UploadForm
 from app.ingest.uploads import service
 from app.ingest.uploads.early_refusal import UploadRoute
@@ -30,9 +29,10 @@ from app.study import repository as study
 from app.study import service as study_service
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.deps import CurrentParticipant
-from app.study.models import Participant
 from app.study.settings.form import SOURCES
 from app.study.settings.schemas import BetaSource
+from app.tables.participants import Participant
+from app.tables.uploads import Upload
 
 router = APIRouter(route_class=UploadRoute)
 

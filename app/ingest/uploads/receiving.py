@@ -15,7 +15,6 @@ from sqlalchemy.orm import Session
 
 from app.ingest import encryption, repository, wording
 from app.ingest.mappings import repository as mappings
-from app.ingest.models import PREVIEW, Upload, UploadFile
 from app.ingest.stated_beta import BetaStated, name_beta
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading, recordings
@@ -28,7 +27,9 @@ from app.platform.errors import TooLarge, passing
 from app.platform.jobs.children import child
 from app.platform.raw_bytes import RawFile
 from app.settings import get_settings
-from app.study.models import Participant, Recording
+from app.tables.participants import Participant
+from app.tables.recordings import Recording
+from app.tables.uploads import PREVIEW, StoredFile, Upload, UploadFile
 from ml.formats.archive import cleaned_suffix
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, GraspLog, Problem, UndecodableFile
@@ -179,7 +180,7 @@ class Receiver:
         """
         self.db.flush()
         if sha256 is not None and not repository.names_stored(self.db, sha256):
-            self.db.delete(self.db.get_one(files.StoredFile, sha256))
+            self.db.delete(self.db.get_one(StoredFile, sha256))
             self.db.flush()
             files.remove(sha256)
 

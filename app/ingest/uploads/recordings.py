@@ -11,12 +11,13 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.ingest import copies, repository, wording
-from app.ingest.models import UploadFile
 from app.platform.web.schemas import sensible_time
 from app.settings import get_settings
 from app.study import repository as study
-from app.study.models import Device, Participant, Recording, Trace
 from app.study.traces import pack
+from app.tables.participants import Participant
+from app.tables.recordings import Device, Recording, Trace
+from app.tables.uploads import UploadFile
 from ml.formats.recording import DECODE_VERSION, RecordingLog, TraceLog
 from ml.formats.redaction_record import pseudonym
 

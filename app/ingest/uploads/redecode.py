@@ -14,7 +14,6 @@ import structlog
 from sqlalchemy.orm import Session
 
 from app.ingest import repository
-from app.ingest.models import UploadFile
 from app.ingest.sessions import in_milliamperes
 from app.ingest.stated_beta import name_beta
 from app.ingest.uploads import outcomes as outcomes_intake
@@ -27,9 +26,12 @@ from app.platform.database import transaction
 from app.platform.errors import NotFound
 from app.platform.jobs.children.child import places
 from app.study import repository as study
-from app.study.models import Participant, Recording, StudySession, Trace
 from app.study.outcomes import repository as outcomes
 from app.study.traces import AMPLITUDE_STREAM, unpack
+from app.tables.participants import Participant
+from app.tables.recordings import Recording, Trace
+from app.tables.sessions import StudySession
+from app.tables.uploads import UploadFile
 from ml.formats.recording import DECODE_VERSION, DecodedFile, RecordingLog, UndecodableFile
 
 log = structlog.get_logger()

@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from app.ingest import wording
-from app.ingest.models import PREVIEW, UploadFile
+from app.tables.uploads import PREVIEW, UploadFile
 from ml.formats.recording import FileReport, Problem
 from ml.formats.redaction_record import Redaction
 

@@ -13,9 +13,7 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.ingest import repository, sessions, wording
-from app.ingest.models import Upload, UploadFile
 from app.ingest.proposals import making
-from app.ingest.repository import GRASP_KIND
 from app.ingest.sessions import StatedSession
 from app.ingest.stated_beta import BetaStated
 from app.ingest.uploads import outcomes as outcomes_intake
@@ -30,8 +28,10 @@ from app.platform.jobs.children.child import places
 from app.platform.web.schemas import sensible_time
 from app.study import repository as study
 from app.study import service as study_service
-from app.study.models import Controller, Hemisphere, Participant, StudySession
 from app.study.visits.service import require_unlocked
+from app.tables.participants import Hemisphere, Participant
+from app.tables.sessions import Controller, StudySession
+from app.tables.uploads import Upload, UploadFile
 from ml.formats.options import BetaMeasure, DecodeOptions
 from ml.formats.recording import FileReport, Problem, UndecodableFile
 
@@ -327,7 +327,7 @@ def attach_grasps_of(db: Session, outcome: UploadOutcome, stated: StatedSession)
     if target is None and len(outcome.session_ids) == 1:
         target = db.get_one(StudySession, outcome.session_ids[0])
     for file in outcome.files:
-        if file.row.kind != GRASP_KIND or file.row.status != "decoded":
+        if file.row.kind != repository.GRASP_KIND or file.row.status != "decoded":
             continue
         if file.row.session_id is not None:
             file.session_ids = [file.row.session_id]
@@ -354,7 +354,7 @@ def attach_grasps(db: Session, file: UploadFile, session: StudySession) -> list[
     Raises:
         Invalid: no grasp file, or another participant's session. Conflict: it belongs to a session already.
     """
-    if file.kind != GRASP_KIND or file.status != "decoded" or file.stored_sha256 is None:
+    if file.kind != repository.GRASP_KIND or file.status != "decoded" or file.stored_sha256 is None:
         raise Invalid(f"File {file.id} is no decoded grasp test.", "Choose a grasp file that waits for its session.")
     if file.session_id is not None and file.session_id != session.id:
         raise Conflict(f"File {file.id} belongs to session {file.session_id} already.", "Correct the session's outcomes by hand.")

@@ -17,12 +17,13 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
 from app.learning import repository
-from app.learning.models import BufferGateDecision, GateChoice
 from app.platform.database import set_reason
 from app.platform.errors import Invalid
 from app.study import blinding
 from app.study import service as study
-from app.study.models import Controller, Participant, StudySession
+from app.tables.learning import BufferGateDecision, GateChoice
+from app.tables.participants import Participant
+from app.tables.sessions import Controller, StudySession
 from ml.outcomes import OUTCOMES, Outcome
 from ml.statistics.multiplicity import holm
 from ml.statistics.ranksum import p_greater

@@ -15,9 +15,9 @@ from sqlalchemy.orm import Session
 
 from app import __version__
 from app.learning import repository
-from app.learning.models import BufferSnapshot, Policy
 from app.platform import files
-from app.study.models import Participant
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.participants import Participant
 from ml.policies.from_buffer import proportional_from_buffer
 from ml.policies.policy import ProportionalPolicy
 from ml.trajectories import ReplayBuffer

@@ -12,13 +12,13 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import repository
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.snapshots.buffers import read_buffer
 from app.platform import files
 from app.platform.errors import Conflict, Invalid
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.models import Participant
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.participants import Participant
 from ml.policies.onnx_policy import OnnxPolicy, PolicyFileError
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 

@@ -23,8 +23,8 @@ from app.platform.web.forms import field_notes, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
-from app.study.models import Participant
 from app.study.service import may
+from app.tables.participants import Participant
 
 router = APIRouter()
 

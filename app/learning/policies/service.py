@@ -15,7 +15,6 @@ from app import __version__
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import repository
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies import foreign
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.training.results import POLICY
@@ -25,7 +24,8 @@ from app.platform.errors import Conflict, Invalid
 from app.platform.jobs.service import code_version
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.models import Participant, SettingsVersion
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.participants import Participant, SettingsVersion
 from ml.policies.onnx_policy import MAX_FILE_BYTES, OnnxPolicy, PolicyFileError
 
 BUNDLE_TEST_WINDOWS = 64

@@ -13,7 +13,7 @@ from app.learning.snapshots import service as snapshots
 from app.platform.database import Db
 from app.platform.web.schemas import Page, PagingQuery, problems
 from app.study.deps import CurrentParticipant
-from app.study.models import Participant
+from app.tables.participants import Participant
 
 router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
 

@@ -10,13 +10,13 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.learning.models import BufferSnapshot
 from app.learning.snapshots.buffers import read_buffer
 from app.platform.web.charts import ACCENT, CONTROLLERS, WARN, Chart, axis, counted, figure
 from app.platform.web.numbers import stated
 from app.study import blinding
 from app.study import repository as study_repository
-from app.study.models import StudySession
+from app.tables.learning import BufferSnapshot
+from app.tables.sessions import StudySession
 from ml.mdp import AMPLITUDE_TOLERANCE
 from ml.trajectories import ReplayBuffer
 

@@ -22,7 +22,6 @@ from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
 from app.learning import repository, wording
 from app.learning.gate.service import LEARNED, Gate, gate
-from app.learning.models import BufferSnapshot, SnapshotSession
 from app.learning.snapshots.trajectories import trajectory_of
 from app.platform import files
 from app.platform.errors import Invalid
@@ -30,15 +29,16 @@ from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.characteristics.models import CharacteristicsVersion
 from app.study.doses.since import hours_since_dose
-from app.study.models import Hemisphere, Participant, SettingsVersion, StudySession
 from app.study.sessions import repository as session_repository
 from app.study.sessions.data import failed_qoc_of, session_data
 from app.study.sessions.programming import Program, differences, stored
 from app.study.sessions.repeated import counts_elsewhere
 from app.study.threshold import mdp_settings, suggest_xi_beta
 from app.study.traces import StepTable, TracesOf, traces_of
+from app.tables.learning import BufferSnapshot, SnapshotSession
+from app.tables.participants import CharacteristicsVersion, Hemisphere, Participant, SettingsVersion
+from app.tables.sessions import StudySession
 from ml.mdp import MdpSettings
 from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet

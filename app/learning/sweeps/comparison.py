@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from app.learning.models import Policy, Sweep
 from app.platform.web.charts import Chart, axis, counted, figure
+from app.tables.learning import Policy, Sweep
 from ml.ope.compare.selection import surest
 from ml.policies.logged_range import LARGEST_SHARE_BELOW
 from ml.returns import Gain

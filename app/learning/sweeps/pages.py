@@ -11,7 +11,7 @@ from app.learning.schemas import ALGORITHM_NAMES
 from app.learning.sweeps import comparison, parallel
 from app.platform.database import Db
 from app.platform.web.templates import render
-from app.study.models import Participant
+from app.tables.participants import Participant
 
 router = APIRouter()
 

@@ -9,12 +9,12 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.learning import repository
-from app.learning.models import BufferSnapshot, Policy, Sweep
 from app.learning.policies.service import free_name
 from app.learning.training.results import CLONE, policy_file, training_file
 from app.platform import files
 from app.platform.jobs.service import code_version
 from app.study import repository as study_repository
+from app.tables.learning import BufferSnapshot, Policy, Sweep
 
 Group = dict[str, Any]
 """Policies trained side by side in one child process: `key`, `algorithm`, `configs`, `start` (None from scratch)."""

@@ -19,7 +19,6 @@ from app.analysis.tables import csv_of
 from app.evaluation import wording
 from app.evaluation.estimates.coverage import coverage_by_policy
 from app.evaluation.estimates.rows import estimate_of
-from app.learning.models import Policy
 from app.overview import repository
 from app.overview.package.dictionary import FIELDS, TITLES, Days, descriptor
 from app.platform.audit import record
@@ -27,11 +26,13 @@ from app.platform.errors import BetaloopError
 from app.study import blinding, service
 from app.study import repository as study
 from app.study.characteristics.schemas import CharacteristicsOut
-from app.study.doses.drugs import Drug, levodopa_equivalent_mg
+from app.study.doses.drugs import levodopa_equivalent_mg
 from app.study.doses.since import hours_since_dose
-from app.study.models import Participant
 from app.study.sessions.data import session_data
 from app.study.settings.schemas import SettingsOut
+from app.tables.learning import Policy
+from app.tables.participants import Participant
+from app.tables.visits import Drug
 from ml.outcomes import BY_KEY, OUTCOMES, Outcome
 from ml.qoc import Margins
 from ml.statistics.within_visits.contrasts import Average

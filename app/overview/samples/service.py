@@ -23,8 +23,9 @@ from app.platform.jobs.children.child import ChildLimits
 from app.platform.jobs.children.limited import ChildEnded, run_limited
 from app.settings import get_settings
 from app.study import blinding
-from app.study.models import Recording, StudySession
 from app.study.traces import recorded_traces, session_offset_s
+from app.tables.recordings import Recording
+from app.tables.sessions import StudySession
 from ml.outcomes import OUTCOMES
 
 WRITE = "app.overview.samples.compute:write"

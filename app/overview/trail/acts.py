@@ -13,11 +13,11 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.overview.trail import repository
 from app.overview.trail.words import headline, sentence
-from app.planning.plans.models import Plan
-from app.platform.audit import AuditEvent
 from app.platform.errors import Forbidden, NotFound
 from app.study import blinding
 from app.study import repository as study
+from app.tables.audit import AuditEvent
+from app.tables.plans import Plan
 
 _ARM_COLUMNS = ("controller", "policy_id")
 _HIDDEN = "hidden from you"

@@ -13,11 +13,13 @@ from sqlalchemy.orm import QueryableAttribute, Session
 from app.overview.trail.names import Names
 from app.overview.trail.schemas import ACTION_WORDS, KINDS, SHOWN_NAMES, TrailFilter
 from app.overview.trail.scope.repository import of_participants
-from app.planning.bundles.models import BundleRelease
-from app.planning.plans.models import SEALED, Plan, PlanItem
-from app.platform.audit import AUDITED, AuditEvent
+from app.platform.audit import AUDITED
 from app.platform.database import Base
-from app.study.models import Participant, StudySession, Visit
+from app.tables.audit import AuditEvent
+from app.tables.participants import Participant
+from app.tables.plans import SEALED, BundleRelease, Plan, PlanItem
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 
 _BATCH = 500
 _SEALED_BY = {"session": "visit_id", "plan_item": "plan_id", "session_proposal": "session_id", "session_conditions": "session_id",

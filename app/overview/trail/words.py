@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from app.overview.trail.changes import SAID
 from app.overview.trail.names import Names
-from app.platform.audit import AuditEvent
+from app.tables.audit import AuditEvent
 
 SEALED_ACT = "took the bundle of a session of a blinded plan"
 _ORDER = list(SAID)

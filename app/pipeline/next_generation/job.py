@@ -7,7 +7,6 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.evaluation.estimates import dose_shapes
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.training.configs import generation_groups
 from app.pipeline.distillation import declare_distillation, distil_all
 from app.pipeline.evaluation import declare_evaluation, declare_fit, evaluate_all, fit_calls, store_members
@@ -18,6 +17,7 @@ from app.pipeline.training import declare_training, store_trained, tested_so_far
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext, JobError
 from app.study.repository import settings_version
+from app.tables.learning import BufferSnapshot, Policy
 from ml.ope.registry import POSTERIOR, shown
 
 CHOOSE = "choose-parents"

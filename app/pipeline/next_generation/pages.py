@@ -19,7 +19,7 @@ from app.platform.jobs import service as job_service
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant, ResultsViewed
-from app.study.models import Participant
+from app.tables.participants import Participant
 
 router = APIRouter()
 

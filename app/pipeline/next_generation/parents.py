@@ -10,15 +10,15 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.evaluation import repository as evaluation
 from app.evaluation.estimates.rows import estimate_of
-from app.evaluation.models import Evaluation
 from app.learning import repository as learning
-from app.learning.models import Policy
 from app.learning.policies.service import window_of
 from app.study import repository as study
 from app.study.adverse_events.repository import events_of_participant
 from app.study.adverse_events.service import blocked_policies
 from app.study.blinding import arm
-from app.study.models import Participant
+from app.tables.evaluations import Evaluation
+from app.tables.learning import Policy
+from app.tables.participants import Participant
 from ml.ope.registry import POSTERIOR
 
 TRAINABLE = ("trained", "distilled")

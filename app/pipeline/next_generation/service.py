@@ -10,16 +10,16 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation import repository as evaluation
-from app.evaluation.models import Evaluation
 from app.evaluation.ranking.staleness import stale_reasons
 from app.learning import repository as learning
 from app.pipeline import service as pipeline
 from app.pipeline.next_generation.parents import Tested, best, posterior_of, tested_policies
 from app.pipeline.params import NEXT_GENERATION, NextGenerationParams
 from app.platform.jobs import repository as jobs
-from app.platform.jobs.models import Job, JobStatus
 from app.study import service as study
-from app.study.models import Participant
+from app.tables.evaluations import Evaluation
+from app.tables.jobs import Job, JobStatus
+from app.tables.participants import Participant
 
 
 @dataclass(frozen=True)

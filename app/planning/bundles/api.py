@@ -14,7 +14,7 @@ from app.planning.bundles import slots
 from app.platform.database import Db
 from app.platform.web.schemas import problems
 from app.study.deps import CurrentVisit
-from app.study.models import Hemisphere, Participant
+from app.tables.participants import Hemisphere, Participant
 
 router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
 

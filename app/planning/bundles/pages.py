@@ -15,7 +15,6 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning.deps import CurrentOwnPolicy
-from app.learning.models import Policy
 from app.planning import wording
 from app.planning.bundles import repository, slots
 from app.planning.bundles import service as bundles
@@ -30,8 +29,9 @@ from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.settings import get_settings
 from app.study.deps import CurrentParticipant, CurrentVisit, ResultsViewed
-from app.study.models import Hemisphere, Participant
 from app.study.service import may
+from app.tables.learning import Policy
+from app.tables.participants import Hemisphere, Participant
 from ml.deploy.wording import battery_life_words, energy_words, warning_sentences
 
 router = APIRouter()

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from sqlalchemy import or_, select, text
 from sqlalchemy.orm import Session, selectinload
 
-from app.learning.models import Policy
-from app.planning.bundles.models import BundleRelease
-from app.planning.plans.models import SEALED, Plan, PlanItem
-from app.study.models import Visit
+from app.tables.learning import Policy
+from app.tables.plans import SEALED, BundleRelease, Plan, PlanItem
+from app.tables.visits import Visit
 
 
 def releases(db: Session, policy_id: int) -> Sequence[BundleRelease]:

@@ -19,13 +19,11 @@ from app import __version__
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import repository as learning
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies import foreign
 from app.learning.policies.service import onnx_of, probe_windows
 from app.learning.snapshots.buffers import read_buffer
 from app.planning import wording
 from app.planning.bundles import repository
-from app.planning.bundles.models import BundleRelease
 from app.planning.grounds import events_against, unanswered
 from app.planning.plans.limits import DeviceLimits, device_limits
 from app.platform import files
@@ -35,7 +33,9 @@ from app.settings import get_settings
 from app.study import cdbs_amplitude
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.models import Hemisphere, Participant
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.participants import Hemisphere, Participant
+from app.tables.plans import BundleRelease
 from ml.deploy.appraisal import plausible_beta
 from ml.deploy.bundle import build_bundle, describe, sign
 from ml.deploy.manifest import Approval, BundleError, BundleManifest

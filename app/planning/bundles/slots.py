@@ -18,16 +18,18 @@ from app.planning.grounds import events_against, unanswered
 from app.planning.plans.designs import Planned, seed_of
 from app.planning.plans.key import common_limits
 from app.planning.plans.limits import device_limits
-from app.planning.plans.models import PlanItem
 from app.planning.plans.view import PlanLine, PlanView, read_plan, refuse_running, shown
 from app.planning.plans.visits import today
 from app.planning.sheet.content import BUNDLE, card_of
 from app.platform import files
 from app.platform.errors import Conflict, Invalid, NotFound
-from app.platform.signatures.models import Signature
 from app.study import service as study
 from app.study.adverse_events.repository import with_serious_events
-from app.study.models import Controller, Hemisphere, Visit
+from app.tables.audit import Signature
+from app.tables.participants import Hemisphere
+from app.tables.plans import PlanItem
+from app.tables.sessions import Controller
+from app.tables.visits import Visit
 from ml.deploy.blinding import Common, blind, room_for
 from ml.deploy.bundle import build_scheduled_bundle, sign
 from ml.deploy.manifest import Approval, BundleError, BundleManifest, PlanCard

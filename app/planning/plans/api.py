@@ -12,7 +12,6 @@ from app.evaluation.shown import estimate_out
 from app.planning import wording
 from app.planning.bundles.repository import releases_of_slots
 from app.planning.plans import key, service, visits
-from app.planning.plans.models import Plan
 from app.planning.plans.schemas import (
     Approval,
     KeyOpening,
@@ -35,6 +34,7 @@ from app.platform.database import Db, now
 from app.platform.signatures.schemas import SignatureOut
 from app.platform.web.schemas import problems
 from app.study.deps import CurrentVisit, VisitViewed
+from app.tables.plans import Plan
 
 router = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 422))
 

@@ -11,15 +11,23 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.planning.plans.models import NEAR
 from app.platform.errors import Invalid
 from app.study.cdbs_amplitude import held_settings, plausible
-from app.study.models import SettingsVersion, Visit
+from app.tables.participants import SettingsVersion
+from app.tables.plans import PlanItem
+from app.tables.visits import Visit
 from ml.designs import LOW_AMPLITUDE, Decision, DesignedSession, DesignSettings, amplitudes, lay_out, near_session
 
 RESOLUTION_MA: Final = 0.1
 """What a stimulator rounds amplitudes to."""
 MAX_SEED: Final = 2**31 - 1
+NEAR: Final = "near"
+"""The design of a session that stays near a stated amplitude."""
+
+
+def is_held(item: PlanItem) -> bool:
+    """Return True for a session that stays near a stated amplitude."""
+    return item.design is not None and item.design["design"] == NEAR
 
 
 @dataclass(frozen=True)

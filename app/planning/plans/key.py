@@ -10,11 +10,11 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.planning.plans.models import Plan, PlanItem
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import service as study
-from app.study.models import Visit
+from app.tables.plans import Plan, PlanItem
+from app.tables.visits import Visit
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from sqlalchemy.orm import Session
 
 from app.planning.plans import repository
-from app.planning.plans.models import PlanItem
 from app.platform.errors import Conflict, Invalid
 from app.study import cdbs_amplitude
-from app.study.models import Controller, Hemisphere, Participant, Visit
+from app.tables.participants import Hemisphere, Participant
+from app.tables.plans import PlanItem
+from app.tables.sessions import Controller
+from app.tables.visits import Visit
 
 _TOLERANCE_MA = 1e-6
 _ROUNDING_MA = 0.01

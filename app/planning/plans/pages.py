@@ -28,8 +28,10 @@ from app.platform.web.forms import FormValues, field_notes, parse, renamed
 from app.platform.web.schemas import Int, Model, PagingQuery
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant, CurrentVisit, VisitViewed
-from app.study.models import Controller, Participant, Visit
 from app.study.service import may, require
+from app.tables.participants import Participant
+from app.tables.sessions import Controller
+from app.tables.visits import Visit
 
 router = APIRouter()
 

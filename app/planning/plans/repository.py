@@ -8,14 +8,16 @@ from datetime import date
 from sqlalchemy import distinct, exists, func, or_, select
 from sqlalchemy.orm import Session, selectinload
 
-from app.evaluation.models import Evaluation
-from app.planning.plans.models import Plan, PlanItem
 from app.platform.database import now
-from app.study.adverse_events.models import AdverseEvent
-from app.study.data_queries.models import DataQuery
-from app.study.doses.models import Dose
-from app.study.models import Hemisphere, Recording, StudySession, Visit, VisitLock
 from app.study.repository import CONFIRMED, count
+from app.tables.adverse_events import AdverseEvent
+from app.tables.data_queries import DataQuery
+from app.tables.evaluations import Evaluation
+from app.tables.participants import Hemisphere
+from app.tables.plans import Plan, PlanItem
+from app.tables.recordings import Recording
+from app.tables.sessions import StudySession
+from app.tables.visits import Dose, Visit, VisitLock
 
 
 def live_plan(db: Session, visit_id: int) -> Plan | None:

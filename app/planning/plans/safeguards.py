@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from app.evaluation import verdict_wording
 from app.evaluation.ranking.decisions import Decided
-from app.learning.models import Policy
 from app.planning.grounds import Grounds
 from app.platform.errors import Conflict, Forbidden, Invalid
+from app.tables.learning import Policy
 
 ROUNDING = 1e-9
 

@@ -13,7 +13,8 @@ from app.planning.notices import Code
 from app.planning.protocol.session_order import Order
 from app.platform.signatures.schemas import SignatureOut, Signing
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
-from app.study.models import Controller, Hemisphere
+from app.tables.participants import Hemisphere
+from app.tables.sessions import Controller
 from ml.designs import SessionDesign
 from ml.ope.posterior.further_sessions import MOST_HELD
 

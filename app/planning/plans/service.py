@@ -13,15 +13,12 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation import repository as evaluations
-from app.evaluation.models import Evaluation
 from app.learning import repository as learning
-from app.learning.models import Policy
 from app.planning.grounds import grounds
 from app.planning.plans import repository
-from app.planning.plans.designs import Planned, bounds_of, near_sessions, planned_sessions, seed_of
+from app.planning.plans.designs import Planned, bounds_of, is_held, near_sessions, planned_sessions, seed_of
 from app.planning.plans.key import label_sessions, sealed
 from app.planning.plans.limits import StatedLimits, lowest_draw, planned_cdbs_ma, require_limits, set_limits
-from app.planning.plans.models import Plan, PlanItem, is_held
 from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
 from app.planning.plans.schemas import HeldIn, Move, PlanIn, PlanOptions
 from app.planning.plans.sign_off import sign_plan
@@ -33,8 +30,13 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.platform.signatures.service import SignatureState
 from app.study import service as study
-from app.study.models import Controller, Hemisphere, Participant, Visit
 from app.study.sessions.logged import CONTROLLER_OF_KIND
+from app.tables.evaluations import Evaluation
+from app.tables.learning import Policy
+from app.tables.participants import Hemisphere, Participant
+from app.tables.plans import Plan, PlanItem
+from app.tables.sessions import Controller
+from app.tables.visits import Visit
 
 MAX_SEED = 2**31 - 1
 

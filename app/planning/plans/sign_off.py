@@ -9,13 +9,13 @@ from sqlalchemy.orm import Session
 
 from app.accounts import signing
 from app.accounts.permissions import Caller
-from app.learning.models import Policy
-from app.planning.plans.models import Plan, PlanItem
 from app.platform.errors import Conflict, Forbidden
 from app.platform.signatures import repository, service
-from app.platform.signatures.models import Signature
 from app.platform.signatures.service import SignatureState
-from app.study.models import Visit
+from app.tables.audit import Signature
+from app.tables.learning import Policy
+from app.tables.plans import Plan, PlanItem
+from app.tables.visits import Visit
 
 KIND: Final = "plan"
 MEANING: Final = "approved for use in this participant"

@@ -12,29 +12,31 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation import repository as evaluations
 from app.evaluation import wording
-from app.evaluation.models import Evaluation
 from app.evaluation.ranking.answer import Row
 from app.evaluation.ranking.judged import Judged, judged
 from app.evaluation.ranking.service import evaluation_notes
 from app.evaluation.ranking.staleness import stale_reasons
-from app.learning.models import Policy
 from app.planning.grounds import Events, events_against, unanswered
 from app.planning.notices import Code, PlanWarning, without_policies
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of
 from app.planning.plans.key import CommonLimits, common_limits, sealed
 from app.planning.plans.limits import require_limits
-from app.planning.plans.models import Plan, PlanItem
 from app.planning.plans.sign_off import signature_of
 from app.planning.plans.visits import today
 from app.planning.protocol.medication import due_before
 from app.planning.wording import ANSWER_EVENT, happened
 from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
-from app.platform.signatures.models import Signature
 from app.platform.signatures.service import SignatureState
 from app.study import service as study
 from app.study.characteristics.service import fields_of
-from app.study.models import Controller, Participant, Visit
+from app.tables.audit import Signature
+from app.tables.evaluations import Evaluation
+from app.tables.learning import Policy
+from app.tables.participants import Participant
+from app.tables.plans import Plan, PlanItem
+from app.tables.sessions import Controller
+from app.tables.visits import Visit
 from ml.ope.estimate import Estimate
 
 

@@ -12,9 +12,10 @@ from app.planning.plans import repository
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import service as study
-from app.study.models import Participant, Visit
 from app.study.schemas import VisitIn
 from app.study.visits.service import require_unlocked
+from app.tables.participants import Participant
+from app.tables.visits import Visit
 
 _LAST_ZONE = timedelta(hours=-12)
 """Offset from UTC of the place where a day ends last."""

@@ -6,14 +6,14 @@ from fastapi import APIRouter
 
 from app.accounts.deps import CurrentCaller
 from app.learning.deps import CurrentPolicy
-from app.learning.models import Policy
 from app.planning.bundles.service import Limits
 from app.planning.releases import service
 from app.planning.releases.schemas import PolicyReleaseIn, PolicyReleaseLimits, PolicyReleaseOut
 from app.platform.database import Db
 from app.platform.signatures.schemas import SignatureOut
 from app.platform.web.schemas import problems
-from app.study.models import Participant
+from app.tables.learning import Policy
+from app.tables.participants import Participant
 
 router = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 422))
 

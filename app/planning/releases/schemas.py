@@ -9,7 +9,7 @@ from pydantic import Field
 from app.platform.signatures.schemas import SignatureOut, Signing
 from app.platform.signatures.service import SignatureState
 from app.platform.web.schemas import Model, Number
-from app.study.models import Hemisphere
+from app.tables.participants import Hemisphere
 
 Milliamperes = Annotated[Number, Field(ge=0, le=25.5)]
 

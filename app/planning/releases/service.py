@@ -11,18 +11,18 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts import signing
 from app.accounts.permissions import Caller
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies.service import onnx_of
 from app.planning.bundles import service as bundles
-from app.planning.plans.models import PlanItem
 from app.platform.errors import Conflict, Forbidden
 from app.platform.signatures import repository as signatures
-from app.platform.signatures.models import Signature
 from app.platform.signatures.service import SignatureState, state_of
 from app.settings import get_settings
 from app.study import repository as study_repository
 from app.study import service as study
-from app.study.models import Hemisphere, Participant
+from app.tables.audit import Signature
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.participants import Hemisphere, Participant
+from app.tables.plans import PlanItem
 
 KIND: Final = "policy"
 MEANING: Final = "released for testing in participants"

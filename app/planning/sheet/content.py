@@ -8,7 +8,7 @@ from app.evaluation.verdict_wording import STANDING_NAMES, effect, likely, plain
 from app.planning import wording
 from app.planning.plans.view import PlanLine, PlanView
 from app.planning.sheet.ink import clock, printed_name, printed_warning, shade
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.outcomes import OUTCOMES
 
 BUNDLE = "Bundle"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from datetime import datetime, time, timedelta
 
-from app.learning.models import Policy
 from app.planning.plans.view import PlanLine
 from app.planning.sheet.latin1_text import latin
-from app.study.models import Controller
+from app.tables.learning import Policy
+from app.tables.sessions import Controller
 
 INK, MUTED, LINE = (20, 30, 38), (95, 108, 118), (150, 160, 168)
 _PLANNED = (246, 248, 250)

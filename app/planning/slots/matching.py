@@ -14,7 +14,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from app.study.models import Controller
+from app.tables.sessions import Controller
 
 FAR = timedelta(minutes=60)
 """A session that began further than this from what the clinic day entered for a slot is another one."""

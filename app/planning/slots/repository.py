@@ -9,8 +9,9 @@ from datetime import date
 from sqlalchemy import false, func, select
 from sqlalchemy.orm import Session
 
-from app.planning.plans.models import Plan, PlanItem
-from app.study.models import StudySession, Visit, VisitLock
+from app.tables.plans import Plan, PlanItem
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit, VisitLock
 
 
 def sessions_of_day(db: Session, visit_id: int) -> Sequence[StudySession]:

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from app.planning.slots.matching import Deviation
 from app.platform.web.schemas import Bool, Model
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.outcomes import FIELDS
 
 

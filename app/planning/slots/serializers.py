@@ -6,7 +6,7 @@ from app.planning import wording
 from app.planning.plans.view import shown
 from app.planning.slots.schemas import SlotRowOut, VisitComparisonOut
 from app.planning.slots.service import Comparison, Row
-from app.study.models import Controller
+from app.tables.sessions import Controller
 
 
 def comparison_out(found: Comparison) -> VisitComparisonOut:

@@ -10,7 +10,6 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
 from app.ingest import repository as ingest
-from app.ingest.models import SessionProposal
 from app.ingest.proposals import service as proposals
 from app.ingest.schemas import ProposalChange
 from app.planning import wording
@@ -24,11 +23,13 @@ from app.planning.visit_day.session_outcomes import take_outcomes
 from app.platform.errors import BetaloopError, Conflict
 from app.study import service as study
 from app.study.blinding import require_known, stated_arm
-from app.study.models import Controller, StudySession, Visit
 from app.study.sessions import logged
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.data import session_data
 from app.study.visits.service import require_unlocked
+from app.tables.sessions import Controller, StudySession
+from app.tables.uploads import SessionProposal
+from app.tables.visits import Visit
 from ml.outcomes import FIELDS
 
 QUANTITIES = ("energy", *FIELDS)

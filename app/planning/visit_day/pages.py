@@ -42,8 +42,8 @@ from app.platform.web.forms import FormValues, field_notes, parse, renamed
 from app.platform.web.schemas import Model
 from app.platform.web.templates import STATIC, render
 from app.study.deps import CurrentVisit, VisitViewed
-from app.study.models import Visit
 from app.study.wording import DRUG_NAMES, EVENT_KINDS
+from app.tables.visits import Visit
 
 router = APIRouter()
 

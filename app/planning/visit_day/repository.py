@@ -8,10 +8,9 @@ from collections.abc import Collection, Sequence
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.planning.plans.models import Plan, PlanItem
-from app.planning.visit_day.models import DayEntry
 from app.planning.visit_day.record import SlotTimes, times_of
 from app.study.repository import count
+from app.tables.plans import DayEntry, Plan, PlanItem
 
 
 def entries(db: Session, plan_id: int) -> Sequence[DayEntry]:

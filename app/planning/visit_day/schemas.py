@@ -11,9 +11,9 @@ from uuid import UUID
 from pydantic import AfterValidator, Field, Strict, model_validator
 
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
-from app.study.adverse_events.models import EventKind
 from app.study.characteristics.schemas import PlannedDose
-from app.study.doses.drugs import Drug
+from app.tables.adverse_events import EventKind
+from app.tables.visits import Drug
 
 MOST_TAPS = 200
 _LONGEST_OFFSET_MS = 10**13  # a tablet whose battery was empty may wake in 1970, and what it holds must be taken all the same

@@ -7,15 +7,15 @@ from app.accounts.permissions import Caller
 from app.planning import wording
 from app.planning.plans.designs import Planned
 from app.planning.plans.key import common_limits, sealed
-from app.planning.plans.models import PlanItem
 from app.planning.visit_day.schemas import DayDoseOut, DayOut, EntryOut, LimitsOut, SlotOut
 from app.planning.visit_day.service import Day
 from app.platform.database import now
 from app.study import service as study
 from app.study.blinding import CONTROLLER_NAMES, may_know
 from app.study.characteristics.service import fields_of
-from app.study.models import Controller
 from app.study.service import may
+from app.tables.plans import PlanItem
+from app.tables.sessions import Controller
 
 
 def day_out(day: Day, caller: Caller) -> DayOut:

@@ -14,13 +14,10 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation import repository as evaluations
-from app.learning.models import Policy
 from app.planning import wording
 from app.planning.plans import repository as plans
-from app.planning.plans.models import Plan, PlanItem
 from app.planning.plans.view import read_plan, refuse_running
 from app.planning.visit_day import repository
-from app.planning.visit_day.models import DayEntry
 from app.planning.visit_day.record import GRADED, SEVERE, moment
 from app.planning.visit_day.schemas import AdverseEventPayload, DosePayload, EntryIn, EntryResult, NotePayload
 from app.planning.visit_day.screening import screen
@@ -32,8 +29,10 @@ from app.study.adverse_events.schemas import AdverseEventIn
 from app.study.adverse_events.service import add_adverse_event
 from app.study.doses import service as doses
 from app.study.doses.schemas import DoseIn
-from app.study.models import Visit
 from app.study.visits.service import require_unlocked
+from app.tables.learning import Policy
+from app.tables.plans import DayEntry, Plan, PlanItem
+from app.tables.visits import Visit
 
 _KEY = "visit-day"
 FIRST_YEAR = 1990

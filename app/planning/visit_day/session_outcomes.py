@@ -9,13 +9,13 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.planning import wording
 from app.planning.visit_day import repository
-from app.planning.visit_day.models import DayEntry
 from app.planning.visit_day.record import GRADED, MILD, SlotOutcome, SlotTimes, last_attempt, outcomes_of, standing, times_of
 from app.study.adverse_events.schemas import AdverseEventIn
 from app.study.adverse_events.service import add_adverse_event
-from app.study.models import StudySession
 from app.study.schemas import QocIn, SessionChange
 from app.study.service import change_session, record_qoc
+from app.tables.plans import DayEntry
+from app.tables.sessions import StudySession
 
 
 def take_outcomes(db: Session, session: StudySession, caller: Caller) -> list[str]:

@@ -13,8 +13,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.platform.audit.breaks import Break
-from app.platform.audit.trail import AuditEvent, record
+from app.platform.audit.trail import record
 from app.platform.database import set_reason
+from app.tables.audit import AuditEvent
 
 ACCEPT, ENTITY = "accept", "audit_event"
 

@@ -15,53 +15,28 @@ import os
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from itertools import islice
 from pathlib import Path
 
 import structlog
-from sqlalchemy import BigInteger, LargeBinary, func, select, text
+from sqlalchemy import select, text
 from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.exc import SQLAlchemyError
-from sqlalchemy.orm import Mapped, Session, mapped_column
+from sqlalchemy.orm import Session
 
 from app.platform.audit.accepted import Accepted, acceptances
 from app.platform.audit.breaks import MOST_BREAKS, Break, BreakKind
 from app.platform.audit.guards import what_writes
 from app.platform.audit.rows import past_the_trail
-from app.platform.database import Base, transaction
+from app.platform.database import transaction
 from app.platform.signatures.service import changed_records
 from app.settings import get_settings, private_folder
+from app.tables.audit import GENESIS, AuditLink, AuditSeal
 
-GENESIS = hashlib.sha256(b"betaloop audit trail").digest()
 SECRET = "audit-seals"  # noqa: S105 - the name of a key
 SEAL_EVERY_S = 60.0
 _A_DAY_US = 86_400_000_000
 """How far the times of links may go back, microseconds: a link is made when its transaction ends, and a transaction may last."""
-
-
-class AuditLink(Base):
-    """The place of a row of the trail in the chain. Insert only, and by the trigger alone.
-
-    There is no foreign key: a row that was removed from the trail must stay seen.
-    """
-
-    __tablename__ = "audit_link"
-
-    position: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
-    event_id: Mapped[int] = mapped_column(BigInteger, unique=True)
-    digest: Mapped[bytes] = mapped_column(LargeBinary)
-
-
-class AuditSeal(Base):
-    """The digest of the chain at a place, under the key of the installation. Insert only."""
-
-    __tablename__ = "audit_seal"
-
-    position: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
-    digest: Mapped[bytes] = mapped_column(LargeBinary)
-    mac: Mapped[bytes] = mapped_column(LargeBinary)
-    made_at: Mapped[datetime] = mapped_column(server_default=func.clock_timestamp())
 
 
 @dataclass(frozen=True)

@@ -7,33 +7,14 @@ the owner of the tables: the service's own role may read the trail, and nothing 
 from __future__ import annotations
 
 import json
-from datetime import datetime, timedelta
+from datetime import timedelta
 from typing import Any
 
-from sqlalchemy import BigInteger, Index, String, Text, func, select, text
-from sqlalchemy.orm import Mapped, Session, mapped_column
+from sqlalchemy import select, text
+from sqlalchemy.orm import Session
 
-from app.platform.database import Base, now, set_actor
-
-
-class AuditEvent(Base):
-    """One change of a row: who, when, from what to what, and why. Insert only: a trigger refuses updates and deletions."""
-
-    __tablename__ = "audit_event"
-    __table_args__ = (Index("ix_audit_event_entity", "entity", "entity_id"),)
-
-    id: Mapped[int] = mapped_column(BigInteger, primary_key=True)
-    at: Mapped[datetime] = mapped_column(server_default=func.clock_timestamp(), index=True)
-    actor: Mapped[str] = mapped_column(String(254))
-    user_id: Mapped[int | None]
-    request_id: Mapped[str | None] = mapped_column(String(64))
-    action: Mapped[str] = mapped_column(String(10))
-    entity: Mapped[str] = mapped_column(String(63))
-    entity_id: Mapped[str] = mapped_column(String(200))
-    before: Mapped[dict[str, Any] | None]
-    after: Mapped[dict[str, Any] | None]
-    reason: Mapped[str | None] = mapped_column(Text)
-
+from app.platform.database import now, set_actor
+from app.tables.audit import AuditEvent
 
 AUDITED: dict[str, tuple[str, ...]] = {
     "app_user": ("password_hash",),

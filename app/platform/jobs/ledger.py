@@ -24,7 +24,7 @@ from app.platform.jobs import repository
 from app.platform.jobs.children.supervisor import ChildMessages
 from app.platform.jobs.context import StepOutcome
 from app.platform.jobs.errors import JobCancelled
-from app.platform.jobs.models import Job, JobStatus, JobStep
+from app.tables.jobs import Job, JobStatus, JobStep
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session, selectinload
 
 from app.platform.database import now
 from app.platform.errors import NotFound
-from app.platform.jobs.models import Job, JobEvent, JobStatus, JobStep, Worker
+from app.tables.jobs import Job, JobEvent, JobStatus, JobStep, Worker
 
 LIVE = (JobStatus.QUEUED, JobStatus.RUNNING)
 ENDED = (JobStatus.SUCCEEDED, JobStatus.FAILED, JobStatus.CANCELLED)

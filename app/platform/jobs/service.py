@@ -16,8 +16,8 @@ from app import __version__
 from app.platform.database import now
 from app.platform.errors import Conflict, Invalid
 from app.platform.jobs import engine, registry, repository
-from app.platform.jobs.models import Job, JobEvent, JobStatus
 from app.platform.jobs.repository import events_after as events_after
+from app.tables.jobs import Job, JobEvent, JobStatus
 
 STALE_S = 60.0
 """A worker that is silent for longer is taken for dead."""

@@ -24,8 +24,8 @@ from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall
 from app.platform.jobs.context import JobContext, StepOutcome
 from app.platform.jobs.errors import JobCancelled, WorkerStopping
 from app.platform.jobs.ledger import Ledger, persist
-from app.platform.jobs.models import Job, JobStatus
 from app.settings import get_settings, private_folder
+from app.tables.jobs import Job, JobStatus
 
 log = logging.getLogger(__name__)
 

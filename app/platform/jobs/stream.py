@@ -13,10 +13,10 @@ from sqlalchemy.orm import Session
 
 from app.platform.database import new_session, now
 from app.platform.jobs import repository
-from app.platform.jobs.models import Job, JobEvent, JobStatus
 from app.platform.jobs.service import describe_event
-from app.platform.jobs.titles import plain_words, reason
+from app.platform.jobs.titles import plain_words, reason, state_in_words
 from app.platform.web.numbers import time_left
+from app.tables.jobs import Job, JobEvent, JobStatus
 
 POLL_S = 0.5
 KEEP_ALIVE_S = 15.0
@@ -72,11 +72,18 @@ def describe(job: Job) -> dict[str, Any]:
         "status": str(job.status),
         "progress": job.progress,
         "time_left": time_left(job.seconds_left(now())),
-        "message": job.doing,
+        "message": state_in_words(job),
         "error": job.error,
         "result": job.result,
         "steps": [
-            {"key": s.key, "title": s.title, "status": str(s.status), "progress": s.progress, "message": s.doing, "weight": s.weight}
+            {
+                "key": s.key,
+                "title": s.title,
+                "status": str(s.status),
+                "progress": s.progress,
+                "message": state_in_words(s),
+                "weight": s.weight,
+            }
             for s in job.steps
         ],
     }

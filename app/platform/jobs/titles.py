@@ -9,6 +9,8 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+from app.tables.jobs import Job, JobStatus, JobStep
+
 _PLAIN: tuple[tuple[re.Pattern[str], str], ...] = tuple(
     (re.compile(stored), plain)
     for stored, plain in (
@@ -66,3 +68,16 @@ def failure(error: str, titles: Mapping[str, str] | None = None) -> str:
         return said
     title = (titles or {}).get(step["key"]) if step else None
     return f"A step failed: {title}." if title else "A step failed." if step else "It failed for a reason that is told to engineers."
+
+
+def state_in_words(work: Job | JobStep) -> str:
+    """Say what a job or a step does now, or why it failed, without names of methods.
+
+    Returns:
+        Words for a page; nothing where a step failed for a reason that engineers alone can read.
+    """
+    if work.status != JobStatus.FAILED:
+        return plain_words(work.message)
+    if isinstance(work, JobStep):
+        return reason(work.message)
+    return failure(work.message) if work.message else ""

@@ -14,8 +14,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from app.platform.database import new_session
 from app.platform.jobs import repository
-from app.platform.jobs.models import JobStatus
 from app.platform.jobs.stream import describe
+from app.tables.jobs import JobStatus
 
 POLL_S = 0.5
 

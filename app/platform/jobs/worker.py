@@ -17,10 +17,9 @@ from sqlalchemy.exc import DBAPIError
 from app.platform.database import database_url, get_engine, new_session, set_actor, transaction
 from app.platform.files import prune_copies_beside
 from app.platform.jobs import engine, repository
-from app.platform.jobs.models import JobStatus
 from app.platform.jobs.steps import JobRunner
-from app.platform.tables import load_tables
 from app.settings import get_settings
+from app.tables.jobs import JobStatus
 
 log = logging.getLogger(__name__)
 
@@ -198,7 +197,6 @@ def run_worker(slots: int, stop_event: threading.Event, pace: Pace | None = None
     Raises:
         IdentityLost: another process took this worker's name; its jobs are left alone.
     """
-    load_tables()
     pace = pace or Pace()
     identity = Identity()
     worker_id = identity.claim()

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.platform.signatures.models import Signature
+from app.tables.audit import Signature
 
 
 def signatures_of(db: Session, kind: str, subject_id: int) -> Sequence[Signature]:

@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.platform.signatures import repository
-from app.platform.signatures.models import Signature
+from app.tables.audit import Signature
 
 _EXACT = 2**53
 _RECORDED = ("id", "subject_kind", "subject_id", "meaning", "sha256", "signed_by", "signer")

@@ -16,13 +16,14 @@ from sqlalchemy.orm import Session
 from app.platform import files
 from app.platform.audit.chain import verify
 from app.platform.bucket import StoreAway, bucket
-from app.platform.database import Base, new_session, now
+from app.platform.database import new_session, now
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.service import STALE_S
 from app.platform.service_role import excess
-from app.platform.tables import load_tables
 from app.platform.web.charts import counted
 from app.settings import get_settings
+from app.tables import METADATA
+from app.tables.uploads import StoredFile
 
 ROOT = Path(__file__).resolve().parents[3]
 LEAST_FREE_MB = 1024
@@ -123,10 +124,9 @@ def _files(db: Session, hashes: bool) -> Finding:
 
 def _owners_of(db: Session, bad: list[str]) -> str:
     """List what names stored files, as tables and numbers: by these they can be looked up and sent again."""
-    load_tables()
     found = []
-    for table in Base.metadata.sorted_tables:
-        columns = [key.parent for key in table.foreign_keys if key.column.table.name == files.StoredFile.__tablename__]
+    for table in METADATA.sorted_tables:
+        columns = [key.parent for key in table.foreign_keys if key.column.table.name == StoredFile.__tablename__]
         if not columns:
             continue
         query = select(table.c.id).where(or_(*(column.in_(bad) for column in columns))).order_by(table.c.id)

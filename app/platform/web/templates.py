@@ -13,6 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from markupsafe import Markup
 
 from app.platform.database import now
+from app.platform.jobs.titles import state_in_words
 from app.platform.web.charts import counted, written
 from app.platform.web.numbers import fixed, minutes, number, p_text, place, rate, size, stated, time_left, typed, when, whole
 from app.settings import get_settings
@@ -86,6 +87,7 @@ _environment.filters.update(
     p=p_text,
     minutes=minutes,
     time_left=time_left,
+    state_in_words=state_in_words,
     size=size,
     when=when,
 )

@@ -8,9 +8,9 @@ from typing import Final
 
 from app.accounts import repository as accounts_repository
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.platform.database import transaction
 from app.settings import written_once
+from app.tables.accounts import Role
 
 ADMIN, CLINICIAN, ENGINEER = "admin@demo.example", "clinician@demo.example", "engineer@demo.example"
 ACCOUNTS: Final = {ADMIN: Role.ADMIN, CLINICIAN: Role.CLINICIAN, ENGINEER: Role.ENGINEER}

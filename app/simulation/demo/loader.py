@@ -255,10 +255,8 @@ def _left(job: dict[str, Any]) -> str:
 
 def main(url: str, state_path: Path) -> None:
     """Load what is missing and start the jobs that train, then end."""
-    from app.platform.tables import load_tables
     from app.simulation.demo.content import load
 
-    load_tables()
     load(url, state_path)
 
 

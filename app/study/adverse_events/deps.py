@@ -10,7 +10,7 @@ from app.accounts.deps import CurrentCaller
 from app.platform.database import Db
 from app.platform.web.schemas import RowId
 from app.study.adverse_events import repository
-from app.study.adverse_events.models import AdverseEvent
+from app.tables.adverse_events import AdverseEvent
 
 
 def current_event(event_id: RowId, db: Db, caller: CurrentCaller) -> AdverseEvent:

@@ -20,9 +20,9 @@ from app.study.adverse_events import repository, service
 from app.study.adverse_events.deps import CurrentEvent
 from app.study.adverse_events.schemas import AdverseEventChange, AdverseEventIn, ClearanceIn
 from app.study.deps import CurrentParticipant, ResultsViewed
-from app.study.models import Participant
 from app.study.service import may
 from app.study.wording import EVENT_KINDS, EVENT_SEVERITIES
+from app.tables.participants import Participant
 
 router = APIRouter()
 

@@ -9,9 +9,11 @@ from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.permissions import Caller
 from app.platform.errors import NotFound
-from app.study.adverse_events.models import AdverseEvent, AdverseEventRevision
-from app.study.models import Participant, StudySession, Visit
 from app.study.repository import in_scope
+from app.tables.adverse_events import AdverseEvent, AdverseEventRevision
+from app.tables.participants import Participant
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 
 
 def event(db: Session, event_id: int, caller: Caller) -> AdverseEvent:

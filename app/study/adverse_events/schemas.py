@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from app.platform.web.schemas import Bool, Int, Model, Moment, Text
-from app.study.adverse_events.models import EventKind, Severity
+from app.tables.adverse_events import EventKind, Severity
 
 
 class AdverseEventFields(Model):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from app.accounts.permissions import Caller
-from app.study.adverse_events.models import AdverseEvent
 from app.study.adverse_events.schemas import AdverseEventOut
 from app.study.adverse_events.service import policy_of
+from app.tables.adverse_events import AdverseEvent
 
 
 def event_out(event: AdverseEvent, caller: Caller) -> AdverseEventOut:

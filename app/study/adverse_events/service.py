@@ -18,9 +18,9 @@ from app.study import blinding
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.adverse_events import repository
-from app.study.adverse_events.models import AdverseEvent, AdverseEventRevision
 from app.study.adverse_events.schemas import AdverseEventChange, AdverseEventFields, AdverseEventIn
-from app.study.models import Participant
+from app.tables.adverse_events import AdverseEvent, AdverseEventRevision
+from app.tables.participants import Participant
 
 _BELONGS = ("session_id", "visit_id", "policy_id", "occurred_at")
 _KNOWN = ("kind", "severity", "serious", "note")

@@ -17,10 +17,10 @@ from app.study.characteristics import form, service
 from app.study.characteristics.schemas import MOST_DOSES, MOST_LEADS
 from app.study.deps import CurrentParticipant
 from app.study.form_changes import reason_of
-from app.study.models import Participant
 from app.study.service import may
 from app.study.settings.form import history_of
 from app.study.wording import DRUG_NAMES, SYMPTOMS, TARGETS, characteristics_words
+from app.tables.participants import Participant
 
 router = APIRouter()
 

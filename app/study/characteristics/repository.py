@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.study.models import StudySession, Visit
-from app.study.outcomes.models import GraspTest
+from app.tables.outcomes import GraspTest
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 
 
 def sessions_with_grasp_tests(db: Session, participant_id: int) -> Sequence[StudySession]:

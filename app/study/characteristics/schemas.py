@@ -10,8 +10,8 @@ from pydantic import Field, StringConstraints, model_validator
 from pydantic_core import PydanticCustomError
 
 from app.platform.web.schemas import Int, Model, Number, Text
-from app.study.doses.drugs import Drug
-from app.study.models import Hemisphere
+from app.tables.participants import Hemisphere
+from app.tables.visits import Drug
 
 MOST_LEADS, MOST_DOSES = 4, 8
 Contacts = Annotated[str, StringConstraints(pattern=r"^[0-9A-Ca-c+ ,;/()-]*$", max_length=40, strip_whitespace=True)]

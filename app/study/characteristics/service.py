@@ -12,10 +12,9 @@ from app.platform.errors import Conflict, Invalid
 from app.study import repository as study_repository
 from app.study import service as study
 from app.study.characteristics import repository
-from app.study.characteristics.models import CharacteristicsVersion
 from app.study.characteristics.schemas import CharacteristicsFields
-from app.study.models import Hemisphere, Participant
 from app.study.outcomes import service as outcomes
+from app.tables.participants import CharacteristicsVersion, Hemisphere, Participant
 
 
 def fields_of(row: CharacteristicsVersion | None) -> CharacteristicsFields:

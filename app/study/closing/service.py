@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from sqlalchemy.orm import Session
 
-from app.accounts.models import Study
 from app.accounts.permissions import Caller
 from app.accounts.studies import service as studies
 from app.platform.jobs import service as jobs
 from app.study import repository
+from app.tables.accounts import Study
 
 
 def end_study(db: Session, study: Study, reason: str, caller: Caller) -> None:

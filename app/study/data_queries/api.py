@@ -9,10 +9,10 @@ from app.platform.database import Db
 from app.platform.web.schemas import problems
 from app.study.data_queries import repository, service
 from app.study.data_queries.deps import CurrentDataQuery
-from app.study.data_queries.models import QueryState
 from app.study.data_queries.schemas import DataQueryEntryIn, DataQueryIn, DataQueryOut
 from app.study.data_queries.serializers import query_out
 from app.study.deps import CurrentParticipant
+from app.tables.data_queries import QueryState
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 

@@ -10,7 +10,7 @@ from app.accounts.deps import CurrentCaller
 from app.platform.database import Db
 from app.platform.web.schemas import RowId
 from app.study.data_queries import repository
-from app.study.data_queries.models import DataQuery
+from app.tables.data_queries import DataQuery
 
 
 def current_query(query_id: RowId, db: Db, caller: CurrentCaller) -> DataQuery:

@@ -6,13 +6,14 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from app.study.adverse_events.models import AdverseEvent
 from app.study.characteristics.schemas import CharacteristicsFields
 from app.study.characteristics.service import fields_of
-from app.study.data_queries.models import Subject
-from app.study.doses.models import Dose
-from app.study.models import Hemisphere, Participant, StudySession, Visit
 from app.study.settings.schemas import SettingsFields
+from app.tables.adverse_events import AdverseEvent
+from app.tables.data_queries import Subject
+from app.tables.participants import Hemisphere, Participant
+from app.tables.sessions import StudySession
+from app.tables.visits import Dose, Visit
 from ml.outcomes import FIELDS as OUTCOME_FIELDS
 
 OTHER = "other"

@@ -9,10 +9,10 @@ from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.permissions import Caller
 from app.platform.errors import NotFound
-from app.study.data_queries.models import DataQuery, DataQueryEntry, QueryState
-from app.study.doses.models import Dose
-from app.study.models import Participant, Visit
 from app.study.repository import in_scope
+from app.tables.data_queries import DataQuery, DataQueryEntry, QueryState
+from app.tables.participants import Participant
+from app.tables.visits import Dose, Visit
 
 
 def data_query(db: Session, query_id: int, caller: Caller) -> DataQuery:

@@ -10,7 +10,7 @@ from pydantic_core import PydanticCustomError
 
 from app.platform.web.schemas import Int, Model, Text
 from app.study.data_queries.fields import FIELDS
-from app.study.data_queries.models import OF_PARTICIPANT, QueryState, Subject
+from app.tables.data_queries import OF_PARTICIPANT, QueryState, Subject
 
 _NAMED = "; ".join(f"of {subject.value} {', '.join(names[:-1])}" for subject, names in FIELDS.items())
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from app.study.data_queries.models import DataQuery
 from app.study.data_queries.schemas import DataQueryEntryOut, DataQueryOut
+from app.tables.data_queries import DataQuery
 
 
 def query_out(row: DataQuery) -> DataQueryOut:

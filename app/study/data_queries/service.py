@@ -16,9 +16,9 @@ from app.study import service as study
 from app.study.adverse_events import repository as events
 from app.study.data_queries import repository
 from app.study.data_queries.fields import Found, value_of
-from app.study.data_queries.models import OF_PARTICIPANT, DataQuery, DataQueryEntry, QueryState, Subject
 from app.study.data_queries.schemas import DataQueryEntryIn, DataQueryIn
-from app.study.models import Participant
+from app.tables.data_queries import OF_PARTICIPANT, DataQuery, DataQueryEntry, QueryState, Subject
+from app.tables.participants import Participant
 
 _FOLLOWS: dict[QueryState, frozenset[QueryState]] = {
     QueryState.OPEN: frozenset({QueryState.ANSWERED, QueryState.CLOSED}),

@@ -10,8 +10,7 @@ from app.accounts.deps import CurrentCaller
 from app.platform.database import Db
 from app.platform.web.schemas import RowId
 from app.study.doses import repository
-from app.study.doses.models import Dose
-from app.study.models import Visit
+from app.tables.visits import Dose, Visit
 
 
 def current_dose(dose_id: RowId, db: Db, caller: CurrentCaller) -> tuple[Dose, Visit]:

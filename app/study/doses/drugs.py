@@ -9,27 +9,8 @@ eight times as much; tolcapone; levodopa gel) is `other`: no equivalent, and no 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
-
-class Drug(StrEnum):
-    """What was taken."""
-
-    LEVODOPA = "levodopa"
-    LEVODOPA_CR = "levodopa_cr"
-    LEVODOPA_COMT = "levodopa_comt"
-    LEVODOPA_EQUIVALENT = "levodopa_equivalent"
-    APOMORPHINE = "apomorphine"
-    PRAMIPEXOLE = "pramipexole"
-    ROPINIROLE = "ropinirole"
-    ROTIGOTINE = "rotigotine"
-    SELEGILINE = "selegiline"
-    RASAGILINE = "rasagiline"
-    SAFINAMIDE = "safinamide"
-    AMANTADINE = "amantadine"
-    ANTICHOLINERGIC = "anticholinergic"
-    MUSCLE_RELAXANT = "muscle_relaxant"
-    OTHER = "other"
+from app.tables.visits import Drug
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.platform.errors import NotFound
-from app.study.doses.models import Dose
-from app.study.models import Visit
 from app.study.repository import visit
+from app.tables.visits import Dose, Visit
 
 
 def dose_with_visit(db: Session, dose_id: int, caller: Caller) -> tuple[Dose, Visit]:

@@ -7,7 +7,7 @@ from datetime import datetime
 from pydantic import Field
 
 from app.platform.web.schemas import Model, Moment, Number, Text
-from app.study.doses.drugs import Drug
+from app.tables.visits import Drug
 
 
 class DoseIn(Model):

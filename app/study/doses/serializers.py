@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from app.study.doses.drugs import DRUGS, Drug, levodopa_equivalent_mg
-from app.study.doses.models import Dose
+from app.study.doses.drugs import DRUGS, levodopa_equivalent_mg
 from app.study.doses.schemas import DoseOut
+from app.tables.visits import Dose, Drug
 
 
 def dose_out(row: Dose) -> DoseOut:

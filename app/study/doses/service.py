@@ -13,10 +13,9 @@ from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import service as study
 from app.study.doses.drugs import DRUGS
-from app.study.doses.models import Dose
 from app.study.doses.schemas import DoseIn
-from app.study.models import Visit
 from app.study.visits.service import require_unlocked
+from app.tables.visits import Dose, Visit
 
 _BEFORE, _AFTER = timedelta(days=3), timedelta(hours=36)
 """A dose lies between three days before the visit's day and that day's end in the westernmost time zone, in UTC."""

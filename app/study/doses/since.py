@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-from app.study.doses.drugs import DRUGS, Drug
-from app.study.models import StudySession
+from app.study.doses.drugs import DRUGS
+from app.tables.sessions import StudySession
+from app.tables.visits import Drug
 
 LONGEST_H = 72.0
 APART_H = 0.25

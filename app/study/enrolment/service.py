@@ -6,7 +6,6 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
-from app.accounts.models import Site
 from app.accounts.permissions import Caller
 from app.accounts.studies import prefixes
 from app.platform.database import now, set_reason
@@ -14,11 +13,11 @@ from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import repository, wording
 from app.study.enrolment import codes
 from app.study.enrolment.schemas import ParticipantIn
-from app.study.margins.models import MarginsVersion
 from app.study.margins.schemas import MarginsFields
-from app.study.models import Participant
 from app.study.service import add_settings, refuse_ended
 from app.study.usual.questions import require_sure
+from app.tables.accounts import Site
+from app.tables.participants import MarginsVersion, Participant
 
 RESERVED_CODES = {"new"}
 

@@ -17,9 +17,9 @@ from app.study.deps import CurrentParticipant
 from app.study.form_changes import Shown, own_changes, reason_of
 from app.study.margins import service, sign_off
 from app.study.margins.schemas import MarginsIn, MarginsLockFields
-from app.study.models import Participant
 from app.study.service import may
 from app.study.settings.form import SettingField, SettingGroup, history, texts
+from app.tables.participants import Participant
 from ml.outcomes import OUTCOMES
 
 router = APIRouter()

@@ -7,7 +7,7 @@ from sqlalchemy.orm import Session
 from app.platform.signatures.schemas import SignatureOut
 from app.study.margins.schemas import MarginsLockOut
 from app.study.margins.sign_off import signatures_of_locks
-from app.study.models import Participant
+from app.tables.participants import Participant
 
 
 def lock_rows(db: Session, participant: Participant) -> list[MarginsLockOut]:

@@ -11,9 +11,8 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import service as study
 from app.study.margins import sign_off
-from app.study.margins.models import MarginsLock, MarginsVersion
 from app.study.margins.schemas import MarginsIn
-from app.study.models import Participant
+from app.tables.participants import MarginsLock, MarginsVersion, Participant
 from ml.outcomes import OUTCOMES
 from ml.qoc import Margins
 

@@ -9,11 +9,10 @@ from sqlalchemy.orm import Session
 from app.accounts import signing
 from app.accounts.permissions import Caller
 from app.platform.signatures import repository as signatures
-from app.platform.signatures.models import Signature
 from app.platform.signatures.service import SignatureState, state_of
-from app.study.margins.models import MarginsLock
 from app.study.margins.schemas import MarginsFields
-from app.study.models import Participant
+from app.tables.audit import Signature
+from app.tables.participants import MarginsLock, Participant
 
 KIND: Final = "margins_lock"
 MEANING: Final = "margins fixed before the sessions that they judge"

@@ -8,7 +8,7 @@ from datetime import datetime
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.study.outcomes.models import GraspTest, TremorSeries
+from app.tables.outcomes import GraspTest, TremorSeries
 
 
 def tremor_series(

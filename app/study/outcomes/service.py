@@ -20,13 +20,14 @@ from app.platform.errors import Invalid
 from app.platform.web.charts import counted
 from app.platform.web.numbers import stated
 from app.study import repository
-from app.study.models import Hemisphere, QocRevision, StudySession
 from app.study.outcomes import repository as of_files
 from app.study.outcomes import tremor
 from app.study.outcomes import values as outcome_values
-from app.study.outcomes.models import GraspTest, TremorSeries
 from app.study.outcomes.tremor import Minutes
 from app.study.outcomes.values import Derived
+from app.tables.outcomes import GraspTest, QocRevision, TremorSeries
+from app.tables.participants import Hemisphere
+from app.tables.sessions import StudySession
 from ml.outcomes import FIELDS
 from ml.qoc import TREMOR_CLASSES
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.platform.web.charts import counted
-from app.study.outcomes.models import TremorSeries
+from app.tables.outcomes import TremorSeries
 from ml.qoc import SAME_TIME_S, TREMOR_CLASSES
 
 

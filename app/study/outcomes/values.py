@@ -12,12 +12,12 @@ from sqlalchemy.orm import Session
 
 from app.platform.web.numbers import stated
 from app.study import repository
-from app.study.characteristics.models import CharacteristicsVersion
-from app.study.models import Hemisphere, StudySession
 from app.study.outcomes import repository as of_files
 from app.study.outcomes import tremor
-from app.study.outcomes.models import GraspTest
 from app.study.outcomes.tremor import SessionMinutes
+from app.tables.outcomes import GraspTest
+from app.tables.participants import CharacteristicsVersion, Hemisphere
+from app.tables.sessions import StudySession
 from ml.outcomes import BY_FIELD
 from ml.qoc import PLAUSIBLE_INTERVAL_S, TremorReading, grasp_frequency, read_tremor
 

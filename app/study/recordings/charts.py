@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from app.platform.web.charts import Cell, Chart, axis, figure
 from app.platform.web.numbers import hover
-from app.study.models import Recording, Trace
 from app.study.recordings.facts import clock_fit
 from app.study.traces import unpack
+from app.tables.recordings import Recording, Trace
 
 _DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
 TIME = "session"

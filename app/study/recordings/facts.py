@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.platform.web.numbers import stated
-from app.study.models import Recording
+from app.tables.recordings import Recording
 from ml.formats.rcs.packets.time import Rejected
 from ml.formats.rcs.quality import REJECTED_WORDS
 

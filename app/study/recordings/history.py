@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
-from app.study.models import Recording
+from app.tables.recordings import Recording
 
 _CLOCKS = (timedelta(hours=-12), timedelta(0), timedelta(hours=14))
 """The latest, the middle and the earliest clock on earth against UTC: a day lies within what they call it."""

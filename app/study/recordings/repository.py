@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from sqlalchemy import select
 from sqlalchemy.orm import Session, joinedload
 
-from app.study.models import Recording, StudySession, Visit
+from app.tables.recordings import Recording
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 
 
 def histories(db: Session, participant_id: int) -> Sequence[Recording]:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.study.models import Controller, Recording
 from app.study.sessions.logged import limits_and_policy
+from app.tables.recordings import Recording
+from app.tables.sessions import Controller
 
 LEAST_FALL = 1.0
 """Charge, %, that must have gone for a whole charge's hours to be told: what operating systems tell a charge in."""

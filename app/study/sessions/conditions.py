@@ -13,12 +13,13 @@ from app.accounts.permissions import SYSTEM, Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import blinding, repository, service
-from app.study.models import Controller, Recording, SettingsVersion, StudySession
 from app.study.schemas import ConditionsChange, ConditionsFields
 from app.study.sessions import designs, logged, programming
-from app.study.sessions.models import SessionConditions
 from app.study.traces import StepTable, driving, step_table
 from app.study.visits.service import require_unlocked
+from app.tables.participants import SettingsVersion
+from app.tables.recordings import Recording
+from app.tables.sessions import Controller, SessionConditions, StudySession
 
 OF_SETTINGS = ("lower_bound", "window", "period_s", "xi_beta")
 """What a settings version tells of the sessions that ran under it."""

@@ -15,10 +15,11 @@ from app.accounts.permissions import SYSTEM
 from app.platform.errors import Invalid
 from app.study import blinding
 from app.study.doses.since import disagreement_h
-from app.study.models import Controller, Recording, StudySession
 from app.study.sessions import logged, repeated
 from app.study.sessions.stimulation import SILENT_MA, Delivered, contradicts, delivered
 from app.study.traces import step_table
+from app.tables.recordings import Recording
+from app.tables.sessions import Controller, StudySession
 
 
 class Kind(StrEnum):

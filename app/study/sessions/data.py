@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from sqlalchemy.orm import Session
 
-from app.study.models import SettingsVersion, StudySession
 from app.study.threshold import mismatch
 from app.study.traces import StepTable, TracesOf, laid_out, step_table
+from app.tables.participants import SettingsVersion
+from app.tables.sessions import StudySession
 from ml.outcomes import OUTCOMES
 from ml.qoc import Qoc, failed_qoc
 

@@ -11,10 +11,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.study import blinding, repository
-from app.study.models import Controller, StudySession
 from app.study.sessions import logged
-from app.study.sessions.models import SessionConditions
 from app.study.traces import StepTable
+from app.tables.sessions import Controller, SessionConditions, StudySession
 from ml.designs import recognise, unstated_holds
 from ml.trajectories import Hold
 

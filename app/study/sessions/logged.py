@@ -9,8 +9,9 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.study import repository
-from app.study.models import Controller, Recording, StudySession
 from app.study.sessions.repository import SlotHead, slot_head
+from app.tables.recordings import Recording
+from app.tables.sessions import Controller, StudySession
 
 CONTROLLER_OF_KIND = {"distilled": Controller.DISTILLED, "baseline": Controller.OTHER}
 """Controllers of policies by their kind; those of every other kind are RL."""

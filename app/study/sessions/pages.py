@@ -25,7 +25,6 @@ from app.study.data_queries.repository import not_closed_of_session
 from app.study.deps import CurrentSession, SessionViewed
 from app.study.doses.since import since_last_dose
 from app.study.form_changes import Shown, own_changes
-from app.study.models import QocRevision, Recording, StudySession
 from app.study.recordings import tablet
 from app.study.schemas import ConditionsChange, DerivedChoice, QocIn, SessionChange
 from app.study.sessions import conditions, designs
@@ -37,6 +36,9 @@ from app.study.sessions.stimulation import beside, delivered
 from app.study.traces import NO_CONTROL, control_programs, session_offset_s
 from app.study.visits.blinded import blinded_page
 from app.study.wording import ACTIVITIES, DEVICE_NAMES, EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
+from app.tables.outcomes import QocRevision
+from app.tables.recordings import Recording
+from app.tables.sessions import StudySession
 from ml.energy import relative_energy
 from ml.outcomes import FIELDS, OUTCOMES
 

@@ -6,7 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from app.study.models import Hemisphere, Recording, StudySession
+from app.tables.participants import Hemisphere
+from app.tables.recordings import Recording
+from app.tables.sessions import StudySession
 
 SAME_SHARE = 0.01
 """Rates and pulse widths within this share are one setting: devices count periods, so that 130 Hz is logged as 130.2 Hz."""

@@ -7,9 +7,9 @@ from datetime import datetime, timedelta
 from sqlalchemy.orm import Session
 
 from app.platform.errors import Conflict
-from app.study.models import SessionSegment, StudySession
 from app.study.sessions import repository
 from app.study.sessions.repository import SameMinutes
+from app.tables.sessions import SessionSegment, StudySession
 
 
 def others(db: Session, session: StudySession) -> list[SameMinutes]:

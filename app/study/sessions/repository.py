@@ -28,10 +28,12 @@ from sqlalchemy import (
 from sqlalchemy.dialects.postgresql import aggregate_order_by
 from sqlalchemy.orm import Session
 
-from app.study.doses.models import Dose
-from app.study.models import CdbsAmplitude, QocRevision, Recording, SessionSegment, SettingsVersion, StudySession, Trace, Visit
 from app.study.repository import CONFIRMED, sessions_of_participant
-from app.study.sessions.models import CountedTime, SessionConditions
+from app.tables.outcomes import QocRevision
+from app.tables.participants import SettingsVersion
+from app.tables.recordings import Recording, Trace
+from app.tables.sessions import CountedTime, SessionConditions, SessionSegment, StudySession
+from app.tables.visits import CdbsAmplitude, Dose, Visit
 from ml.outcomes import Outcome
 
 

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from app.study import repository
-from app.study.models import Controller, Hemisphere, Recording, StudySession, Trace
 from app.study.traces import AMPLITUDE_STREAM, StepTable, TracesOf, amplitude_program, driving, shown_table
+from app.tables.participants import Hemisphere
+from app.tables.recordings import Recording, Trace
+from app.tables.sessions import Controller, StudySession
 
 SILENT_MA = 0.005
 """Below this, an amplitude is off: devices step by 0.1 mA, tables are rounded."""

@@ -11,8 +11,10 @@ from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
 from app.study import repository
-from app.study.models import SettingsVersion, StudySession, Trace
 from app.study.traces import AMPLITUDE_STREAM, StepTable, beta_of_part, driving, shown_table
+from app.tables.participants import SettingsVersion
+from app.tables.recordings import Trace
+from app.tables.sessions import StudySession
 from ml.trajectories import SessionTrajectory
 
 CONTROL_STREAMS = ("beta", "band_power")

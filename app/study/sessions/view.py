@@ -10,7 +10,6 @@ from sqlalchemy.orm import Session
 from app.platform.errors import Invalid
 from app.platform.web.charts import Chart
 from app.study import repository
-from app.study.models import Recording, StudySession, Trace
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
 from app.study.outcomes.charts import grasp_chart, tremor_chart
@@ -32,6 +31,8 @@ from app.study.recordings.facts import (
 from app.study.sessions.charts import control_chart
 from app.study.sessions.data import SessionData
 from app.study.traces import AMPLITUDE_STREAM, driving, session_offset_s, shown_table
+from app.tables.recordings import Recording, Trace
+from app.tables.sessions import StudySession
 
 
 @dataclass(frozen=True)

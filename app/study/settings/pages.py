@@ -17,11 +17,11 @@ from app.platform.web.templates import render
 from app.study import service
 from app.study.deps import CurrentParticipant
 from app.study.form_changes import Shown, own_changes, reason_of
-from app.study.models import Participant
 from app.study.service import may
 from app.study.settings import form
 from app.study.settings.schemas import SettingsIn
 from app.study.threshold import SuggestedThreshold, suggest_xi_beta
+from app.tables.participants import Participant
 
 log = structlog.get_logger()
 

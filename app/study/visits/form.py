@@ -11,8 +11,9 @@ from app.platform.errors import Invalid
 from app.platform.web.forms import parse
 from app.platform.web.numbers import typed
 from app.study import repository
-from app.study.models import Hemisphere, Visit
 from app.study.schemas import CdbsAmplitudeModel, VisitChange
+from app.tables.participants import Hemisphere
+from app.tables.visits import Visit
 
 SIDES = tuple(side.value for side in Hemisphere)
 PROGRAMS = range(4)

@@ -23,7 +23,6 @@ from app.study.deps import CurrentParticipant, CurrentVisit, ResultsViewed, Visi
 from app.study.doses.serializers import dose_out
 from app.study.doses.since import since_last_dose
 from app.study.form_changes import Shown, own_changes, reason_of
-from app.study.models import Participant, StudySession, Visit
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
 from app.study.recordings import tablet
@@ -37,6 +36,9 @@ from app.study.visits import form, sign_off
 from app.study.visits import service as visit_locks
 from app.study.visits.blinded import blinded_page
 from app.study.wording import DRUG_NAMES
+from app.tables.participants import Participant
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 
 router = APIRouter()
 

@@ -12,8 +12,9 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import repository
 from app.study.blinding import Arm, visible_arms
-from app.study.models import StudySession, Visit, VisitLock
 from app.study.visits import sign_off
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit, VisitLock
 
 Day = tuple[Visit, list[tuple[StudySession, Arm | None]]]
 

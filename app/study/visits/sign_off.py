@@ -14,12 +14,13 @@ from app.accounts import signing
 from app.accounts.permissions import SYSTEM, Caller
 from app.platform.errors import Invalid
 from app.platform.signatures import repository as signatures
-from app.platform.signatures.models import Signature
 from app.platform.signatures.service import SignatureState, content_hash, state_of
 from app.study import repository
 from app.study.blinding import stated_arm
-from app.study.models import StudySession, Visit, VisitLock
 from app.study.traces import sources
+from app.tables.audit import Signature
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit, VisitLock
 from ml.outcomes import FIELDS
 
 KIND: Final = "visit_lock"

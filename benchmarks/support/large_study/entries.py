@@ -11,8 +11,8 @@ from fastapi.testclient import TestClient
 
 from app.accounts import repository
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.platform.database import transaction
+from app.tables.accounts import Role
 
 LFP_HZ, LFP_MINUTES, TREND_DAYS = 250, 10, 60
 STEPS_OF_A_PROPOSAL = 300

@@ -15,7 +15,6 @@ import numpy as np
 from fastapi.testclient import TestClient
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM
 from app.main import create_app
 from app.platform.database import transaction
@@ -23,6 +22,7 @@ from app.platform.migrate import migrate
 from app.settings import get_settings
 from app.study.enrolment.schemas import ParticipantIn
 from app.study.enrolment.service import enrol
+from app.tables.accounts import Role
 
 RATE_HZ, LEAD_S = 250, 20
 EMAIL = "admin@clinic.example"

@@ -15,20 +15,23 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM
 from app.evaluation.service import store_evaluation
-from app.learning.models import BufferSnapshot, Policy, Sweep
 from app.learning.policies.baselines import constant_onnx, ensure_baselines
 from app.learning.snapshots.service import collect, take_snapshot
 from app.platform import files
-from app.platform.jobs.models import Job, JobEvent, JobStatus, JobStep
 from app.study import blinding
 from app.study.enrolment.schemas import ParticipantIn
 from app.study.enrolment.service import enrol
-from app.study.models import Controller, Device, Participant, QocRevision, Recording, SessionSegment, StudySession, Trace, Visit
-from app.study.sessions.models import SessionConditions
 from app.study.traces import pack
+from app.tables.accounts import Role
+from app.tables.jobs import Job, JobEvent, JobStatus, JobStep
+from app.tables.learning import BufferSnapshot, Policy, Sweep
+from app.tables.outcomes import QocRevision
+from app.tables.participants import Participant
+from app.tables.recordings import Device, Recording, Trace
+from app.tables.sessions import Controller, SessionConditions, SessionSegment, StudySession
+from app.tables.visits import Visit
 from ml.ope.estimate import Estimate
 
 EMAIL, PASSWORD = "admin@clinic.example", "pages of a large study"

@@ -16,10 +16,10 @@ from sqlalchemy.orm import Session
 
 from app.accounts import repository, service
 from app.accounts.addresses import normal_address
-from app.accounts.models import Role
 from app.accounts.permissions import APPROVE_PLAN, MANAGE_ACCOUNTS, PERMISSIONS, READ, READ_ARMS, WRITE_STUDY, Caller, Grant
 from app.platform.database import new_session
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
+from app.tables.accounts import Role
 
 EMAIL, PASSWORD = "ada@clinic.example", "correct horse battery"
 

@@ -16,9 +16,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts import passwords, service
 from app.accounts.deps import COOKIE
-from app.accounts.models import Role, User
 from app.platform.database import transaction
 from app.platform.errors import TooMany
+from app.tables.accounts import Role, User
 from tests.conftest import PASSWORD
 
 NEW = "another good password"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from app.accounts.models import Role, Scope
 from app.accounts.permissions import PERMISSIONS, SCOPES
+from app.tables.accounts import Role, Scope
 
 READER = {"read", "arms:read"}
 STAFF = READER | {"study:write", "qoc:write", "settings:write", "upload", "jobs:run", "plan:draft", "bundles:take", "audit:read"}

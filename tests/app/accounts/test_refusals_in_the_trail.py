@@ -9,10 +9,10 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts import second_factor, service, totp
-from app.accounts.models import Role, User
 from app.accounts.signing import sign
-from app.platform.audit import AuditEvent
 from app.platform.errors import Forbidden, TooMany, Unauthorized
+from app.tables.accounts import Role, User
+from app.tables.audit import AuditEvent
 
 EMAIL, PASSWORD = "ada@clinic.example", "correct horse battery"
 

@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 
 from app import cli
 from app.accounts import second_factor, service, signing, totp
-from app.accounts.models import Role, User
 from app.platform.database import new_session
 from app.platform.errors import Forbidden, Invalid, Unauthorized
+from app.tables.accounts import Role, User
 from tests.conftest import PASSWORD
 
 EMAIL = "ada@clinic.example"

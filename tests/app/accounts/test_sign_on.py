@@ -17,12 +17,12 @@ from typer.testing import CliRunner
 
 from app import cli
 from app.accounts import service as accounts
-from app.accounts.models import Role, User
 from app.accounts.sign_on import provider as ours
 from app.accounts.sign_on import service
 from app.accounts.sign_on.provider import Identity
 from app.platform.database import new_session, now
 from app.settings import get_settings
+from app.tables.accounts import Role, User
 from tests import identity_provider as theirs
 from tests.conftest import PASSWORD
 

@@ -12,13 +12,13 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
-from app.accounts.models import Role, User
 from app.accounts.permissions import CONFIRMED_FOR, Caller
 from app.accounts.sign_on import service
 from app.accounts.signing import sign
 from app.platform.database import new_session, now, set_actor
 from app.platform.errors import Forbidden
 from app.platform.web.templates import _environment
+from app.tables.accounts import Role, User
 from tests import identity_provider as theirs
 from tests.app.accounts.test_sign_on import ADA, BOB, ada, browser, hospital, signed_on, trail  # noqa: F401
 from tests.conftest import PASSWORD

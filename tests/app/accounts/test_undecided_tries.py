@@ -12,8 +12,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts import service
 from app.accounts.browser import failed_sign_ins
-from app.accounts.models import Role, User
 from app.platform.errors import Forbidden, TooMany, Unauthorized, passing
+from app.tables.accounts import Role, User
 
 EMAIL, PASSWORD, WRONG = "ada@clinic.example", "correct horse battery", "a wrong guess"
 REFUSING = """

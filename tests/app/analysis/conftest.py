@@ -12,8 +12,12 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.study import blinding, repository
-from app.study.models import Controller, Device, Hemisphere, QocRevision, Recording, SessionSegment, StudySession, Trace, Visit
 from app.study.traces import pack
+from app.tables.outcomes import QocRevision
+from app.tables.participants import Hemisphere
+from app.tables.recordings import Device, Recording, Trace
+from app.tables.sessions import Controller, SessionSegment, StudySession
+from app.tables.visits import Visit
 
 AddSession = Callable[..., int]
 

@@ -13,9 +13,9 @@ from fastapi.testclient import TestClient
 from rich.console import Console
 
 from app.platform.database import now, transaction
-from app.platform.jobs.models import Job, JobStatus
 from app.platform.web.numbers import minutes_left, time_left
 from app.simulation.demo import command, loader
+from app.tables.jobs import Job, JobStatus
 
 PAGES = ("/", "/participants/P1", "/participants/P1/ranking")
 

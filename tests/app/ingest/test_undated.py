@@ -11,8 +11,9 @@ from sqlalchemy import inspect, select
 from sqlalchemy.orm import Session
 
 from app.ingest.repository import recordings_of_minutes
-from app.study.models import Recording, SessionSegment
 from app.study.sessions.repository import same_minutes
+from app.tables.recordings import Recording
+from app.tables.sessions import SessionSegment
 from tests.app.ingest.conftest import device_zip
 
 

@@ -11,12 +11,13 @@ from sqlalchemy import select, true
 from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
-from app.accounts.models import Membership, Role, Site, Study
 from app.accounts.permissions import Caller, Grant
 from app.overview.trail.repository import audit_events
 from app.overview.trail.schemas import TrailFilter
 from app.overview.trail.scope.repository import of_reader
-from app.platform.audit import AUDITED, AuditEvent
+from app.platform.audit import AUDITED
+from app.tables.accounts import Membership, Role, Site, Study
+from app.tables.audit import AuditEvent
 from tests.conftest import PASSWORD
 
 Upload = Callable[..., int]

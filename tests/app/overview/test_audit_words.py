@@ -15,8 +15,9 @@ from app.overview.trail.names import Names
 from app.overview.trail.repository import batches
 from app.overview.trail.schemas import TrailFilter
 from app.overview.trail.words import headline, sentence
-from app.platform.audit import AUDITED, AuditEvent
+from app.platform.audit import AUDITED
 from app.platform.database import new_session
+from app.tables.audit import AuditEvent
 from tests.app.every_route import World
 
 QUERY = {"id": 8, "participant_id": 1, "session_id": 7, "upload_id": None, "field": "rating"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from app.overview.first_screen import offers
 from app.overview.state import State
 from app.overview.visit_progress import VisitProgress
-from app.study.models import Participant
+from app.tables.participants import Participant
 
 
 def participants() -> list[Participant]:

@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 
 from app.overview.samples import service
 from app.platform.database import transaction
-from app.study.models import StudySession
+from app.tables.sessions import StudySession
 from ml.formats import DecodeOptions, decode
 from ml.formats.recording import SampleLog
 from tests.app.ingest.conftest import device_zip, send, steady  # noqa: F401 (fixture)

@@ -12,8 +12,8 @@ from app.analysis.evidence.service import evidence
 from app.overview.story import story_chart
 from app.platform.web.charts import ACCENT, Chart, Link
 from app.study import repository
-from app.study.models import Visit
 from app.study.repository import participant_by_code
+from app.tables.visits import Visit
 from tests.app.analysis.conftest import adder
 
 LATER = dt.date(2026, 6, 1)

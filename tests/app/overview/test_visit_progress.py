@@ -11,7 +11,7 @@ from app.overview.state import State, next_steps
 from app.overview.tasks import Actor, Task
 from app.overview.visit_progress import VisitProgress, visit_progress
 from app.overview.wording import progress, what
-from app.study.models import Participant, SettingsVersion
+from app.tables.participants import Participant, SettingsVersion
 from tests.clinic_day import clinic_day
 from tests.conftest import PASSWORD
 

@@ -11,8 +11,8 @@ from pwdlib import PasswordHash
 
 from app.accounts import service
 from app.accounts.deps import COOKIE
-from app.accounts.models import Membership, Role, SignIn, User
 from app.platform.database import transaction
+from app.tables.accounts import Membership, Role, SignIn, User
 
 PASSWORD = "correct horse battery"
 HTML = {"Accept": "text/html", "Sec-Fetch-Site": "same-origin"}

@@ -7,7 +7,7 @@ from typing import Any
 from fastapi.routing import iter_route_contexts
 
 from app.platform.database import transaction
-from app.platform.jobs.models import Job, JobEvent
+from app.tables.jobs import Job, JobEvent
 from tests.app.every_route import World
 
 ELSEWHERE = {

@@ -11,8 +11,8 @@ from sqlalchemy import select
 
 from app.accounts import service as accounts
 from app.accounts.deps import COOKIE
-from app.accounts.models import Role, SignIn
 from app.platform.database import now, transaction
+from app.tables.accounts import Role, SignIn
 
 SECOND = "another horse battery"
 

@@ -11,10 +11,10 @@ from fastapi.testclient import TestClient
 from sqlalchemy import text
 
 from app.accounts import repository, second_factor, totp
-from app.accounts.models import Role, Site, Study
 from app.accounts.permissions import PERMISSIONS
 from app.platform.database import new_session, transaction
 from app.settings import get_settings
+from app.tables.accounts import Role, Site, Study
 from tests.app.every_route import PASSWORD, World
 from tests.app.pages import page_roles as roles
 from tests.app.pages.every_page import ELSEWHERE, addresses, routes

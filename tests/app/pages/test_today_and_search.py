@@ -17,12 +17,13 @@ from app.overview.saved import Saved, overall
 from app.overview.state import states
 from app.overview.tasks import Actor, Task
 from app.platform.jobs import service as jobs
-from app.platform.jobs.models import Job, JobStatus
 from app.settings import get_settings
 from app.study.enrolment.schemas import ParticipantIn
 from app.study.enrolment.service import enrol
-from app.study.models import Participant, Visit
 from app.study.repository import participant_by_code
+from app.tables.jobs import Job, JobStatus
+from app.tables.participants import Participant
+from app.tables.visits import Visit
 from tests.app.analysis.conftest import adder
 from tests.app.words import flat
 
@@ -94,7 +95,7 @@ def test_a_search_with_one_hit_opens_it(
 def test_a_search_finds_nothing_beyond_the_callers_sites(sign_in: Callable[[str], TestClient], session_id: int, db: Session) -> None:
     viewer = sign_in("viewer")
     assert viewer.get("/search", params={"q": "P1"}).status_code == 303
-    from app.accounts.models import Membership, Site, User
+    from app.tables.accounts import Membership, Site, User
 
     site = Site(study_id=1, code="other", name="Another clinic")
     db.add(site)

@@ -18,8 +18,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.learning.policies.baselines import constant_onnx
-from app.platform.jobs.models import JobEvent
 from app.settings import get_settings
+from app.tables.jobs import JobEvent
 
 Upload = Callable[..., int]
 Ended = Callable[..., dict[str, Any]]

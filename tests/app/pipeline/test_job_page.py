@@ -15,7 +15,7 @@ from app.learning.schemas import Aim, Anchor, Preset
 from app.pipeline.charts import job_curves
 from app.pipeline.pages import VALUE_NAMES
 from app.platform.jobs import StepReport
-from app.platform.jobs.models import Job, JobEvent, JobStep
+from app.tables.jobs import Job, JobEvent, JobStep
 from ml.ope.dlmm import DlmmConfig
 from tests.app.evaluation.estimates.test_compute import buffer_of, call, sessions
 

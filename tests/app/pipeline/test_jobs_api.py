@@ -13,11 +13,11 @@ from app.accounts.permissions import SYSTEM
 from app.evaluation.estimates.methods import quick_methods
 from app.evaluation.schemas import EvaluateParams
 from app.evaluation.service import policies_to_rank
-from app.learning.models import Policy
 from app.learning.policies.baselines import constant_onnx
 from app.learning.schemas import DEFAULT_SWEEP
 from app.platform import files
 from app.study.repository import participant_by_code
+from app.tables.learning import Policy
 from ml.ope.registry import method_keys
 
 Upload = Callable[..., int]

@@ -12,12 +12,12 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation.models import Evaluation
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.policies.baselines import constant_onnx
 from app.learning.snapshots.buffers import read_buffer
 from app.platform import files
 from app.study.repository import participant_by_code
+from app.tables.evaluations import Evaluation
+from app.tables.learning import BufferSnapshot, Policy
 from ml.deploy.bundle import verify_bundle
 from ml.ope.compare.skill import held_out_skill
 from ml.ope.registry import estimators, quick_estimators

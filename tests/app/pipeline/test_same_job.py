@@ -19,8 +19,8 @@ from app.learning.snapshots.service import take_snapshot
 from app.pipeline.stages import PLAN, snapshot_facts
 from app.platform.database import now
 from app.platform.jobs import registry
-from app.platform.jobs.models import Job, JobStatus, JobStep
 from app.study.repository import participant_by_code
+from app.tables.jobs import Job, JobStatus, JobStep
 
 Upload = Callable[..., int]
 JOBS = "/api/v1/participants/P1/jobs"

@@ -11,8 +11,6 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation.models import Evaluation
-from app.learning.models import Policy
 from app.learning.schemas import TrainParams
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.snapshots.service import take_snapshot
@@ -24,6 +22,8 @@ from app.pipeline.stages import snapshot_facts
 from app.pipeline.training import training_calls, training_plan
 from app.platform import files
 from app.study.repository import participant_by_code
+from app.tables.evaluations import Evaluation
+from app.tables.learning import Policy
 from ml.ope.registry import POSTERIOR
 from ml.policies.policy import ConstantPolicy
 from tests.app.evaluations import policies as policies

@@ -10,13 +10,17 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation.service import store_evaluation
-from app.learning.models import BufferSnapshot, Policy
 from app.learning.snapshots.service import take_snapshot
 from app.platform import files
 from app.study import blinding
-from app.study.models import Controller, Device, Participant, QocRevision, Recording, SessionSegment, StudySession, Trace, Visit
 from app.study.repository import participant_by_code
 from app.study.traces import pack
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.outcomes import QocRevision
+from app.tables.participants import Participant
+from app.tables.recordings import Device, Recording, Trace
+from app.tables.sessions import Controller, SessionSegment, StudySession
+from app.tables.visits import Visit
 from ml.ope.estimate import Estimate
 from ml.ope.flags import Flag
 

@@ -1,4 +1,4 @@
-"""Migrations: they make what the models say, refuse other schemas, and every audited table has its trail."""
+"""Migrations: they make what the tables say, refuse other schemas, and every audited table has its trail."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ from sqlalchemy import Connection, text
 from sqlalchemy.orm import Session
 
 from app.platform.audit import AUDITED
-from app.platform.database import Base
 from app.platform.migrate import migrate
-from app.platform.tables import load_tables
+from app.tables import METADATA
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
 def differences(connection: Connection) -> list[Any]:
     """What a new migration would have to do; tables of the job engine's own schema are not ours."""
-    load_tables()
     context = MigrationContext.configure(connection, opts={"compare_server_default": False})
-    return list(compare_metadata(context, Base.metadata))
+    return list(compare_metadata(context, METADATA))
 
 
 def config(connection: Connection) -> Config:

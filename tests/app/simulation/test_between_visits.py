@@ -12,14 +12,14 @@ from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.models import Policy
 from app.learning.snapshots.service import take_snapshot
 from app.pipeline.next_generation.service import outlook
-from app.platform.jobs.models import Job
 from app.simulation.design import PRESETS, Design, Remembered
 from app.simulation.loop import ParticipantLoop, Signer
-from app.study.models import Participant
 from app.study.repository import participant_by_code
+from app.tables.jobs import Job
+from app.tables.learning import Policy
+from app.tables.participants import Participant
 from tests.app.evaluations import judge as judge
 from tests.app.evaluations import judged
 from tests.app.evaluations import policies as policies

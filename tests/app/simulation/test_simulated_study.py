@@ -17,35 +17,33 @@ from sqlalchemy import func, select
 
 from app.accounts.permissions import SYSTEM
 from app.analysis.trial_time.service import trial_time
-from app.evaluation.models import Evaluation
 from app.evaluation.ranking.results import driven_sessions, results_by_policy
-from app.ingest.models import UploadFile
-from app.learning.models import BufferSnapshot
-from app.planning.bundles.models import BundleRelease
-from app.planning.plans.models import Plan
-from app.planning.visit_day.models import DayEntry
-from app.platform.audit import AuditEvent
 from app.platform.database import new_session
 from app.platform.errors import Conflict
-from app.platform.jobs.models import Job, JobStatus
 from app.platform.signatures.repository import signatures_of
 from app.settings import get_settings
 from app.simulation.design import STATE_FILE, design
 from app.simulation.run import ACCOUNT, SIGNER, simulate
 from app.study import repository as study
 from app.study.blinding import arm
-from app.study.models import Controller, QocRevision, Recording, StudySession
 from app.study.sessions.data import session_data
 from app.study.threshold import mdp_settings
+from app.tables.audit import AuditEvent
+from app.tables.evaluations import Evaluation
+from app.tables.jobs import Job, JobStatus
+from app.tables.learning import BufferSnapshot
+from app.tables.outcomes import QocRevision
+from app.tables.plans import BundleRelease, DayEntry, Plan
+from app.tables.recordings import Recording
+from app.tables.sessions import Controller, StudySession
+from app.tables.uploads import UploadFile
 
 ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """
 import sys
-from app.platform.tables import load_tables
 from app.simulation.design import Design, Preset
 from app.simulation.run import simulate
 
-load_tables()
 size = Preset(
     visits=2, random_visits=1, random_sessions=1, session_minutes=5, policies_per_kind=1,
     pipeline={"preset": "quick", "count": 1, "updates": 20, "distil_updates": 20, "methods": ["linear", "wis"]},

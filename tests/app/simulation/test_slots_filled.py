@@ -10,20 +10,19 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
-from app.ingest.models import Upload
-from app.planning.bundles.models import BundleRelease
-from app.planning.plans.models import PlanItem
-from app.planning.visit_day.models import DayEntry
 from app.platform.database import transaction
 from app.platform.errors import BetaloopError, Conflict
 from app.simulation import sessions, tablet
 from app.simulation.design import Design, Preset, Remembered
 from app.simulation.loop import ParticipantLoop, Signer
 from app.study.blinding import arm
-from app.study.models import Controller, Recording, StudySession
 from app.study.sessions import logged
 from app.study.sessions.data import session_data
+from app.tables.accounts import Role
+from app.tables.plans import BundleRelease, DayEntry, PlanItem
+from app.tables.recordings import Recording
+from app.tables.sessions import Controller, StudySession
+from app.tables.uploads import Upload
 from ml.deploy.runtime.control_loop import End
 from ml.deploy.runtime.session import run_slot
 

@@ -10,14 +10,16 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.ingest.models import Upload, UploadFile
 from app.study import blinding, repository, service
 from app.study.enrolment import service as enrolment
 from app.study.enrolment.schemas import ParticipantIn
-from app.study.models import Controller, Device, Hemisphere, Recording, SessionSegment, StudySession, Trace
 from app.study.schemas import VisitIn
 from app.study.settings.schemas import SettingsIn
 from app.study.traces import pack
+from app.tables.participants import Hemisphere
+from app.tables.recordings import Device, Recording, Trace
+from app.tables.sessions import Controller, SessionSegment, StudySession
+from app.tables.uploads import Upload, UploadFile
 
 START = datetime(2026, 3, 2, 9, 0, tzinfo=UTC)
 CLASSES = ("unknown", "none", "slight", "mild", "moderate", "strong")

@@ -8,7 +8,8 @@ import pytest
 
 from app.platform.errors import Invalid
 from app.study import cdbs_amplitude
-from app.study.models import CdbsAmplitude, Hemisphere, Participant, SettingsVersion, Visit
+from app.tables.participants import Hemisphere, Participant, SettingsVersion
+from app.tables.visits import CdbsAmplitude, Visit
 
 LEFT, RIGHT = Hemisphere.LEFT, Hemisphere.RIGHT
 

@@ -9,9 +9,9 @@ from sqlalchemy.orm import Session
 
 from app.platform.audit.chain import verify
 from app.platform.database import new_session
-from app.platform.signatures.models import Signature
 from app.platform.signatures.repository import newest_of_each
 from app.platform.signatures.service import content_hash, covers
+from app.tables.audit import Signature
 from tests.conftest import PASSWORD
 
 LOCKS = "/api/v1/participants/P1/margins/locks"

@@ -14,12 +14,12 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
 from app.ingest.proposals import service as proposals
-from app.platform.audit import AuditEvent
-from app.study.doses.models import Dose
-from app.study.models import CdbsAmplitude, StudySession
 from app.study.outcomes import repository as of_files
 from app.study.outcomes import service as outcomes
-from app.study.outcomes.models import GraspTest, TremorSeries
+from app.tables.audit import AuditEvent
+from app.tables.outcomes import GraspTest, TremorSeries
+from app.tables.sessions import StudySession
+from app.tables.visits import CdbsAmplitude, Dose
 from tests.app.study.conftest import minutes
 
 NewFile = Callable[[StudySession], int]

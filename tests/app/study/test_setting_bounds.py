@@ -12,8 +12,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.platform.database import transaction
-from app.study.models import CdbsAmplitude, Participant, SettingsVersion
 from app.study.settings.schemas import SETTING_BOUNDS, SettingsFields
+from app.tables.participants import Participant, SettingsVersion
+from app.tables.visits import CdbsAmplitude
 from tests.app.conftest import Upload
 
 HTML = {"Accept": "text/html", "Sec-Fetch-Site": "same-origin"}

@@ -8,7 +8,7 @@ from sqlalchemy import select, text
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
-from app.platform.audit import AuditEvent
+from app.tables.audit import AuditEvent
 
 
 def test_a_new_participant_gets_the_papers_constants(client: TestClient) -> None:

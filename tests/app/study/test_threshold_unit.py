@@ -7,11 +7,11 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.study import service
-from app.study.models import StudySession
 from app.study.sessions.charts import control_chart
 from app.study.sessions.data import session_data
 from app.study.sessions.pages import summarise
 from app.study.settings.schemas import SettingsIn
+from app.tables.sessions import StudySession
 
 
 def test_a_threshold_with_stated_unit_and_source_counts(db: Session, study_session: StudySession) -> None:

@@ -9,10 +9,11 @@ from sqlalchemy import Column, ColumnElement, Integer, Select, Table, and_, case
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import QueryableAttribute, aliased
 
-from app.accounts.models import Site
 from app.accounts.permissions import READ_AUDIT, Caller
-from app.platform.audit import AUDITED, AuditEvent
+from app.platform.audit import AUDITED
 from app.platform.database import Base
+from app.tables.accounts import Site
+from app.tables.audit import AuditEvent
 
 _ROOTS = ("participant", "site", "study")
 _SIGNED = ("plan", "policy", "visit_lock", "margins_lock")

@@ -9,9 +9,9 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
-from app.platform.audit import AuditEvent
 from app.platform.database import transaction
+from app.tables.accounts import Role
+from app.tables.audit import AuditEvent
 from tests.conftest import PASSWORD
 
 MEMBERS = "/api/v1/studies/main/members"

@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 from app import cli
 from app.accounts import service as accounts
-from app.accounts.models import Role, Site, Study
 from app.accounts.studies import prefixes, repository
 from app.platform.database import transaction
 from app.platform.errors import Conflict
+from app.tables.accounts import Role, Site, Study
 from tests.conftest import PASSWORD
 
 

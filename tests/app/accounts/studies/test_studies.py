@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 from app import cli
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.accounts.permissions import SYSTEM
 from app.accounts.studies.service import grant, study_to_manage
 from app.platform.database import transaction
+from app.tables.accounts import Role
 from tests.conftest import PASSWORD
 
 Clients = Callable[[str], TestClient]

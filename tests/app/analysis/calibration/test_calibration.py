@@ -12,9 +12,10 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from app.evaluation.models import Evaluation
-from app.planning.plans.models import Plan
-from app.study.models import StudySession, Visit
+from app.tables.evaluations import Evaluation
+from app.tables.plans import Plan
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 from tests.app.evaluations import estimate
 
 Upload = Callable[..., int]

@@ -19,7 +19,8 @@ from sqlalchemy.orm import Session
 from app.analysis.energy.measures import Measure, Pulses, pulses_of, taken
 from app.analysis.evidence.facts import Facts, Side
 from app.study.blinding import Arm
-from app.study.models import Controller, Recording, SessionSegment, Trace
+from app.tables.recordings import Recording, Trace
+from app.tables.sessions import Controller, SessionSegment
 
 PATH = "/api/v1/participants/P1/analyses/energy"
 

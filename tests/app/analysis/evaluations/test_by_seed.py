@@ -10,9 +10,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation.service import store_evaluation
-from app.learning.models import BufferSnapshot
 from app.learning.snapshots.service import take_snapshot
 from app.study.repository import participant_by_code
+from app.tables.learning import BufferSnapshot
 from tests.app.evaluations import estimate, policies  # noqa: F401 (a fixture)
 from tests.app.words import above_fold, drawn_above_fold, methods_named
 

@@ -7,7 +7,7 @@ from itertools import combinations
 import pytest
 
 from app.analysis.metrics.comparisons import ALPHA, Group, compare, group, sessions_needed, smallest_p
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.statistics.ranksum import rank_sum
 
 

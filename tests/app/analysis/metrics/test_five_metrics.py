@@ -9,7 +9,8 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.study.models import CdbsAmplitude, Hemisphere, Visit
+from app.tables.participants import Hemisphere
+from app.tables.visits import CdbsAmplitude, Visit
 from tests.app.words import flat
 
 PATH = "/api/v1/participants/P1/analyses"

@@ -20,7 +20,7 @@ from sqlalchemy.orm import Session
 from app.analysis.pooled.serializers import pooled_out
 from app.analysis.pooled.service import Pooled, PooledController, PooledMetric
 from app.analysis.trial_time.service import TrialTime
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.statistics.within_visits.contrasts import Reason, Unavailable
 from tests.app.analysis.conftest import adder
 
@@ -121,8 +121,8 @@ def test_computation_time_counts_ended_steps(client: TestClient, db: Session, en
     from datetime import UTC, datetime, timedelta
 
     from app.accounts.permissions import SYSTEM
-    from app.platform.jobs.models import Job, JobStatus, JobStep
     from app.study import repository
+    from app.tables.jobs import Job, JobStatus, JobStep
 
     participant = repository.participant_by_code(db, enrolled, SYSTEM)
     start = datetime(2026, 3, 2, tzinfo=UTC)

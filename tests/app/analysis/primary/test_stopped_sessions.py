@@ -16,11 +16,11 @@ from app.analysis.evidence.service import evidence
 from app.analysis.primary.verdict import judged_outcome
 from app.evaluation.ranking.results import driven_sessions
 from app.learning.gate.service import decide
-from app.learning.models import GateChoice
 from app.learning.snapshots.service import collect, take_snapshot
-from app.study.models import Controller
 from app.study.repository import participant_by_code, sessions_of_participant
 from app.study.sessions.data import failed_qoc_of
+from app.tables.learning import GateChoice
+from app.tables.sessions import Controller
 from ml.ope.scale import outcome_table
 from ml.outcomes import OUTCOMES
 from ml.qoc import Margins, Qoc

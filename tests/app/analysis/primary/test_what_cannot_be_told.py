@@ -14,7 +14,7 @@ from app.analysis.evidence.measurements import RESOLUTION
 from app.analysis.primary.verdict import LockedMargins, NoVerdict, VerdictResult, verdicts
 from app.overview.package import recompute
 from app.study.blinding import Arm
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from ml.qoc import Margins, failed_qoc
 from ml.statistics.noninferiority import Inconclusive, NonInferiorAndSaving
 from ml.statistics.within_visits.contrasts import Reason, Unavailable

@@ -9,7 +9,7 @@ from app.accounts.permissions import SYSTEM
 from app.analysis.evidence.service import of_all
 from app.analysis.trial_time.service import of_evidence, trial_time
 from app.study import repository as study
-from app.study.models import Controller
+from app.tables.sessions import Controller
 from tests.app.analysis.conftest import AddSession
 
 

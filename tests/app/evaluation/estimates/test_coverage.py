@@ -20,7 +20,6 @@ from app.accounts.permissions import SYSTEM
 from app.evaluation import wording
 from app.evaluation.estimates.compute import check_coverage
 from app.evaluation.estimates.coverage import CHECKS, VERDICTS, shown_limit, shown_value
-from app.evaluation.models import Evaluation
 from app.evaluation.schemas import CheckOut
 from app.evaluation.service import store_evaluation
 from app.learning.policies.baselines import constant_onnx, ensure_baselines
@@ -30,6 +29,7 @@ from app.overview.package.export import export_participant
 from app.platform import files
 from app.platform.jobs import StepReport
 from app.study.repository import participant_by_code
+from app.tables.evaluations import Evaluation
 from ml.ope.flags import Flag
 from ml.ope.support.coverage import AmplitudeSupport, flags_of
 from ml.ope.support.diagnostics import diagnose

@@ -15,10 +15,10 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.evaluation.estimates import dose_shapes
 from app.evaluation.estimates.compute import evaluate_method
-from app.evaluation.models import Evaluation
 from app.evaluation.wording import shape_pooling
 from app.platform.jobs import StepReport
 from app.study.repository import participant_by_code
+from app.tables.evaluations import Evaluation
 from ml.ope.outcomes.minutes import SHAPES
 from ml.ope.outcomes.pooling import pool
 from ml.ope.posterior.estimator import build

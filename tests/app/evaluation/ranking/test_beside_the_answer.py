@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.learning.models import Policy
+from app.tables.learning import Policy
 from tests.app.evaluations import judged
 from tests.app.words import above_fold
 from tests.ml.ope.posterior.draws import N, cdbs

@@ -14,13 +14,13 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation.models import Evaluation
 from app.evaluation.service import store_evaluation
-from app.learning.models import Policy
 from app.learning.policies.baselines import constant_onnx
 from app.learning.snapshots.service import take_snapshot
 from app.platform.errors import Invalid
 from app.study.repository import participant_by_code
+from app.tables.evaluations import Evaluation
+from app.tables.learning import Policy
 from tests.app.evaluations import estimate
 
 Upload = Callable[..., int]

@@ -13,13 +13,13 @@ from app.accounts.permissions import SYSTEM
 from app.evaluation import repository, wording
 from app.evaluation.ranking.staleness import stale_reasons
 from app.learning.gate.service import decide
-from app.learning.models import GateChoice
 from app.platform.web.charts import counted
-from app.study.doses.drugs import Drug
-from app.study.doses.models import Dose
-from app.study.models import CdbsAmplitude, Hemisphere, StudySession, Trace
 from app.study.repository import participant_by_code, sessions_of_participant
-from app.study.sessions.models import SessionConditions
+from app.tables.learning import GateChoice
+from app.tables.participants import Hemisphere
+from app.tables.recordings import Trace
+from app.tables.sessions import SessionConditions, StudySession
+from app.tables.visits import CdbsAmplitude, Dose, Drug
 from tests.app.evaluations import estimate
 
 Upload = Callable[..., int]

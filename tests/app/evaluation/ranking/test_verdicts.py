@@ -14,7 +14,7 @@ from pypdf import PdfReader
 
 from app.evaluation.ranking.decisions import Circumstances, decide
 from app.learning.policies.baselines import constant_onnx
-from app.study.margins.models import MarginsVersion
+from app.tables.participants import MarginsVersion
 from ml.ope.flags import Flag
 from ml.ope.posterior.further_sessions import Place
 from tests.app.evaluations import judged

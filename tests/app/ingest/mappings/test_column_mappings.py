@@ -16,13 +16,13 @@ from fastapi.testclient import TestClient
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
-from app.accounts.models import Role
 from app.accounts.permissions import Caller, Grant
 from app.ingest.mappings import rules
 from app.ingest.mappings.schemas import MappingIn
 from app.ingest.mappings.service import may_remove
 from app.platform.errors import Invalid
 from app.platform.files import path_of
+from app.tables.accounts import Role
 from tests.app.ingest.conftest import Send
 
 API, PAGE = "/api/v1", {"Accept": "text/html"}

@@ -14,9 +14,10 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.ingest.channels import Place, choose, is_survey, place_of
-from app.study.models import Hemisphere, Recording, Trace
 from app.study.sessions.usable_steps import Worth
 from app.study.traces import pack, unpack
+from app.tables.participants import Hemisphere
+from app.tables.recordings import Recording, Trace
 from tests.app.ingest.conftest import device_zip
 
 LEADS = ["left STN", "", "left M1", ""]

@@ -10,9 +10,10 @@ import pytest
 
 from app.ingest import wording
 from app.ingest.proposals.evidence import BY_CUT, BY_UPLOAD, Evidence, Reason, Source, guess_controller, guess_visit
-from app.study.models import Controller, Visit
 from app.study.sessions.stimulation import Delivered
 from app.study.traces import StepTable
+from app.tables.sessions import Controller
+from app.tables.visits import Visit
 
 nan = float("nan")
 

@@ -14,9 +14,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.overview.package.export import export_participant
-from app.platform.audit import AuditEvent
 from app.platform.errors import Invalid
 from app.study import repository as study
+from app.tables.audit import AuditEvent
 from tests.app.ingest.conftest import device_zip, loose, steady, table
 
 Json = dict[str, Any]

@@ -9,7 +9,8 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.study.models import Recording, SessionSegment
+from app.tables.recordings import Recording
+from app.tables.sessions import SessionSegment
 
 
 def told(answer: dict[str, Any]) -> str:

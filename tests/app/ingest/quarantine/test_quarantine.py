@@ -12,13 +12,12 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.ingest.models import UploadFile
 from app.ingest.quarantine.serializers import problem_of
 from app.ingest.uploads import reading
 from app.ingest.uploads.reading import Cleaned
 from app.platform import files
-from app.platform.audit import AuditEvent
-from app.platform.files import StoredFile
+from app.tables.audit import AuditEvent
+from app.tables.uploads import StoredFile, UploadFile
 from ml.formats.recording import UndecodableFile
 from tests.app.ingest.conftest import device_zip, steady
 

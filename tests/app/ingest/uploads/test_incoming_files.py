@@ -29,7 +29,6 @@ from app.ingest.uploads import service
 from app.ingest.uploads import reading
 from app.ingest.sessions import StatedSession
 from app.platform.database import new_session
-from app.platform.tables import load_tables
 from app.study.repository import participant_by_code
 
 def stay(*_, **__):
@@ -42,7 +41,6 @@ class Slow(io.BytesIO):
             stay()
         return super().read(n)
 
-load_tables()
 if sys.argv[1] == "cleaning":
     reading.clean = stay
 raw = b"t_s,beta,amplitude_fraction,note\\n" + b"".join(b"%d,1,1,NAME-OF-THE-PATIENT\\n" % (2 * k) for k in range(1, 250_000))

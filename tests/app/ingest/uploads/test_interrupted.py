@@ -18,7 +18,6 @@ from typer.testing import CliRunner
 from app.accounts.permissions import SYSTEM
 from app.cli import app as command_line
 from app.ingest import wording
-from app.ingest.models import Upload, UploadFile
 from app.ingest.sessions import StatedSession
 from app.ingest.uploads import reading, service
 from app.ingest.uploads.in_progress import in_progress, interrupted
@@ -28,7 +27,8 @@ from app.ingest.uploads.service import Incoming
 from app.platform.database import new_session
 from app.settings import get_settings
 from app.study import repository as study
-from app.study.models import Controller
+from app.tables.sessions import Controller
+from app.tables.uploads import Upload, UploadFile
 from tests.app.ingest.conftest import Send, steady
 from tests.app.ingest.uploads import readers
 

@@ -17,15 +17,17 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.ingest.models import Upload, UploadFile
 from app.ingest.uploads import reading
 from app.ingest.uploads.interrupted import resume
 from app.platform.errors import Invalid
 from app.platform.jobs.children import limited
 from app.settings import get_settings
 from app.study import repository as study
-from app.study.models import Recording, SettingsVersion, StudySession
 from app.study.traces import MOST_STEPS, step_table
+from app.tables.participants import SettingsVersion
+from app.tables.recordings import Recording
+from app.tables.sessions import StudySession
+from app.tables.uploads import Upload, UploadFile
 from ml import formats
 from ml.formats import archive
 from tests.app.ingest.conftest import Send, device_zip, steady, table
@@ -40,10 +42,8 @@ from app.ingest.uploads import reading
 from app.ingest.uploads.interrupted import resume
 from app.ingest.sessions import StatedSession
 from app.platform.database import new_session
-from app.platform.tables import load_tables
 from app.study.repository import participant_by_code
 
-load_tables()
 if sys.argv[2] == "slowly":
     reading.DECODE = "tests.app.ingest.uploads.readers:sleep"
 else:

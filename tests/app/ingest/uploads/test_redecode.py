@@ -18,7 +18,7 @@ from app.ingest.uploads import reading, recordings
 from app.ingest.uploads import redecode as module
 from app.ingest.uploads.redecode import redecode
 from app.platform import files
-from app.study.models import Recording, Trace
+from app.tables.recordings import Recording, Trace
 from ml import formats
 from ml.formats.recording import DECODE_VERSION, DecodedFile
 from tests.app.ingest.conftest import device_zip, steady

@@ -12,10 +12,9 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.ingest.models import UploadFile
 from app.ingest.uploads import reading
-from app.platform.files import StoredFile
 from app.settings import get_settings
+from app.tables.uploads import StoredFile, UploadFile
 from ml.formats.recording import UndecodableFile
 from tests.app.ingest.conftest import steady
 from tests.app.ingest.proposals.test_proposals import correct, post

@@ -11,9 +11,9 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.models import BufferGateDecision
 from app.learning.snapshots.service import collect
 from app.study.repository import participant_by_code
+from app.tables.learning import BufferGateDecision
 
 Upload = Callable[..., int]
 GATE = "/api/v1/participants/P1/buffer-gate"

@@ -9,14 +9,14 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.models import BufferSnapshot
 from app.learning.policies.baselines import constant_onnx
 from app.learning.policies.learned_earlier import Learned, add_learned
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.snapshots.service import take_snapshot
 from app.platform.errors import Conflict, Invalid
 from app.study import repository as study
-from app.study.models import Participant
+from app.tables.learning import BufferSnapshot
+from app.tables.participants import Participant
 from ml.trajectories import ReplayBuffer
 from tests.app.conftest import Upload
 

@@ -13,13 +13,13 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.models import Policy
 from app.learning.policies.baselines import constant_onnx, ensure_baselines, proportional_onnx
 from app.learning.schemas import DistilParams
 from app.learning.snapshots.service import collect, take_snapshot
 from app.learning.training.configs import distillation_config
 from app.platform import files
 from app.study.repository import participant_by_code
+from app.tables.learning import Policy
 from ml.deploy.bundle import verify_bundle
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy

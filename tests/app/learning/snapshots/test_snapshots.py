@@ -12,13 +12,14 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.models import BufferSnapshot
 from app.learning.snapshots.service import take_snapshot
 from app.platform import files
 from app.platform.database import new_session
 from app.platform.errors import Invalid
-from app.study.models import Participant, Trace
 from app.study.repository import participant_by_code
+from app.tables.learning import BufferSnapshot
+from app.tables.participants import Participant
+from app.tables.recordings import Trace
 from ml.qoc import failed_qoc
 from ml.trajectories import ReplayBuffer, from_parquet
 

@@ -14,7 +14,6 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.learning import wording
-from app.learning.models import Policy, Sweep
 from app.learning.policies.baselines import constant_onnx
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.snapshots.service import take_snapshot
@@ -24,6 +23,7 @@ from app.learning.training.compute import best_supported, stored_gains
 from app.platform import files
 from app.platform.jobs import service as jobs
 from app.study.repository import participant_by_code
+from app.tables.learning import Policy, Sweep
 from ml.ope.posterior.gains import PosteriorGain
 from ml.policies.policy import ConstantPolicy
 from ml.population.virtual import world

@@ -11,12 +11,12 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.learning.models import Policy
 from app.learning.schemas import DEFAULT_SWEEP, AlgorithmName, TrainParams
 from app.learning.sweeps.comparison import Candidate, better_without_learning, held_near
 from app.learning.training.compute import CONSTANT_GRID, with_best_anchor
 from app.learning.training.configs import ANCHORED, CLOSE, LOOSE, training_groups
 from app.platform import files
+from app.tables.learning import Policy
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.population.virtual import world
 from ml.rl import ALGORITHMS, TrainedPolicy

@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.accounts.models import Study, User
+from app.tables.accounts import Study, User
 from tests.app.pages.entries.test_errors_at_fields import Sent, held_against, refused
 
 TEMPLATES = Path(__file__).parents[4] / "app" / "templates"

@@ -11,11 +11,11 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.ingest.models import ColumnMapping
-from app.learning.models import Policy
 from app.learning.policies.baselines import constant_onnx
 from app.learning.snapshots.service import take_snapshot
 from app.study.repository import participant_by_code
+from app.tables.learning import Policy
+from app.tables.uploads import ColumnMapping
 from tests.app.evaluations import policies as policies
 from tests.app.pages.entries.test_errors_at_fields import WHY, Sent, refused
 from tests.app.pages.entries.test_errors_of_files_and_visits import UNKNOWN

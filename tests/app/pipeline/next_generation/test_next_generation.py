@@ -11,8 +11,6 @@ from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation.models import Evaluation
-from app.learning.models import Policy
 from app.learning.schemas import DEFAULT_SWEEP, TrainParams
 from app.learning.snapshots.service import take_snapshot
 from app.learning.training.configs import generation_groups, training_groups
@@ -20,8 +18,10 @@ from app.pipeline.next_generation.job import judging_call
 from app.pipeline.next_generation.parents import best
 from app.pipeline.params import NextGenerationParams
 from app.pipeline.training import training_starts
-from app.platform.jobs.models import Job
 from app.study.repository import participant_by_code
+from app.tables.evaluations import Evaluation
+from app.tables.jobs import Job
+from app.tables.learning import Policy
 from ml.rl.algorithms.rebrac import RebracConfig
 from tests.app.evaluations import judged
 

@@ -15,14 +15,15 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.models import Policy
 from app.planning.bundles.repository import releases
 from app.planning.bundles.service import approvals
 from app.planning.plans.limits import device_limits
 from app.platform import files
-from app.platform.audit import AuditEvent
-from app.study.models import Device, Hemisphere, Recording
 from app.study.repository import participant_by_code
+from app.tables.audit import AuditEvent
+from app.tables.learning import Policy
+from app.tables.participants import Hemisphere
+from app.tables.recordings import Device, Recording
 from ml.deploy.bundle import open_bundle, verify_bundle
 from ml.deploy.runtime.envelope import BetaSample, Signal
 from ml.rl import MlpPolicy

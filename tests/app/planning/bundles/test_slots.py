@@ -21,7 +21,7 @@ from app.planning.plans.view import read_plan
 from app.planning.sheet.content import card_of
 from app.platform import files
 from app.platform.errors import Invalid
-from app.study.models import Visit
+from app.tables.visits import Visit
 from app.tablet.command import control, lines, verified
 from app.tablet.live import run_live
 from app.tablet.sources import Wish

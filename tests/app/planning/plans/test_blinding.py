@@ -12,7 +12,7 @@ from pypdf import PdfReader
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.platform.audit import AuditEvent
+from app.tables.audit import AuditEvent
 
 PAGE = {"Accept": "text/html"}
 

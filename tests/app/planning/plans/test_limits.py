@@ -6,7 +6,7 @@ import pytest
 
 from app.planning.plans.limits import DeviceLimits, SlotLimits, StatedLimits, slot_limits
 from app.platform.errors import Invalid
-from app.study.models import Controller
+from app.tables.sessions import Controller
 
 NONE = StatedLimits()
 

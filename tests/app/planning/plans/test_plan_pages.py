@@ -9,8 +9,8 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.planning.plans.models import Plan
-from app.study.models import Visit
+from app.tables.plans import Plan
+from app.tables.visits import Visit
 from tests.app.words import above_fold
 
 PAGE = {"Accept": "text/html"}

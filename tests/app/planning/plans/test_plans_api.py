@@ -12,11 +12,11 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.evaluation.estimates.rows import estimate_of
-from app.evaluation.models import Evaluation
 from app.evaluation.service import store_evaluation
-from app.learning.models import BufferSnapshot, Policy
-from app.planning.plans.models import Plan
-from app.platform.audit import AuditEvent
+from app.tables.audit import AuditEvent
+from app.tables.evaluations import Evaluation
+from app.tables.learning import BufferSnapshot, Policy
+from app.tables.plans import Plan
 
 PASSWORD = "correct horse battery"
 

@@ -13,12 +13,12 @@ from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.models import Policy
-from app.planning.plans.models import Plan
 from app.planning.plans.view import PlanView, read_plan, refuse_running
 from app.platform.errors import Conflict
-from app.platform.signatures.models import Signature
 from app.study import repository as study
+from app.tables.audit import Signature
+from app.tables.learning import Policy
+from app.tables.plans import Plan
 
 PASSWORD = "correct horse battery"
 PAGE = {"Accept": "text/html"}

@@ -15,9 +15,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation.ranking.service import current
-from app.learning.models import BufferSnapshot, Policy
 from app.planning.plans.suggested import suggested as suggested_of
 from app.study.repository import participant_by_code
+from app.tables.learning import BufferSnapshot, Policy
 from ml.ope.posterior.portfolio import portfolio
 from tests.app.evaluations import judge as judge
 from tests.app.evaluations import judged

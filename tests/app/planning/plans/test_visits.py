@@ -10,8 +10,8 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.platform.audit import AuditEvent
-from app.study.models import Visit
+from app.tables.audit import AuditEvent
+from app.tables.visits import Visit
 
 PAGE = {"Accept": "text/html"}
 

@@ -6,7 +6,7 @@ from datetime import time
 
 from app.planning.protocol.medication import due_before
 from app.study.characteristics.schemas import PlannedDose
-from app.study.doses.drugs import Drug
+from app.tables.visits import Drug
 
 SCHEDULE = [PlannedDose(drug=Drug.LEVODOPA, mg=mg, at=at) for mg, at in ((100.0, "07:00"), (50.0, "09:20"), (100.0, "12:00"))]
 

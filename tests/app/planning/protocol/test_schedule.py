@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from app.planning.protocol.schedule import Candidate, PlannedSession, Rule, Rules, cdbs_sessions, most_policies, schedule, total_minutes
 from app.planning.protocol.session_order import Order
 from app.platform.errors import Invalid
-from app.study.models import Controller
+from app.tables.sessions import Controller
 
 LEARNED = {Controller.RL, Controller.DISTILLED}
 

@@ -11,10 +11,10 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
-from app.learning.models import Policy
 from app.platform import files
-from app.platform.signatures.models import Signature
 from app.settings import get_settings
+from app.tables.audit import Signature
+from app.tables.learning import Policy
 from ml.rl import MlpPolicy
 from tests.app.planning.serious_events import clear, event
 from tests.conftest import PASSWORD

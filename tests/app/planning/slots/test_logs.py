@@ -10,7 +10,7 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
-from app.planning.plans.models import Plan
+from app.tables.plans import Plan
 from ml.deploy.runtime.decision_log import description_line, kind_line
 from tests.app.words import flat
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, date, datetime, timedelta
 
 from app.planning.slots.matching import Deviation, Done, Match, Planned, match
-from app.study.models import Controller
+from app.tables.sessions import Controller
 
 DAY = date(2026, 3, 2)
 NINE = datetime(2026, 3, 2, 9, tzinfo=UTC)

@@ -10,7 +10,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.study.models import StudySession
+from app.tables.sessions import StudySession
 from tests.app.words import flat
 
 DAY = "2026-04-06"

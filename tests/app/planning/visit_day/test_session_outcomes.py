@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.planning.visit_day.session_outcomes import take_outcomes
-from app.study.models import StudySession
+from app.tables.sessions import StudySession
 
 TABLE = "t_s,beta,amplitude_fraction\n" + "".join(f"{2 * k},1,1\n" for k in range(-9, 31))
 

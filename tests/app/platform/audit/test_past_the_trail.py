@@ -11,11 +11,11 @@ from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
 from app import cli
-from app.platform.audit import AuditEvent
 from app.platform.audit.breaks import BreakKind
 from app.platform.audit.chain import verify
 from app.platform.database import new_session
 from app.platform.signatures.service import content_hash
+from app.tables.audit import AuditEvent
 from tests.app.every_route import World
 from tests.conftest import PASSWORD
 

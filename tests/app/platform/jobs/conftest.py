@@ -22,8 +22,8 @@ from sqlalchemy.orm import Session
 from app.platform.database import new_session, transaction
 from app.platform.jobs import repository, service
 from app.platform.jobs.children.forked import MODULE as FORKING
-from app.platform.jobs.models import Job
 from app.settings import get_settings
+from app.tables.jobs import Job
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[3]

@@ -21,12 +21,12 @@ from app.platform.jobs.children.slots import Slots
 from app.platform.jobs.children.supervisor import ChildMessages
 from app.platform.jobs.errors import JobCancelled
 from app.platform.jobs.ledger import Ledger
-from app.platform.jobs.models import JobStatus
 from app.platform.jobs.steps import JobRunner
 from app.platform.jobs.stream import job_events
 from app.platform.jobs.watch import show_progress, watch
 from app.platform.jobs.worker import Identity, IdentityLost, Pace, WorkerMonitor
 from app.settings import get_settings
+from app.tables.jobs import JobStatus
 
 
 def test_a_free_slot_goes_to_the_job_that_has_the_fewest():

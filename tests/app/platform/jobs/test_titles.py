@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from app.platform.jobs.models import Job, JobEvent, JobStatus, JobStep
 from app.platform.jobs.stream import describe, shown
 from app.platform.jobs.titles import failure, numbered, plain_words, reason
+from app.tables.jobs import Job, JobEvent, JobStatus, JobStep
 from ml.ope.registry import methods
 from tests.app.words import methods_named
 

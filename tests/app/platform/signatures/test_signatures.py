@@ -10,14 +10,13 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
-from app.accounts.models import Role, SignInAttempt
 from app.accounts.permissions import SYSTEM, Caller
 from app.accounts.signing import sign
-from app.platform.audit import AuditEvent
 from app.platform.errors import Forbidden, TooMany
-from app.platform.signatures.models import Signature
 from app.platform.signatures.repository import signatures_of
 from app.platform.signatures.service import content_hash, covers
+from app.tables.accounts import Role, SignInAttempt
+from app.tables.audit import AuditEvent, Signature
 
 PASSWORD = "correct horse battery"
 CONTENT: dict[str, Any] = {"order": ["cdbs", "rl"], "max_ma": 3.0, "note": "Łódź", "limits": {"b": 0.1, "a": None}}

@@ -16,10 +16,10 @@ from typer.testing import CliRunner
 from app.cli import app as command_line
 from app.platform.database import now, transaction
 from app.platform.jobs import JobKind, register, registry, service
-from app.platform.jobs.models import Worker
 from app.platform.jobs.service import STALE_S
 from app.platform.upkeep import doctor
 from app.settings import get_settings
+from app.tables.jobs import Worker
 from tests.app.platform.upkeep.small_disks import small_disk
 from tests.conftest import close_connections
 

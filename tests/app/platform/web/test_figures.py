@@ -10,8 +10,8 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts import service
-from app.accounts.models import Role, Scope
 from app.settings import get_settings
+from app.tables.accounts import Role, Scope
 from tests.conftest import PASSWORD
 
 FIGURES, DESCRIPTION = "/metrics", "/api/v1/openapi.json"

@@ -15,8 +15,9 @@ from app.accounts.permissions import SYSTEM
 from app.platform.errors import Conflict
 from app.study.characteristics import service
 from app.study.characteristics.schemas import CharacteristicsFields, Lead, Target
-from app.study.models import Hemisphere, Participant, StudySession
 from app.study.outcomes import service as outcomes
+from app.tables.participants import Hemisphere, Participant
+from app.tables.sessions import StudySession
 
 NewFile = Callable[[StudySession], int]
 LEFT, RIGHT = Hemisphere.LEFT, Hemisphere.RIGHT

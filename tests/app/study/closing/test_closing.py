@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 from app import cli
 from app.accounts.permissions import SYSTEM
 from app.pipeline.service import start_job
-from app.platform.audit import AuditEvent
 from app.platform.errors import Conflict
-from app.platform.jobs.models import Job, JobStatus
 from app.study import repository as study
+from app.tables.audit import AuditEvent
+from app.tables.jobs import Job, JobStatus
 from tests.app.conftest import table
 from tests.conftest import PASSWORD
 

@@ -10,8 +10,8 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
-from app.accounts.models import Role
 from app.platform.database import transaction
+from app.tables.accounts import Role
 from tests.conftest import PASSWORD
 
 HOME = "/api/v1/participants/P1/data-queries"

@@ -14,17 +14,18 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.models import BufferSnapshot
 from app.platform import files
 from app.platform.database import new_session
 from app.study import service as study
 from app.study.doses import service
-from app.study.doses.drugs import DRUGS, Drug, levodopa_equivalent_mg
+from app.study.doses.drugs import DRUGS, levodopa_equivalent_mg
 from app.study.doses.schemas import DoseIn
 from app.study.doses.since import disagreement_h, since_last_dose
-from app.study.models import StudySession
 from app.study.schemas import SessionChange
 from app.study.sessions.contradictions import Kind, contradictions
+from app.tables.learning import BufferSnapshot
+from app.tables.sessions import StudySession
+from app.tables.visits import Drug
 from ml.trajectories import from_parquet
 from tests.app.study.conftest import START
 from tests.conftest import PASSWORD

@@ -9,9 +9,9 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
 
-from app.platform.audit import AuditEvent
 from app.platform.database import new_session
 from app.study.enrolment.codes import CodeQuestion, questions
+from app.tables.audit import AuditEvent
 
 TODAY = date(2026, 11, 22)
 NAME, YEAR, DATE = CodeQuestion.NAME, CodeQuestion.BIRTH_YEAR, CodeQuestion.BIRTH_DATE

@@ -11,14 +11,15 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.platform.audit import AuditEvent
 from app.platform.errors import Invalid
 from app.study import blinding, service
-from app.study.models import Controller, Hemisphere, StudySession
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
-from app.study.outcomes.models import TremorSeries
 from app.study.schemas import QocIn, SessionChange
+from app.tables.audit import AuditEvent
+from app.tables.outcomes import TremorSeries
+from app.tables.participants import Hemisphere
+from app.tables.sessions import Controller, StudySession
 from tests.app.study.conftest import minutes
 
 NewFile = Callable[[StudySession], int]

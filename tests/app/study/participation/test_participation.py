@@ -11,8 +11,8 @@ from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
 from app import cli
-from app.platform.audit import AuditEvent
 from app.platform.errors import Invalid
+from app.tables.audit import AuditEvent
 
 Upload = Callable[..., int]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.study.models import Recording, Trace
 from app.study.recordings.charts import Stretch, trace_charts
 from app.study.traces import pack
+from app.tables.recordings import Recording, Trace
 
 
 def trace(channel: str, valid: int, n: int = 10) -> Trace:

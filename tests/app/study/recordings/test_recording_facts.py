@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from app.study.models import Recording
 from app.study.recordings.charts import Stretch, clock_chart, spectrum_charts, trace_charts
 from app.study.recordings.facts import (
     amplitude_limits,
@@ -13,6 +12,7 @@ from app.study.recordings.facts import (
     sensing_configurations,
     valid_shares,
 )
+from app.tables.recordings import Recording
 
 
 def recording(**details: Any) -> Recording:

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.study.models import Controller, Recording
 from app.study.recordings.tablet import Battery, Latency, by_controller, of_recording
+from app.tables.recordings import Recording
+from app.tables.sessions import Controller
 
 
 def log(**said: Any) -> Recording:

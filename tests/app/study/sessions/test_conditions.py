@@ -12,8 +12,8 @@ from sqlalchemy import text
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
-from app.study.models import Hemisphere
 from app.study.sessions.programming import Program, differences
+from app.tables.participants import Hemisphere
 from tests.app.ingest.conftest import device_zip, table
 
 ROWS = [(2 * k, 1.0, 0.4 if k == 0 else 0.7) for k in range(-9, 21)]

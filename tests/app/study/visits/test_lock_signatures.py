@@ -10,8 +10,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
-from app.platform.audit import AuditEvent
-from app.platform.signatures.models import Signature
+from app.tables.audit import AuditEvent, Signature
 from tests.conftest import PASSWORD
 
 Upload = Callable[..., int]

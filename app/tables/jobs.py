@@ -6,11 +6,19 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, Index, String, Text, UniqueConstraint, func
+from sqlalchemy import (
+    BigInteger,
+    CheckConstraint,
+    ForeignKey,
+    Index,
+    String,
+    Text,
+    UniqueConstraint,
+    func,
+)
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
-from app.platform.jobs.titles import failure, plain_words, reason
 
 
 class JobStatus(StrEnum):
@@ -29,6 +37,7 @@ class JobStatus(StrEnum):
 
 
 _LEAST_PROGRESS = 0.05
+
 _STATUS_CHECK = "status in ('queued', 'running', 'succeeded', 'failed', 'cancelled')"
 
 
@@ -66,11 +75,6 @@ class Job(Base):
             return None
         return (present - self.started_at).total_seconds() * (1 - self.progress) / self.progress
 
-    @property
-    def doing(self) -> str:
-        """What it does now, or why it failed, in words without methods."""
-        return failure(self.message) if self.message and self.status == JobStatus.FAILED else plain_words(self.message)
-
 
 class JobStep(Base):
     """One compute step of a job, run in a child process of its own; `key` is stable over restarts (`train/2`)."""
@@ -97,11 +101,6 @@ class JobStep(Base):
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
     job: Mapped[Job] = relationship(back_populates="steps")
-
-    @property
-    def doing(self) -> str:
-        """What it does now, or why it failed, in words without methods; nothing where only engineers could read it."""
-        return reason(self.message) if self.status == JobStatus.FAILED else plain_words(self.message)
 
 
 class JobEvent(Base):

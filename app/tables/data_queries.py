@@ -5,11 +5,18 @@ from __future__ import annotations
 from datetime import datetime
 from enum import StrEnum
 
-from sqlalchemy import CheckConstraint, ForeignKey, String, Text, func
+from sqlalchemy import (
+    CheckConstraint,
+    ForeignKey,
+    String,
+    Text,
+    func,
+)
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
-from app.study.models import Participant, StudySession
+from app.tables.participants import Participant
+from app.tables.sessions import StudySession
 
 
 class QueryState(StrEnum):

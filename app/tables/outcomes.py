@@ -1,15 +1,79 @@
-"""Tables of what uploaded files say of QoCs."""
+"""Tables of outcomes: a column per outcome and margin from `ml.outcomes`, and what uploaded files say of them."""
 
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, LargeBinary, String, func
-from sqlalchemy.orm import Mapped, mapped_column
+from sqlalchemy import (
+    CheckConstraint,
+    Double,
+    ForeignKey,
+    Index,
+    LargeBinary,
+    SmallInteger,
+    String,
+    Text,
+    UniqueConstraint,
+    func,
+)
+from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import ONE_STANDING, Base
-from app.study.models import Hemisphere
+from app.tables.participants import Hemisphere
+from ml.outcomes import OUTCOMES, Outcome
+
+if TYPE_CHECKING:
+    from app.tables.sessions import StudySession
+
+
+def value_checks() -> tuple[CheckConstraint, ...]:
+    """Return the range of each outcome as a constraint of its column."""
+    return tuple(CheckConstraint(_range(o), name=o.key) for o in OUTCOMES)
+
+
+class HasOutcomes:
+    """A row with a column per outcome."""
+
+    def value(self, outcome: Outcome) -> float | None:
+        """Return the value of an outcome; None where not measured."""
+        found: float | None = getattr(self, outcome.field)
+        return found
+
+
+def add_value_columns(table: type[Base]) -> None:
+    """Add a column per outcome to a table, null where not measured."""
+    for o in OUTCOMES:
+        setattr(table, o.field, mapped_column(SmallInteger if o.whole else Double, nullable=True))
+
+
+def _range(o: Outcome) -> str:
+    if o.below is not None:
+        return f"{o.field} >= {o.low:g} and {o.field} < {o.below:g}"
+    return f"{o.field} between {o.low:g} and {o.high:g}"
+
+
+class QocRevision(HasOutcomes, Base):
+    """End-of-session QoCs of a session, a column per outcome; a correction is a new revision."""
+
+    __tablename__ = "qoc"
+    __table_args__ = (
+        UniqueConstraint("session_id", "revision"),
+        *value_checks(),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    session_id: Mapped[int] = mapped_column(ForeignKey("session.id", ondelete="CASCADE"), index=True)
+    revision: Mapped[int]
+    entered_by: Mapped[str] = mapped_column(String(254))
+    reason: Mapped[str | None] = mapped_column(Text)
+    derived: Mapped[list[Any]] = mapped_column(server_default="[]")
+    """Names of the QoCs that stand in this revision as they were derived from uploaded files, not as a person typed them."""
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    session: Mapped[StudySession] = relationship(back_populates="qocs")
+
+
+add_value_columns(QocRevision)
 
 
 class TremorSeries(Base):

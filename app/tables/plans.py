@@ -1,16 +1,32 @@
-"""Tables of visit plans."""
+"""Tables of visit plans, of the bundles taken for them, and of what was entered on the clinic day."""
 
 from __future__ import annotations
 
+import uuid
 from datetime import datetime, time
-from typing import Any, Final
+from typing import Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, SmallInteger, String, Text, UniqueConstraint, and_, func
+import sqlalchemy as sa
+from sqlalchemy import (
+    BigInteger,
+    CheckConstraint,
+    ForeignKey,
+    Index,
+    SmallInteger,
+    String,
+    Text,
+    UniqueConstraint,
+    Uuid,
+    and_,
+    func,
+)
 from sqlalchemy.dialects.postgresql import JSONB
-from sqlalchemy.orm import Mapped, mapped_column, relationship
+from sqlalchemy.orm import Mapped, column_property, mapped_column, relationship
 
 from app.platform.database import Base
-from app.study.models import HEMISPHERE_CHECK, Controller, Hemisphere
+from app.tables.participants import HEMISPHERE_CHECK, Hemisphere
+from app.tables.sessions import Controller, StudySession
+from app.tables.visits import Visit
 
 
 class Plan(Base):
@@ -106,10 +122,79 @@ class PlanItem(Base):
     controllers and in plans of before."""
 
 
-NEAR: Final = "near"
-"""The design of a session held near a stated amplitude."""
+class BundleRelease(Base):
+    """A controller bundle that left the service: who took which policy within which limits, and with whose approval. Insert only.
+
+    `policy_id` is null where the session's amplitudes were laid out beforehand, `plan_item_id` where the bundle is for no planned session.
+    `approvals` holds the sign-offs that stood in the manifest; null for bundles taken before they were recorded here. `content_sha256` is
+    of what the bundle holds but who took it first and when: who takes the same gets the same bytes; null for bundles of earlier versions.
+    """
+
+    __tablename__ = "bundle_release"
+    __table_args__ = (
+        CheckConstraint("hemisphere in ('left', 'right')", name="hemisphere"),
+        CheckConstraint("policy_id is not null or plan_item_id is not null", name="what"),
+        CheckConstraint("min_ma >= 0 and min_ma <= cdbs_ma and cdbs_ma <= max_ma and ramp_ma_per_s > 0", name="limits"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    policy_id: Mapped[int | None] = mapped_column(ForeignKey("policy.id"), index=True)
+    plan_item_id: Mapped[int | None] = mapped_column(ForeignKey("plan_item.id"), index=True)
+    sha256: Mapped[str] = mapped_column(ForeignKey("stored_file.sha256"))
+    content_sha256: Mapped[str | None] = mapped_column(String(64), index=True)
+    hemisphere: Mapped[Hemisphere | None] = mapped_column(String(10))
+    min_ma: Mapped[float]
+    max_ma: Mapped[float]
+    cdbs_ma: Mapped[float]
+    ramp_ma_per_s: Mapped[float]
+    approvals: Mapped[list[dict[str, Any]] | None] = mapped_column(JSONB(none_as_null=True))
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
 
 
-def is_held(item: PlanItem) -> bool:
-    """Whether a session is held near a stated amplitude."""
-    return item.design is not None and item.design["design"] == NEAR
+KINDS = (
+    "start", "stop", "stop_cause", "rating", "grasp", "dyskinesia", "speech", "gait", "note", "adverse_event", "skip", "repeat",
+    "session_end", "clinical_settings", "dose",
+)  # fmt: skip
+
+OF_THE_DAY = ("note", "adverse_event", "clinical_settings", "dose")
+"""Kinds that may belong to the day as a whole; all others belong to one session of the plan."""
+
+
+class DayEntry(Base):
+    """One thing that somebody entered on the clinic day. Insert only; a correction is a new entry that names what it replaces.
+
+    `device_time` is as the tablet's clock had it, `clock_offset_ms` what must be added to it to have the service's time, as last measured
+    by the tablet; null where the tablet had not reached the service yet.
+    """
+
+    __tablename__ = "day_entry"
+    __table_args__ = (
+        CheckConstraint(f"kind in ({', '.join(repr(k) for k in KINDS)})", name="kind"),
+        CheckConstraint("(plan_item_id is null) = (attempt is null) and attempt >= 1", name="attempt"),
+        CheckConstraint(f"plan_item_id is not null or kind in ({', '.join(repr(k) for k in OF_THE_DAY)})", name="session"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    uuid: Mapped[uuid.UUID] = mapped_column(Uuid, unique=True)
+    plan_id: Mapped[int] = mapped_column(ForeignKey("plan.id"), index=True)
+    plan_item_id: Mapped[int | None] = mapped_column(ForeignKey("plan_item.id"), index=True)
+    attempt: Mapped[int | None] = mapped_column(SmallInteger)
+    kind: Mapped[str] = mapped_column(String(20))
+    payload: Mapped[dict[str, Any]]
+    replaces: Mapped[list[Any]] = mapped_column(server_default="[]")
+    """Identifiers of the entries that this one corrects or decides between."""
+    device_time: Mapped[datetime]
+    clock_offset_ms: Mapped[int | None] = mapped_column(BigInteger)
+    received_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    entered_by: Mapped[str] = mapped_column(String(254))
+
+
+_SIGNED = (Plan.visit_id == Visit.id, Plan.status == "approved", Plan.blinded)
+# a column of the visit costs a list of visits no query
+Visit.sealed = column_property(sa.exists().where(*_SIGNED, Plan.key_opened_at.is_(None)).correlate(Visit.__table__))
+_OPENED = sa.select(func.max(Plan.key_opened_at)).where(*_SIGNED)
+Visit.unsealed_at = column_property(_OPENED.correlate(Visit.__table__).scalar_subquery())
+_LETTER = sa.select(PlanItem.label).where(PlanItem.id == StudySession.plan_item_id)
+StudySession.letter = column_property(_LETTER.correlate(StudySession.__table__).scalar_subquery())

@@ -1,16 +1,37 @@
-"""Tables of uploads: what arrived, from whom, and what was made of it."""
+"""Tables of files: bytes that the service stores, uploads, and what was made of them."""
 
 from __future__ import annotations
 
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import BigInteger, CheckConstraint, ForeignKey, Index, String, Text, UniqueConstraint, func
+from sqlalchemy import (
+    BigInteger,
+    CheckConstraint,
+    ForeignKey,
+    Index,
+    String,
+    Text,
+    UniqueConstraint,
+    func,
+)
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
-from app.study.models import StudySession
+from app.tables.sessions import StudySession
 from ml.formats.tables.mapping import TableMapping
+
+
+class StoredFile(Base):
+    """Bytes that the content-addressed folder holds."""
+
+    __tablename__ = "stored_file"
+    __table_args__ = (CheckConstraint("sha256 ~ '^[0-9a-f]{64}$'", name="sha256"), CheckConstraint("size >= 0", name="size"))
+
+    sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
+    size: Mapped[int] = mapped_column(BigInteger)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+
 
 PREVIEW = "preview"
 """Member of a file's report: what may be shown of a table that waits for a column mapping."""
