@@ -1,14 +1,14 @@
-"""A matrix as a small picture: PNG with a palette, written by the standard library alone, for figures that need no script."""
+"""Matrices as small PNG pictures with a palette, for figures that need no script."""
 
 from __future__ import annotations
 
 import base64
-import struct
-import zlib
+import io
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 STOPS = ((24, 16, 66), (56, 44, 128), (40, 92, 150), (28, 138, 138), (86, 182, 98), (196, 212, 64), (253, 236, 150))
 """Colours from low to high; their lightness rises evenly, so that the picture also reads in grey."""
@@ -35,17 +35,8 @@ def picture(values: NDArray[np.floating], low: float, high: float) -> str:
     share = np.clip((values - low) / ((high - low) or 1.0), 0.0, 1.0)
     known = np.isfinite(values)
     indices = np.where(known, 1 + np.round(254 * np.where(known, share, 0.0)), 0).astype(np.uint8)
-    rows, columns = indices.shape
-    lines = np.concatenate([np.zeros((rows, 1), np.uint8), indices], axis=1).tobytes()
-    colours = b"\0\0\0" + palette().tobytes()
-    parts = (
-        (b"IHDR", struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)),
-        (b"PLTE", colours),
-        (b"tRNS", b"\0"),
-        (b"IDAT", zlib.compress(lines, 6)),
-        (b"IEND", b""),
-    )
-    content = b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in parts
-    )
-    return "data:image/png;base64," + base64.b64encode(content).decode()
+    image = Image.fromarray(indices, "P")
+    image.putpalette(b"\0\0\0" + palette().tobytes())
+    content = io.BytesIO()
+    image.save(content, "PNG", transparency=0)
+    return "data:image/png;base64," + base64.b64encode(content.getvalue()).decode()

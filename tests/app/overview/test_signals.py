@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import os
 import re
@@ -12,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from PIL import Image
 
 from app.overview.signals import compute, service
 from app.overview.signals.figures import chart_figure
@@ -160,14 +163,13 @@ def test_a_stretch_of_a_million_samples_is_drawn_fluidly(tmp_path: Path) -> None
 
 
 def test_a_picture_has_its_size_its_colours_and_nothing_where_nothing_is_known() -> None:
-    import base64
-    import struct
-    import zlib
-
     values = np.array([[0.0, 1.0, np.nan], [2.0, -5.0, 9.0]])
     content = base64.b64decode(picture(values, 0.0, 2.0).removeprefix("data:image/png;base64,"))
-    assert struct.unpack(">II", content[16:24]) == (3, 2)
-    at = content.index(b"IDAT")
-    (length,) = struct.unpack(">I", content[at - 4 : at])
-    assert list(zlib.decompress(content[at + 4 : at + 4 + length])) == [0, 1, 128, 0, 0, 255, 1, 255]
+    drawn = np.asarray(Image.open(io.BytesIO(content)).convert("RGBA"))
+    first, last = [*palette()[0].tolist(), 255], [*palette()[-1].tolist(), 255]
+    assert drawn.shape == (2, 3, 4)
+    assert drawn[0, 0].tolist() == first == drawn[1, 1].tolist()
+    assert drawn[0, 1].tolist() == [*palette()[127].tolist(), 255]
+    assert drawn[0, 2, 3] == 0
+    assert drawn[1, 0].tolist() == last == drawn[1, 2].tolist()
     assert palette()[0].tolist() == [24, 16, 66]
