@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
@@ -327,3 +329,12 @@ def test_what_does_not_exist_is_found(markdown: str, says: str) -> None:
 )
 def test_what_exists_is_let_pass(markdown: str) -> None:
     assert wrong(markdown, ROOT / "README.md") == []
+
+
+def test_change_fragments_have_a_type_that_the_changelog_knows() -> None:
+    names = [path.name for path in (ROOT / "changes").glob("[!.]*")]
+    assert [name for name in names if not re.fullmatch(r"\+[a-z0-9-]+\.(added|changed|fixed)\.md", name)] == []
+    drafted = subprocess.run(
+        [sys.executable, "-m", "towncrier", "build", "--draft", "--version", "0"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert drafted.returncode == 0, drafted.stderr
