@@ -27,6 +27,7 @@ from app.platform.errors import DatabaseAway
 from app.platform.files import prune_copies_beside, remove_abandoned
 from app.platform.upkeep.doctor import newest_revision, revision
 from app.platform.web import middleware as web
+from app.platform.web import templates
 from app.platform.web.compression import CompressedFiles
 from app.platform.web.schemas import problems
 from app.platform.web.templates import STATIC
@@ -162,9 +163,9 @@ def _built() -> FastAPI:
     app.include_router(_service_routes())
     app.mount("/static/plotly", CompressedFiles(packages=[(plotly.__name__, "package_data")]))
     app.mount("/static", _Static(directory=STATIC))
-    app.state.outlook = outlook  # of the analyses, for the plan, which stands before them
     app.state.description = DESCRIPTION
-    app.state.slots_of_visit = slots_of_visit  # of the plan, for the page of the visit
+    templates.provide(templates.Part.OUTLOOK, outlook)
+    templates.provide(templates.Part.SLOTS_OF_VISIT, slots_of_visit)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
 

@@ -7,18 +7,20 @@ from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Any, NamedTuple
 
-from sqlalchemy import ARRAY, ColumnElement, Integer, Select, any_, cast, column, false, func, or_, select, table, true
-from sqlalchemy.dialects.postgresql import JSONB
+from sqlalchemy import ARRAY, ColumnElement, Integer, Select, any_, cast, false, func, or_, select, true
 from sqlalchemy.orm import Session, contains_eager, joinedload, lazyload, selectinload
 
 from app.accounts.permissions import READ_ARMS, Caller
 from app.platform.errors import NotFound
 from app.tables.accounts import Site, Study
 from app.tables.audit import AuditEvent
+from app.tables.learning import Policy
 from app.tables.outcomes import QocRevision
 from app.tables.participants import Participant, SettingsVersion
+from app.tables.plans import BundleRelease, Plan, PlanItem
 from app.tables.recordings import Recording, Trace
 from app.tables.sessions import SessionSegment, StudySession
+from app.tables.uploads import UploadFile
 from app.tables.visits import Visit, VisitLock
 
 CONFIRMED = StudySession.status == "confirmed"
@@ -276,43 +278,35 @@ def lock_session(db: Session, session: StudySession) -> None:
 
 
 def uploads_of_files(db: Session, upload_file_ids: Sequence[int]) -> dict[int, int]:
-    """Number of the upload that each file came in. Uploads belong to a later phase; of their table only numbers are needed here."""
+    """Find the number of the upload that each file came in."""
     if not upload_file_ids:
         return {}
-    files = table("upload_file", column("id"), column("upload_id"))
-    rows = db.execute(select(files.c.id, files.c.upload_id).where(files.c.id.in_(upload_file_ids)))
+    rows = db.execute(select(UploadFile.id, UploadFile.upload_id).where(UploadFile.id.in_(upload_file_ids)))
     return {row.id: row.upload_id for row in rows}
 
 
 def policy_id(db: Session, participant_id: int, name_or_id: str) -> int | None:
-    """Number of a participant's policy by name, or by number where no policy has that name.
-
-    Policies belong to a later phase; of their table only names are needed here.
-    """
-    policies = table("policy", column("id"), column("participant_id"), column("name"))
-    own = select(policies.c.id).where(policies.c.participant_id == participant_id)
-    found = db.scalar(own.where(policies.c.name == name_or_id))
+    """Find the number of a participant's policy by name, or by number where no policy has that name."""
+    own = select(Policy.id).where(Policy.participant_id == participant_id)
+    found = db.scalar(own.where(Policy.name == name_or_id))
     if found is None and name_or_id.isdecimal() and len(name_or_id) < 10:
-        found = db.scalar(own.where(policies.c.id == int(name_or_id)))
+        found = db.scalar(own.where(Policy.id == int(name_or_id)))
     return found
 
 
 def policy_names(db: Session, participant_id: int) -> Sequence[str]:
     """Names of a participant's policies."""
-    policies = table("policy", column("participant_id"), column("name"))
-    return db.scalars(select(policies.c.name).where(policies.c.participant_id == participant_id).order_by(policies.c.name)).all()
+    return db.scalars(select(Policy.name).where(Policy.participant_id == participant_id).order_by(Policy.name)).all()
 
 
 def policy_name(db: Session, policy_id: int | None) -> str | None:
     """Name of a policy, by its number."""
-    policies = table("policy", column("id"), column("name"))
-    return None if policy_id is None else db.scalar(select(policies.c.name).where(policies.c.id == policy_id))
+    return None if policy_id is None else db.scalar(select(Policy.name).where(Policy.id == policy_id))
 
 
 def has_policy(db: Session, participant_id: int, policy_id: int) -> bool:
-    """Whether a policy is the participant's."""
-    policies = table("policy", column("id"), column("participant_id"))
-    return db.scalar(select(policies.c.id).where(policies.c.id == policy_id, policies.c.participant_id == participant_id)) is not None
+    """Return True for a policy of the participant."""
+    return db.scalar(select(Policy.id).where(Policy.id == policy_id, Policy.participant_id == participant_id)) is not None
 
 
 class PolicyHead(NamedTuple):
@@ -325,36 +319,24 @@ class PolicyHead(NamedTuple):
 
 def policies_of_network(db: Session, participant_id: int, sha256: str) -> Sequence[PolicyHead]:
     """The participant's policies whose network file has this SHA-256, the newest first."""
-    policies = table("policy", *(column(name) for name in ("id", "participant_id", "name", "kind", "onnx_sha256")))
-    query = select(policies.c.id, policies.c.name, policies.c.kind)
-    query = query.where(policies.c.participant_id == participant_id, policies.c.onnx_sha256 == sha256)
-    return [PolicyHead(*row) for row in db.execute(query.order_by(policies.c.id.desc()))]
+    query = select(Policy.id, Policy.name, Policy.kind).where(Policy.participant_id == participant_id, Policy.onnx_sha256 == sha256)
+    return [PolicyHead(*row) for row in db.execute(query.order_by(Policy.id.desc()))]
 
 
 def released_limits(db: Session, policy_id: int, moment: datetime | None) -> tuple[float, float] | None:
-    """Amplitude limits, mA, of the newest bundle of a policy that was released before a moment; None where there is none.
-
-    Bundles belong to a later phase; of their table only the limits are needed here.
-    """
-    names = ("policy_id", "min_ma", "max_ma", "created_at")
-    releases = table("bundle_release", *(column(name) for name in names))
-    query = select(releases.c.min_ma, releases.c.max_ma).where(releases.c.policy_id == policy_id)
+    """Find the amplitude limits, mA, of the newest bundle of a policy that was released before a moment; None where there is none."""
+    query = select(BundleRelease.min_ma, BundleRelease.max_ma).where(BundleRelease.policy_id == policy_id)
     if moment is not None:
-        query = query.where(releases.c.created_at <= moment)
-    row = db.execute(query.order_by(releases.c.created_at.desc()).limit(1)).first()
+        query = query.where(BundleRelease.created_at <= moment)
+    row = db.execute(query.order_by(BundleRelease.created_at.desc()).limit(1)).first()
     return None if row is None else (float(row.min_ma), float(row.max_ma))
 
 
 def planned_designs(db: Session, visit_id: int) -> list[dict[str, Any]]:
-    """Designs of the random sessions in a visit's approved plan, by position; those that are drawn by the device have none.
-
-    Plans belong to a later phase; of their tables only the designs are needed here.
-    """
-    plans = table("plan", *(column(name) for name in ("id", "visit_id", "status")))
-    items = table("plan_item", *(column(name) for name in ("plan_id", "position")), column("design", JSONB))
-    query = select(items.c.design).join_from(items, plans, items.c.plan_id == plans.c.id)
-    query = query.where(plans.c.visit_id == visit_id, plans.c.status == "approved", items.c.design.is_not(None))
-    return [row for row in db.scalars(query.order_by(items.c.position)) if row["holds"]]
+    """List the designs of the random sessions in a visit's approved plan, by position; those that are drawn by the device have none."""
+    query = select(PlanItem.design).join(Plan, Plan.id == PlanItem.plan_id)
+    query = query.where(Plan.visit_id == visit_id, Plan.status == "approved", PlanItem.design.is_not(None))
+    return [row for row in db.scalars(query.order_by(PlanItem.position)) if row is not None and row["holds"]]
 
 
 def settings_version(db: Session, settings_version_id: int) -> SettingsVersion:

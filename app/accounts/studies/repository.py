@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sqlalchemy import column, func, select, table, text
+from sqlalchemy import func, select, text
 from sqlalchemy.orm import Session
 
 from app.tables.accounts import Membership, Site, Study, User
-
-_PARTICIPANTS = table("participant", column("code"), column("site_id"))
+from app.tables.participants import Participant
 
 
 def study_by_code(db: Session, code: str) -> Study | None:
@@ -50,8 +49,8 @@ def prefixes(db: Session) -> Sequence[tuple[int, str, str]]:
 
 def codes_elsewhere(db: Session, study_id: int, prefix: str) -> bool:
     """Decide whether a participant of another study has a code that begins so, whatever its capitals."""
-    begins = func.lower(_PARTICIPANTS.c.code).startswith(prefix.lower(), autoescape=True)
-    query = select(_PARTICIPANTS.c.code).join(Site, Site.id == _PARTICIPANTS.c.site_id).where(Site.study_id != study_id, begins)
+    begins = func.lower(Participant.code).startswith(prefix.lower(), autoescape=True)
+    query = select(Participant.code).join(Site, Site.id == Participant.site_id).where(Site.study_id != study_id, begins)
     return db.scalar(query.limit(1)) is not None
 
 

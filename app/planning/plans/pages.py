@@ -26,7 +26,7 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError, NotFound
 from app.platform.web.forms import FormValues, field_notes, parse, renamed
 from app.platform.web.schemas import Int, Model, PagingQuery
-from app.platform.web.templates import render
+from app.platform.web.templates import Part, make_part, render
 from app.study.deps import CurrentParticipant, CurrentVisit, VisitViewed
 from app.study.service import may, require
 from app.tables.participants import Participant
@@ -228,7 +228,7 @@ def _page(
         may_override=may_approve,
         drafting=drafting,
         **(
-            draft_form.shown_of(db, visit, caller, full, values) | {"outlook": request.app.state.outlook(db, participant, caller)}
+            draft_form.shown_of(db, visit, caller, full, values) | {"outlook": make_part(Part.OUTLOOK, db, participant, caller)}
             if drafting
             else {}
         ),

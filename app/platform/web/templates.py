@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
+from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -108,3 +110,23 @@ _environment.globals.update(
     ANY_OUTCOME=ANY,
     outcome_columns=outcome_columns,
 )
+
+
+class Part(StrEnum):
+    """Part of a page that a later phase makes, from the session, the record of the page, and the caller."""
+
+    SLOTS_OF_VISIT = "planned sessions against recorded ones, on the page of a visit"
+    OUTLOOK = "sentences on what further visits would settle, on the page of a draft"
+
+
+_makers: dict[Part, Callable[..., Any]] = {}
+
+
+def provide(part: Part, maker: Callable[..., Any]) -> None:
+    """Register the function that makes a part; `app.main` does so for every one."""
+    _makers[part] = maker
+
+
+def make_part(part: Part, *arguments: Any) -> Any:
+    """Make a part of a page. Raises KeyError where no function is provided."""
+    return _makers[part](*arguments)

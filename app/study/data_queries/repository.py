@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sqlalchemy import Select, column, func, select, table
+from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.permissions import Caller
@@ -12,6 +12,7 @@ from app.platform.errors import NotFound
 from app.study.repository import in_scope
 from app.tables.data_queries import DataQuery, DataQueryEntry, QueryState
 from app.tables.participants import Participant
+from app.tables.uploads import Upload
 from app.tables.visits import Dose, Visit
 
 
@@ -58,9 +59,8 @@ def visit_number(db: Session, visit_id: int | None) -> int | None:
 
 
 def upload_of(db: Session, participant_id: int, upload_id: int) -> bool:
-    """Whether an upload is the participant's. Uploads belong to a later phase; of their table only the owner is needed here."""
-    uploads = table("upload", column("id"), column("participant_id"))
-    return db.scalar(select(uploads.c.id).where(uploads.c.id == upload_id, uploads.c.participant_id == participant_id)) is not None
+    """Return True for an upload of the participant."""
+    return db.scalar(select(Upload.id).where(Upload.id == upload_id, Upload.participant_id == participant_id)) is not None
 
 
 def _queries() -> Select[DataQuery]:

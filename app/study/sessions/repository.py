@@ -12,16 +12,13 @@ from sqlalchemy import (
     BindParameter,
     Select,
     String,
-    and_,
     bindparam,
     cast,
-    column,
     func,
     literal,
     literal_column,
     or_,
     select,
-    table,
     true,
     union_all,
 )
@@ -31,6 +28,7 @@ from sqlalchemy.orm import Session
 from app.study.repository import CONFIRMED, sessions_of_participant
 from app.tables.outcomes import QocRevision
 from app.tables.participants import SettingsVersion
+from app.tables.plans import SEALED, Plan, PlanItem
 from app.tables.recordings import Recording, Trace
 from app.tables.sessions import CountedTime, SessionConditions, SessionSegment, StudySession
 from app.tables.visits import CdbsAmplitude, Dose, Visit
@@ -120,16 +118,10 @@ class SlotHead(NamedTuple):
 
 
 def slot_head(db: Session, participant_id: int, slot_id: int) -> SlotHead | None:
-    """A session of one of the participant's plans.
-
-    Plans belong to a later phase; of their tables only these columns are needed here.
-    """
-    plans = table("plan", *(column(name) for name in ("id", "visit_id", "status", "blinded", "approved_at", "key_opened_at")))
-    items = table("plan_item", *(column(name) for name in ("id", "plan_id", "position", "controller", "policy_id")))
-    sealed = and_(plans.c.blinded, plans.c.approved_at.is_not(None), plans.c.key_opened_at.is_(None))
-    wanted = (items.c.id, plans.c.id, plans.c.status, plans.c.visit_id, items.c.position, items.c.controller, items.c.policy_id, sealed)
-    query = select(*wanted).join_from(items, plans, items.c.plan_id == plans.c.id).join(Visit, Visit.id == plans.c.visit_id)
-    row = db.execute(query.where(items.c.id == slot_id, Visit.participant_id == participant_id)).first()
+    """Find a session of one of the participant's plans."""
+    item = (PlanItem.id, Plan.id, Plan.status, Plan.visit_id, PlanItem.position, PlanItem.controller, PlanItem.policy_id)
+    query = select(*item, SEALED).join_from(PlanItem, Plan, PlanItem.plan_id == Plan.id).join(Visit, Visit.id == Plan.visit_id)
+    row = db.execute(query.where(PlanItem.id == slot_id, Visit.participant_id == participant_id)).first()
     return None if row is None else SlotHead(*row)
 
 

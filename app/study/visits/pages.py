@@ -15,7 +15,7 @@ from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, confirmed, field_notes, parse
-from app.platform.web.templates import render
+from app.platform.web.templates import Part, make_part, render
 from app.settings import get_settings
 from app.study import cdbs_amplitude, repository, service
 from app.study.blinding import arm, may_know, visible_arm
@@ -153,7 +153,7 @@ def shown_visit(
         rows=[_session_row(db, s, traces, caller) for s in sessions],
         told=told,
         latencies=tablet.by_controller(ran),
-        slots=request.app.state.slots_of_visit(db, visit, caller),
+        slots=make_part(Part.SLOTS_OF_VISIT, db, visit, caller),
         may_upload=may(caller, can.UPLOAD, visit.participant) and not visit.locked,
         limit_mb=get_settings().upload_limit_mb,
         proposals=[s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id],
