@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from datetime import datetime, timedelta
 
 from sqlalchemy import delete, func, select, text, update
-from sqlalchemy.orm import Session, selectinload
+from sqlalchemy.orm import InstrumentedAttribute, Session, joinedload, selectinload
+from sqlalchemy.orm.interfaces import LoaderOption
 
 from app.accounts.addresses import normal_address
 from app.platform.database import now
@@ -38,12 +39,9 @@ def studies(db: Session) -> Sequence[Study]:
 
 def sign_in_by_token(db: Session, token_sha256: str, idle_since: datetime, begun_since: datetime) -> SignIn | None:
     """Find the live browser session of a token."""
-    return db.scalar(
-        select(SignIn)
-        .where(SignIn.token_sha256 == token_sha256, SignIn.ended_at.is_(None))
-        .where(SignIn.last_seen_at > idle_since, SignIn.created_at > begun_since)
-        .options(selectinload(SignIn.user).selectinload(User.memberships))
-    )
+    live = select(SignIn).where(SignIn.token_sha256 == token_sha256, SignIn.ended_at.is_(None))
+    live = live.where(SignIn.last_seen_at > idle_since, SignIn.created_at > begun_since)
+    return db.scalars(live.options(_with_memberships(SignIn.user))).unique().one_or_none()
 
 
 def sign_in_of(db: Session, token_sha256: str) -> SignIn | None:
@@ -58,11 +56,13 @@ def open_sign_ins(db: Session, user_id: int) -> Sequence[SignIn]:
 
 def api_token_by_hash(db: Session, token_sha256: str) -> ApiToken | None:
     """Find the API token of a hash, unless it was revoked or has run out."""
-    return db.scalar(
-        select(ApiToken)
-        .where(ApiToken.token_sha256 == token_sha256, ApiToken.revoked_at.is_(None), ApiToken.expires_at > now())
-        .options(selectinload(ApiToken.user).selectinload(User.memberships))
-    )
+    live = select(ApiToken).where(ApiToken.token_sha256 == token_sha256, ApiToken.revoked_at.is_(None), ApiToken.expires_at > now())
+    return db.scalars(live.options(_with_memberships(ApiToken.user))).unique().one_or_none()
+
+
+def _with_memberships(user: InstrumentedAttribute[User]) -> LoaderOption:
+    """Load a row's user with the roles in the row's own query: every request asks it."""
+    return joinedload(user, innerjoin=True).joinedload(User.memberships)
 
 
 def tokens_of(db: Session, user_id: int) -> Sequence[ApiToken]:
