@@ -11,6 +11,7 @@ order that names a `module` has it imported first, once, and its `prepare()` cal
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import json
 import os
@@ -28,6 +29,10 @@ from app.platform.jobs.children import child
 DESCRIPTORS = 3
 """Of each order: its socket, the log, the pipe of reports."""
 LONGEST_ORDER = 1 << 16
+LARGE_PAGE = 1 << 21
+"""Bytes."""
+_COLLAPSE = 25
+"""MADV_COLLAPSE of madvise(2), Linux 6.1 and newer."""
 
 
 def main(arguments: list[str]) -> int:
@@ -50,6 +55,32 @@ def _leave_to_itself() -> None:
     """What is loaded stays: the collector would touch, and so copy, every page that the children share."""
     gc.collect()
     gc.freeze()
+
+
+def use_large_pages() -> int:
+    """Move this process's own memory to pages of 2 MB and return the bytes moved, 0 where the system cannot.
+
+    A fork copies one entry per page, five hundred times fewer than of 4 kB. Memory is shared and copied in 4 kB as before.
+    """
+    if sys.platform != "linux":
+        return 0
+    madvise = ctypes.CDLL(None, use_errno=True).madvise
+    madvise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
+    return sum(stop - start for start, stop in _own_ranges() if madvise(start, stop - start, _COLLAPSE) == 0)
+
+
+def _own_ranges() -> list[tuple[int, int]]:
+    """Find the ranges of whole large pages in writable memory without a file."""
+    found = []
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        place, rights, _, _, _, *named = line.split(maxsplit=5)
+        if not rights.startswith("rw-p") or (named and named[0] != "[heap]"):
+            continue
+        start, stop = (int(end, 16) for end in place.split("-"))
+        start, stop = -(-start // LARGE_PAGE) * LARGE_PAGE, stop // LARGE_PAGE * LARGE_PAGE
+        if start < stop:
+            found.append((start, stop))
+    return found
 
 
 class _Server:

@@ -12,13 +12,13 @@ from typing import Any
 from app.platform.errors import no_room
 from app.platform.files import draft_folder
 from app.platform.jobs.children.child import Cause, ChildLimits
-from app.platform.jobs.children.forked import ForkedProcesses
+from app.platform.jobs.children.forked import MODULE, ForkedProcesses
 from app.platform.jobs.children.slots import Slots
 from app.platform.jobs.children.supervisor import ChildMessages, ComputeCall
 from app.settings import get_settings
 
-PREPARED = ("app.ingest.uploads.compute:prepare",)
-"""What children are to have ready, as names: the platform lies below the phases and may not import them."""
+PREPARED = ("app.ingest.uploads.compute:prepare", f"{MODULE}:use_large_pages")
+"""What children are to have ready, as names: the platform lies below the phases and may not import them. A file takes two forks."""
 IDLE_S = 120.0
 """Time after the last file at which the process that forks readers ends, seconds: files of one sitting come within two minutes."""
 WALL_PER_CPU = 5
