@@ -34,9 +34,10 @@ from ml.outcomes import FIELDS, OUTCOMES, enumerated
 
 WITHDRAWN = "withdrawn"
 NOT_AFTER_WITHDRAWAL = frozenset(
-    {can.UPLOAD, can.RUN_JOBS, can.WRITE_POLICIES, can.DRAFT_PLAN, can.APPROVE_PLAN, can.TAKE_BUNDLES, can.WRITE_SETTINGS}
+    {can.UPLOAD, can.RUN_JOBS, can.WRITE_POLICIES, can.DRAFT_PLAN, can.TAKE_BUNDLES, can.WRITE_SETTINGS}
+    | {can.SIGN_PLAN, can.RELEASE, can.DECIDE_GATE, can.CLEAR_EVENT, can.SET_MARGINS}
 )
-"""What needs a participant who takes part; records that exist may still be corrected."""
+"""What needs a participant who takes part. Records that exist may still be corrected, and a key be opened in an emergency."""
 SIGNED_UNITS = {"dB", "z"}
 """Units in which a beta may be negative: logarithms and standard scores."""
 POLICY_CONTROLLERS = {Controller.RL, Controller.DISTILLED, Controller.OTHER}

@@ -65,7 +65,7 @@ def _page(
         grounds=wording.gate_grounds(gate),
         alpha=gates.ALPHA,
         typed=typed or dict.fromkeys(LABELS, ""),
-        may_decide=caller.may(can.APPROVE_PLAN, site.study_id, site.id),
+        may_decide=caller.may(can.DECIDE_GATE, site.study_id, site.id),
         remarks=field_notes(error, typed or {}),
         problem=error.problem(request.url.path) if error else None,
     )

@@ -98,7 +98,7 @@ def decide(db: Session, participant: Participant, choice: GateChoice, reason: st
     Raises:
         Invalid: no reason. Forbidden: the caller approves no plans in this study.
     """
-    study.require(caller, can.APPROVE_PLAN, participant)
+    study.require(caller, can.DECIDE_GATE, participant)
     if not reason.strip():
         raise Invalid("A decision on what policies learn from needs its reason.", "Say why in a sentence.", field="reason")
     row = BufferGateDecision(participant_id=participant.id, choice=choice, reason=reason.strip(), created_by=caller.label)

@@ -167,7 +167,7 @@ def _page(
         release_meaning=releases.MEANING,
         brought=releases.brought_by(db, policy, caller),
         release_required=get_settings().require_released_policies,
-        may_release=may(caller, can.APPROVE_PLAN, participant),
+        may_release=may(caller, can.RELEASE, participant),
         key=bundles.public_key(),
         remarks=field_notes(error, typed or {}),
         releasing=releasing,

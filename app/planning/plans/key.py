@@ -53,10 +53,10 @@ def open_key(db: Session, visit: Visit, plan: Plan, caller: Caller, reason: str,
         reason: why; in an emergency it may be empty, and is asked for afterwards (`give_reason`).
 
     Raises:
-        Forbidden: the caller may not sign plans. Conflict: the plan is not blinded, not signed, or open already.
+        Forbidden: the caller may not open keys. Conflict: the plan is not blinded, not signed, or open already.
         Invalid: no reason, and no emergency.
     """
-    study.require(caller, can.APPROVE_PLAN, visit.participant)
+    study.require(caller, can.OPEN_KEY, visit.participant)
     if not sealed(plan):
         why = "is not blinded" if not plan.blinded else "is not signed yet" if plan.approved_at is None else "has an open key already"
         raise Conflict(f"Plan {plan.id} of visit {visit.number} {why}.", "Load the page again.")
@@ -73,9 +73,9 @@ def give_reason(db: Session, visit: Visit, plan: Plan, caller: Caller, reason: s
     """State afterwards why a key was opened in an emergency.
 
     Raises:
-        Forbidden: the caller may not sign plans. Conflict: a reason stands, or nothing was opened. Invalid: no reason.
+        Forbidden: the caller may not open keys. Conflict: a reason stands, or nothing was opened. Invalid: no reason.
     """
-    study.require(caller, can.APPROVE_PLAN, visit.participant)
+    study.require(caller, can.OPEN_KEY, visit.participant)
     if plan.key_opened_at is None or plan.key_opened_reason is not None:
         raise Conflict(f"Plan {plan.id} of visit {visit.number} waits for no reason.", "Load the page again.")
     if not reason.strip():

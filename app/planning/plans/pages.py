@@ -193,7 +193,7 @@ def _page(
         full = None
     view = shown(full) if full else None
     signed = view is not None and view.plan.status == "approved"
-    may_approve = may(caller, can.APPROVE_PLAN, participant)
+    may_approve = may(caller, can.SIGN_PLAN, participant)
     # a signed plan is there to be run: policies are offered, and named beside one whose key is sealed, only to who would replace it
     drafting = may(caller, can.DRAFT_PLAN, participant) and (not signed or (may_approve and (replacing or values is not None)))
     return render(

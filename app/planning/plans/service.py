@@ -59,7 +59,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
     evaluation = _evaluation(db, participant, draft.evaluation_id)
     found = grounds(db, participant, evaluation)
     overrides, limits = {o.policy_id: o.reason for o in draft.overrides}, {v.policy_id: v.min_fraction for v in draft.limits}
-    guarded = safeguards(found, chosen, overrides, limits, may_override=study.may(caller, can.APPROVE_PLAN, participant))
+    guarded = safeguards(found, chosen, overrides, limits, may_override=study.may(caller, can.SIGN_PLAN, participant))
     repository.lock_visit(db, visit.id)
     _supersede(db, visit, draft.reason, caller)
     plan = Plan(
@@ -112,7 +112,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
             or what `safeguards.refuse_approval` or `releases.refuse_unreleased` refuse.
         Invalid: no cDBS amplitude by which limits are ones in milliamperes. Forbidden, TooMany: as `sign_off.sign_plan`.
     """
-    study.require(caller, can.APPROVE_PLAN, visit.participant)
+    study.require(caller, can.SIGN_PLAN, visit.participant)
     repository.lock_visit(db, visit.id)
     view = read_plan(db, visit, caller)
     plan = view.plan
@@ -241,7 +241,7 @@ def _supersede(db: Session, visit: Visit, reason: str | None, caller: Caller) ->
     if earlier is None:
         return
     if earlier.status == "approved":
-        study.require(caller, can.APPROVE_PLAN, visit.participant)
+        study.require(caller, can.SIGN_PLAN, visit.participant)
         if sealed(earlier) and repository.has_sessions(db, visit.id):
             raise Conflict(
                 f"Sessions of visit {visit.number} ran under blinded plan {earlier.id}, whose key is sealed.",

@@ -69,7 +69,7 @@ def release(
         Conflict: a retired policy, or as `bundles.refuse_after_events`. Invalid: limits that contradict each other or leave the
             stimulator's own; a damaged file; or nobody has stated the cDBS amplitude or the unit of beta.
     """
-    study.require(caller, can.APPROVE_PLAN, participant)
+    study.require(caller, can.RELEASE, participant)
     study.require_own(participant, policy, f"policy {policy.id}")
     if policy.retired_reason:
         raise Conflict(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", "Take it back first, or release another one.")

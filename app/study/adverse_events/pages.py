@@ -109,7 +109,7 @@ def _page(
         remarks=field_notes(error, typed),
         may_add=may(caller, can.WRITE_QOC, participant),
         may_write=may(caller, can.WRITE_STUDY, participant),
-        may_clear=may(caller, can.APPROVE_PLAN, participant),
+        may_clear=may(caller, can.CLEAR_EVENT, participant),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

@@ -82,7 +82,7 @@ def clear_adverse_event(db: Session, event: AdverseEvent, revision: int, reason:
         Forbidden: the caller approves no plans of this participant. Conflict: it does not block, or somebody changed it.
         Invalid: no reason.
     """
-    study.require(caller, can.APPROVE_PLAN, event.participant)
+    study.require(caller, can.CLEAR_EVENT, event.participant)
     if not event.blocks:
         raise Conflict(f"Adverse event {event.id} is {'cleared already' if event.now.serious else 'not serious'}.", "Nothing waits for it.")
     return _follow(db, event, revision, reason, caller, event.now, reason.strip())

@@ -111,7 +111,7 @@ def _page(
         lock_reason=lock_reason,
         lock_meaning=sign_off.MEANING,
         lock_signatures=sign_off.signatures_of_locks(db, participant),
-        may_write=may(caller, can.APPROVE_PLAN, participant),
+        may_write=may(caller, can.SET_MARGINS, participant),
         remarks=field_notes(error, values | {"lock_reason": lock_reason}),
         problem=error.problem(request.url.path) if error else None,
     )

@@ -28,7 +28,7 @@ def change_margins(db: Session, participant: Participant, change: MarginsIn, rea
     Raises:
         Invalid: no reason. Forbidden: the caller approves no plans of this participant. Conflict: somebody else was faster.
     """
-    study.require(caller, can.APPROVE_PLAN, participant)
+    study.require(caller, can.SET_MARGINS, participant)
     current = participant.current_margins
     values = {name: getattr(current, name) for name in MarginsIn.model_fields} | change.model_dump(exclude_unset=True)
     if all(getattr(current, name) == value for name, value in values.items()):
@@ -61,7 +61,7 @@ def lock_margins(
         Invalid: no reason. Forbidden: the caller approves no plans of this participant, or as `app.accounts.signing`, as TooMany is.
             Conflict: newer margins are there, or these are locked already.
     """
-    study.require(caller, can.APPROVE_PLAN, participant)
+    study.require(caller, can.SET_MARGINS, participant)
     current = participant.current_margins
     if current.version != version:
         raise Conflict(f"The present margins are version {current.version}, not {version}.", "Look at them and lock again.")

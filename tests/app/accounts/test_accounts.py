@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import repository, service
 from app.accounts.addresses import normal_address
-from app.accounts.permissions import APPROVE_PLAN, MANAGE_ACCOUNTS, PERMISSIONS, READ, READ_ARMS, WRITE_STUDY, Caller, Grant
+from app.accounts.permissions import MANAGE_ACCOUNTS, PERMISSIONS, READ, READ_ARMS, SIGN_PLAN, WRITE_STUDY, Caller, Grant
 from app.platform.database import new_session
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 from app.tables.accounts import Role
@@ -154,8 +154,8 @@ def test_bad_accounts_are_refused(db: Session, email: str, password: str) -> Non
 def test_roles_include_what_they_should() -> None:
     assert PERMISSIONS[Role.VIEWER] == {READ, READ_ARMS}
     assert READ_ARMS not in PERMISSIONS[Role.BLINDED_ASSESSOR]
-    assert APPROVE_PLAN in PERMISSIONS[Role.CLINICIAN]
-    assert APPROVE_PLAN not in PERMISSIONS[Role.ENGINEER]
+    assert SIGN_PLAN in PERMISSIONS[Role.CLINICIAN]
+    assert SIGN_PLAN not in PERMISSIONS[Role.ENGINEER]
     assert all(PERMISSIONS[r] <= PERMISSIONS[Role.ADMIN] for r in Role)
     assert MANAGE_ACCOUNTS not in PERMISSIONS[Role.CLINICIAN] | PERMISSIONS[Role.ENGINEER]
 

@@ -78,6 +78,15 @@ def open_key(client: TestClient, visit: int) -> None:
     assert client.post(f"/api/v1/visits/{visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
 
 
+def test_the_key_opens_in_an_emergency_after_the_participant_has_withdrawn(client: TestClient, studied: Any, plan: Plan) -> None:
+    left = client.patch("/api/v1/participants/P1", json={"status": "withdrawn", "reason": "asked to stop"})
+    assert left.status_code == 200, left.text
+    opened = client.post(f"/api/v1/visits/{studied.visit}/plan/key", json={"emergency": True})
+    assert opened.status_code == 200, opened.text
+    drafted = client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": list(studied.policies[:1]), "minutes_per_session": 5})
+    assert drafted.status_code == 409, "and nothing new is planned"
+
+
 def test_a_coordinator_uploads_and_confirms_by_letters(
     client: TestClient, coordinator: TestClient, db: Session, studied: Any, plan: Plan, uploads: list[dict[str, Any]]
 ) -> None:
