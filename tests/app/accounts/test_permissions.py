@@ -7,8 +7,8 @@ from app.tables.accounts import Role, Scope
 
 READER = {"read", "arms:read"}
 STAFF = READER | {"study:write", "qoc:write", "settings:write", "upload", "jobs:run", "plan:draft", "bundles:take", "audit:read"}
-SIGNED = {"plan:sign", "key:open", "policies:release", "gate:decide", "events:clear", "margins:set"}
-CLINICIAN = STAFF | SIGNED | {"quarantine:decide", "visit:lock", "queries:ask"}
+SIGNATURES = {"plan:sign", "key:open", "policies:release", "gate:decide", "events:clear", "margins:set"}
+CLINICIAN = STAFF | SIGNATURES | {"quarantine:decide", "visit:lock", "queries:ask"}
 
 
 def test_a_role_may_what_is_written_here() -> None:
