@@ -60,7 +60,7 @@ def uploads(coordinator: TestClient, db: Session, plan: Plan) -> list[dict[str, 
 
 
 @pytest.fixture
-def held(coordinator: TestClient, studied: Any, uploads: list[dict[str, Any]]) -> dict[int, int]:
+def sessions(coordinator: TestClient, studied: Any, uploads: list[dict[str, Any]]) -> dict[int, int]:
     """Confirmed by the coordinator in one step: session by position."""
     done = coordinator.post(f"/api/v1/visits/{studied.visit}/slots/confirm", json={})
     assert done.status_code == 200, done.text
@@ -147,7 +147,7 @@ def test_no_page_and_no_route_depends_on_what_ran_until_the_key_is_opened(
     db: Session,
     studied: Any,
     plan: Plan,
-    held: dict[int, int],
+    sessions: dict[int, int],
 ) -> None:
     """What every page and route answers is the same where two sessions change places, and another once the key is open."""
     policy = next(i for i in plan.items if i.policy_id == studied.policies[0])
@@ -158,7 +158,7 @@ def test_no_page_and_no_route_depends_on_what_ran_until_the_key_is_opened(
         {
             c.path.format(**named, session_id=session)
             for c in iter_route_contexts(service_app.routes)
-            for session in (held[policy.position], held[other.position])
+            for session in (sessions[policy.position], sessions[other.position])
             if c.path
             and "GET" in (getattr(c, "methods", None) or ())
             and set(re.findall(r"{(\w+)", c.path)) <= {*named, "session_id"}
@@ -188,11 +188,11 @@ def test_no_page_and_no_route_depends_on_what_ran_until_the_key_is_opened(
     swap(db, HELD, policy.id, other.id)
     again = answers(coordinator)
     assert sum(known[p] != again[p] for p in paths) >= 10, "the swap shows once the key is open"
-    assert all(again[p] != sealed["coordinator"][p] for p in (f"/visits/{studied.visit}", f"/sessions/{held[policy.position]}"))
+    assert all(again[p] != sealed["coordinator"][p] for p in (f"/visits/{studied.visit}", f"/sessions/{sessions[policy.position]}"))
 
 
-def test_traces_conditions_and_samples_are_refused_to_everybody_with_the_way_out(client: TestClient, held: dict[int, int]) -> None:
-    for session in list(held.values())[:1]:
+def test_traces_conditions_and_samples_are_refused_to_everybody_with_the_way_out(client: TestClient, sessions: dict[int, int]) -> None:
+    for session in list(sessions.values())[:1]:
         for part in ("trace", "traces", "conditions", "samples", "signal"):
             refused = client.get(f"/api/v1/sessions/{session}/{part}")
             assert refused.status_code == 403, part
@@ -213,7 +213,7 @@ def test_traces_conditions_and_samples_are_refused_to_everybody_with_the_way_out
 
 
 def test_the_audit_trail_tells_no_arm_of_a_sealed_plan(
-    client: TestClient, db: Session, studied: Any, plan: Plan, held: dict[int, int]
+    client: TestClient, db: Session, studied: Any, plan: Plan, sessions: dict[int, int]
 ) -> None:
     def trail() -> str:
         entities = ("plan_item", "session", "session_proposal", "session_conditions")
@@ -228,7 +228,7 @@ def test_the_audit_trail_tells_no_arm_of_a_sealed_plan(
 
 
 def test_no_search_and_no_table_of_the_trail_tells_an_arm_of_a_sealed_plan(
-    client: TestClient, studied: Any, plan: Plan, held: dict[int, int]
+    client: TestClient, studied: Any, plan: Plan, sessions: dict[int, int]
 ) -> None:
     """A search that finds a row by a hidden value tells the value."""
 
@@ -246,41 +246,43 @@ def test_no_search_and_no_table_of_the_trail_tells_an_arm_of_a_sealed_plan(
 
 
 def test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened(
-    client: TestClient, db: Session, studied: Any, plan: Plan, held: dict[int, int]
+    client: TestClient, db: Session, studied: Any, plan: Plan, sessions: dict[int, int]
 ) -> None:
     participant = participant_by_code(db, "P1", SYSTEM)
     before = take_snapshot(db, participant, SYSTEM)
     db.commit()
     members = {m.session_id: m.left_out_reason or "" for m in before.members}
-    assert all("blinded plan is sealed" in members[s] for s in held.values())
+    assert all("blinded plan is sealed" in members[s] for s in sessions.values())
     slots = f"/api/v1/visits/{studied.visit}/slots"
     assert not [r for r in client.get(slots).json()["rows"] if r["predicted"] or "energy" in r["done"]], "100 % of cDBS would name cDBS"
     found = client.get("/api/v1/participants/P1/analyses").json()
-    assert {e["reason"] for e in found["excluded"] if e["session_id"] in held.values()} == {"the key of its visit's blinded plan is sealed"}
+    assert {e["reason"] for e in found["excluded"] if e["session_id"] in sessions.values()} == {
+        "the key of its visit's blinded plan is sealed"
+    }
     assert "visit 2: the key of its blinded plan is sealed" in client.get("/api/v1/participants/P1/calibration").json()["left_out"]
     package = zipfile.ZipFile(io.BytesIO(client.get("/participants/P1/export.zip").content))
     assert "the sessions of visit 2, whose blinded plan's key is sealed" in package.read("P1/README.txt").decode()
-    assert not set(map(str, held.values())) & {line.split(",")[0] for line in package.read("P1/sessions.csv").decode().splitlines()}
+    assert not set(map(str, sessions.values())) & {line.split(",")[0] for line in package.read("P1/sessions.csv").decode().splitlines()}
     # of machines too: what a job computes for people would tell them
-    assert not set(held.values()) & {s.session_id for s in driven_sessions(db, before, SYSTEM)}
+    assert not set(sessions.values()) & {s.session_id for s in driven_sessions(db, before, SYSTEM)}
     assert describe(db, before, SYSTEM).sessions_by_visit.keys() == {1}
     open_key(client, studied.visit)
     assert all("energy" in r["done"] for r in client.get(slots).json()["rows"])
     db.expire_all()
-    ran = {s for s, i in zip(held.values(), plan.items, strict=True) if i.policy_id is not None or i.controller == "cdbs"}
+    ran = {s for s, i in zip(sessions.values(), plan.items, strict=True) if i.policy_id is not None or i.controller == "cdbs"}
     assert ran <= {s.session_id for s in driven_sessions(db, before, SYSTEM)}
     after = take_snapshot(db, participant, SYSTEM)
     kept = {m.session_id for m in after.members if m.left_out_reason is None}
-    assert set(held.values()) & kept, "at least the sessions of cDBS and random draws enter"
+    assert set(sessions.values()) & kept, "at least the sessions of cDBS and random draws enter"
     assert after.id != before.id
 
 
 def test_what_can_be_learned_from_is_asked_anew_once_the_key_is_opened(
-    client: TestClient, db: Session, studied: Any, held: dict[int, int]
+    client: TestClient, db: Session, studied: Any, sessions: dict[int, int]
 ) -> None:
     participant = participant_by_code(db, "P1", SYSTEM)
     for session in sessions_of_participant(db, participant.id):
-        if session.id not in held.values():
+        if session.id not in sessions.values():
             body = {"excluded_reason": "another day", "reason": "another day"}
             assert client.patch(f"/api/v1/sessions/{session.id}", json=body).status_code == 200
     db.expire_all()
@@ -293,7 +295,7 @@ def test_what_can_be_learned_from_is_asked_anew_once_the_key_is_opened(
 
 
 def test_a_sealed_plan_that_was_run_is_not_replaced_before_its_key_is_opened(
-    client: TestClient, studied: Any, held: dict[int, int]
+    client: TestClient, studied: Any, sessions: dict[int, int]
 ) -> None:
     draft = {"policy_ids": [studied.policies[0]], "reason": "another order"}
     refused = client.post(f"/api/v1/visits/{studied.visit}/plan", json=draft)
