@@ -1,0 +1,26 @@
+"""Facts of RC+S session folders: whose clock its times show, which counters turn, what is no reading, what changes the dose."""
+
+from __future__ import annotations
+
+from ml.formats.counters import Counter
+from ml.formats.facts import ClockFact, Facts
+from ml.formats.sentinels import UINT8, UINT32, WIDE, Field
+
+FACTS = Facts(
+    clocks=(
+        ClockFact("computer", "HostUnixTime, PacketGenTime, PacketRxUnixTime, UnixOnsetTime", "UTC, taken from it", "Summit API"),
+        ClockFact("implant", "timestamp, systemTick", "differences alone are used", "recordings whose implant was years off"),
+    ),
+    counters={
+        "systemTick": Counter(65_536, "100 us", True, "Summit API: 16 bits, 6.5536 s"),
+        "dataTypeSequence": Counter(256, "packets of one stream", True, "Summit API: 8 bits"),
+        "globalSequence": Counter(256, "packets of all streams", True, "Summit API: 8 bits"),
+    },
+    fields={
+        "AmplitudeInMilliamps": Field("mA", 0, 25.4, (25.5, *WIDE), "Summit API: 255 x 0.1 mA means `hold`"),
+        "Bands": Field("device units", 0, UINT32 - 1, (UINT32,), "Summit API: 32 bits"),
+        "CurrentAdaptiveState": Field("state", 0, 8, (15,), "Summit API: 15 is no state"),
+        "batteryLevelPercent": Field("%", 0, 100, (UINT8, *WIDE), "a share of 100"),
+    },
+    dose=(),
+)
