@@ -18,7 +18,7 @@ from app.accounts.browser import SIGNED_OUT, count_try, failed_sign_ins, local_p
 from app.accounts.deps import COOKIE, CurrentCaller
 from app.accounts.passwords import AT_ONCE, MIN_PASSWORD
 from app.accounts.permissions import Caller
-from app.platform.database import Db, new_session, now, set_actor
+from app.platform.database import Db, now, set_actor, transaction
 from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany, about
 from app.platform.web.bounded import Bounded
 from app.platform.web.forms import FormValues, field_notes
@@ -67,13 +67,12 @@ async def sign_in(request: Request, values: FormValues) -> Response:
 
 def _sign_in(request: Request, values: FormData) -> Response:
     email, target = str(values.get("email", "")), local_path(str(values.get("next", "/")))
-    with new_session() as db:
-        try:
+    try:
+        with transaction() as db:
             set_actor(db, normal_address(email) or "unknown", request_id=request.state.request_id)
             token = service.sign_in(db, email, str(values.get("password", "")), str(values.get("code", "")))
-        except BetaloopError as error:
-            return _sign_in_refused(request, values, error)
-        db.commit()
+    except BetaloopError as error:
+        return _sign_in_refused(request, values, error)
     return signed_in(token, target)
 
 
@@ -91,7 +90,6 @@ def sign_out(request: Request, db: Db) -> Response:
         if caller := service.caller_of_cookie(db, token):
             set_actor(db, caller.label, caller.user_id, request.state.request_id)
         service.sign_out(db, token)
-        db.commit()
     answer = RedirectResponse("/sign-in?done=out", 303)
     answer.delete_cookie(COOKIE, httponly=True, samesite="lax", secure=get_settings().cookie_secure)
     if get_settings().oidc_issuer:
@@ -118,7 +116,6 @@ def change_password(request: Request, db: Db, caller: CurrentCaller, values: For
     except BetaloopError as error:
         db.rollback()
         return _account_page(request, db, caller, error, refused=("password", {}))
-    db.commit()
     return RedirectResponse("/sign-in?done=password", 303)
 
 
@@ -134,7 +131,6 @@ def begin_second_factor(request: Request, db: Db, caller: CurrentCaller, values:
     except BetaloopError as error:
         db.rollback()
         return _account_page(request, db, caller, error, refused=("begin", {}))
-    db.commit()
     return RedirectResponse("/account#second-factor", 303)
 
 
@@ -147,7 +143,6 @@ def confirm_second_factor(request: Request, db: Db, caller: CurrentCaller, value
     except BetaloopError as error:
         db.rollback()
         return _account_page(request, db, caller, error, refused=("confirm", {}))
-    db.commit()
     return _account_page(request, db, caller, codes=codes)
 
 
@@ -162,7 +157,6 @@ def remove_second_factor(request: Request, db: Db, caller: CurrentCaller, values
     except BetaloopError as error:
         db.rollback()
         return _account_page(request, db, caller, error, refused=("remove", {}))
-    db.commit()
     return RedirectResponse("/account?done=factor", 303)
 
 
@@ -175,7 +169,6 @@ def create_token(request: Request, db: Db, caller: CurrentCaller, values: FormVa
     except BetaloopError as error:
         db.rollback()
         return _account_page(request, db, caller, error, refused=("token", values))
-    db.commit()
     return _account_page(request, db, caller, token=token)
 
 
@@ -184,7 +177,6 @@ def revoke_token(token_id: RowId, db: Db, caller: CurrentCaller) -> Response:
     """End one of one's own tokens."""
     caller.require_browser()
     service.revoke_token(db, _own_id(caller), token_id)
-    db.commit()
     return RedirectResponse("/account?done=revoked", 303)
 
 
@@ -213,7 +205,6 @@ def add_user(request: Request, db: Db, caller: CurrentCaller, values: FormValues
     except BetaloopError as error:
         db.rollback()
         return _accounts_page(request, db, caller, error, fields)
-    db.commit()
     return RedirectResponse("/accounts?done=added", 303)
 
 
@@ -226,7 +217,6 @@ def reset_password(request: Request, user_id: RowId, db: Db, caller: CurrentCall
     except BetaloopError as error:
         db.rollback()
         return _accounts_page(request, db, caller, error, refused=f"user-{user_id}")
-    db.commit()
     return RedirectResponse("/accounts?done=password", 303)
 
 
@@ -235,7 +225,6 @@ def set_active(user_id: RowId, db: Db, caller: CurrentCaller, values: FormValues
     """Shut a user out, or let the user in again."""
     active = values.get("active") == "yes"
     service.set_active(db, _managed_user(db, caller, user_id), active, caller)
-    db.commit()
     return RedirectResponse(f"/accounts?done={'opened' if active else 'closed'}", 303)
 
 

@@ -52,8 +52,7 @@ CurrentSweep = Annotated[Sweep, Depends(current_sweep)]
 def sweep_viewed(sweep: CurrentSweep, db: Db) -> Iterator[None]:
     """Record who looked, for routes that show what policies of a sweep are predicted to bring, as `app.study.deps` does."""
     yield
-    if record_view(db, "sweep", sweep.id):
-        db.commit()
+    record_view(db, "sweep", sweep.id)
 
 
 SweepViewed = Depends(sweep_viewed, scope="function")

@@ -38,7 +38,6 @@ def start_job(participant: CurrentParticipant, body: JobIn, db: Db, caller: Curr
     """
     params = body.model_dump(mode="json", exclude={"kind", "again"})
     started = service.start_job(db, participant, body.kind, params, caller, again=body.again)
-    db.commit()
     response.status_code = 202 if started.new else 200
     return job_out(started.job, participant)
 
@@ -87,7 +86,6 @@ def follow_job(
 def cancel_job(found: CurrentJob, db: Db, caller: CurrentCaller) -> JobOut:
     """Cancel a job: a waiting one ends at once, a running one within 2 s."""
     job = service.cancel_job(db, found.participant, found.job, caller)
-    db.commit()
     return job_out(job, found.participant)
 
 
@@ -95,5 +93,4 @@ def cancel_job(found: CurrentJob, db: Db, caller: CurrentCaller) -> JobOut:
 def retry_job(found: CurrentJob, db: Db, caller: CurrentCaller) -> JobOut:
     """Start a new job with the params of one that has ended."""
     job = service.retry_job(db, found.participant, found.job, caller)
-    db.commit()
     return job_out(job, found.participant)

@@ -82,7 +82,6 @@ def start_job(request: Request, participant: CurrentParticipant, db: Db, caller:
             raise Invalid("The form names no kind of job.", f"Choose one of {', '.join(kinds)}.", field="kind")
         asked = parse(kind.params, {name: v for name, v in given.items() if name != "again"}, FORM_LABELS).model_dump(mode="json")
         started = service.start_job(db, participant, kind.name, asked, caller, again="again" in given)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return _jobs(request, participant, db, caller, 50, 0, error, given)
@@ -143,7 +142,6 @@ def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller)
 def cancel_job(found: CurrentJob, db: Db, caller: CurrentCaller) -> Response:
     """Cancel a job."""
     service.cancel_job(db, found.participant, found.job, caller)
-    db.commit()
     return RedirectResponse(f"/jobs/{found.job.id}?done=cancelled", 303)
 
 
@@ -151,7 +149,6 @@ def cancel_job(found: CurrentJob, db: Db, caller: CurrentCaller) -> Response:
 def retry_job(found: CurrentJob, db: Db, caller: CurrentCaller) -> Response:
     """Start the same job again."""
     job = service.retry_job(db, found.participant, found.job, caller)
-    db.commit()
     return RedirectResponse(f"/jobs/{job.id}?done=started", 303)
 
 

@@ -14,7 +14,7 @@ from psycopg.errors import UndefinedColumn, UndefinedTable
 from sqlalchemy import Connection, DateTime, Engine, MetaData, create_engine, event, make_url, text
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.exc import DBAPIError, ProgrammingError
-from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
+from sqlalchemy.orm import DeclarativeBase, ORMExecuteState, Session, SessionTransaction, sessionmaker
 
 from app.platform.connection import NOTICED, connection_url
 from app.platform.embedded import place
@@ -157,7 +157,7 @@ def transaction(actor: str = "system") -> Iterator[Session]:
 
 
 def get_db() -> Iterator[Session]:
-    """The session of one request; the endpoint commits, an error rolls back."""
+    """Open the session of one request; it closes when the answer has left, for some answers are read from it piece by piece."""
     db = new_session()
     try:
         yield db
@@ -177,7 +177,40 @@ def _let_go(db: Session) -> None:
         db.invalidate()
 
 
-Db = Annotated[Session, Depends(get_db)]
+def request_session(db: Annotated[Session, Depends(get_db)]) -> Iterator[Session]:
+    """Commit what an endpoint has changed when it returns, before its answer leaves. An error rolls back, as does a failed commit.
+
+    Raises:
+        SQLAlchemyError: the commit failed. The sender gets an error, and never the answer of the endpoint.
+    """
+    yield db
+    if db.info.get(_MAY_HAVE_WRITTEN) or db.new or db.dirty or db.deleted:
+        db.commit()  # after reading alone the answer is right, also where the database has gone meanwhile
+
+
+_MAY_HAVE_WRITTEN = "may have written"
+
+
+@event.listens_for(Session, "after_flush")
+def _after_flush(db: Session, _context: Any) -> None:
+    db.info[_MAY_HAVE_WRITTEN] = True
+
+
+@event.listens_for(Session, "do_orm_execute")
+def _before_statement(state: ORMExecuteState) -> None:
+    """Take every statement that is not a plain query for one that writes, a call of a function in text among them."""
+    if not state.is_select:
+        state.session.info[_MAY_HAVE_WRITTEN] = True
+
+
+@event.listens_for(Session, "after_transaction_end")
+def _after_end(db: Session, transaction: SessionTransaction) -> None:
+    if transaction.parent is None:  # the end of a savepoint commits nothing
+        db.info.pop(_MAY_HAVE_WRITTEN, None)
+
+
+Db = Annotated[Session, Depends(request_session, scope="function")]
+"""The session of a request. Nothing that takes it commits: the change of one request is one transaction."""
 
 
 def set_actor(db: Session, label: str, user_id: int | None = None, request_id: str | None = None, reason: str | None = None) -> None:

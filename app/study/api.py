@@ -53,7 +53,6 @@ def list_participants(db: Db, caller: CurrentCaller, paging: PagingQuery) -> Pag
 def enrol(draft: ParticipantIn, db: Db, caller: CurrentCaller) -> ParticipantOut:
     """Enrol a participant."""
     participant = enrolment.enrol(db, draft, caller)
-    db.commit()
     return participant_out(participant)
 
 
@@ -73,7 +72,6 @@ def list_settings(participant: CurrentParticipant) -> list[SettingsOut]:
 def change_settings(participant: CurrentParticipant, change: SettingsChange, db: Db, caller: CurrentCaller) -> SettingsOut:
     """Change settings: a new version; members left out keep their value."""
     row = service.change_settings(db, participant, change.settings, change.reason, caller, change.sure)
-    db.commit()
     return SettingsOut.model_validate(row)
 
 
@@ -88,7 +86,6 @@ def list_visits(participant: CurrentParticipant, db: Db, paging: PagingQuery) ->
 def add_visit(participant: CurrentParticipant, draft: VisitIn, db: Db, caller: CurrentCaller) -> VisitOut:
     """Add a visit."""
     visit = service.add_visit(db, participant, draft, caller)
-    db.commit()
     return visit_out(visit, participant.code)
 
 
@@ -102,7 +99,6 @@ def read_visit(visit: CurrentVisit) -> VisitOut:
 def change_visit(visit: CurrentVisit, change: VisitChange, db: Db, caller: CurrentCaller) -> VisitOut:
     """Correct a visit: its date, its note, its cDBS amplitudes; amplitude fractions of its sessions follow."""
     service.change_visit(db, visit, change, caller)
-    db.commit()
     return visit_out(visit, visit.participant.code)
 
 
@@ -119,7 +115,6 @@ def lock_visit(visit: CurrentVisit, why: VisitLockIn, db: Db, caller: CurrentCal
     The signature covers the visit, its doses, and every session with its controller, QoCs, conditions, exclusion and samples.
     """
     visits.lock(db, visit, why.reason, caller, why.password, why.code)
-    db.commit()
     return lock_rows(db, visit)[-1]
 
 
@@ -127,7 +122,6 @@ def lock_visit(visit: CurrentVisit, why: VisitLockIn, db: Db, caller: CurrentCal
 def unlock_visit(visit: CurrentVisit, why: VisitUnlockIn, db: Db, caller: CurrentCaller) -> VisitLockOut:
     """Open the data of a visit for corrections."""
     visits.unlock(db, visit, why.reason, caller)
-    db.commit()
     return lock_rows(db, visit)[-1]
 
 
@@ -148,7 +142,6 @@ def read_session(session: CurrentSession, caller: CurrentCaller) -> SessionOut:
 def change_session(session: CurrentSession, change: SessionChange, db: Db, caller: CurrentCaller) -> SessionOut:
     """Correct a session: its controller, channel, hemisphere, or whether it counts."""
     service.change_session(db, session, change, caller)
-    db.commit()
     return session_out(session, caller)
 
 
@@ -178,7 +171,6 @@ def change_conditions(session: CurrentSession, change: ConditionsChange, db: Db,
     """Correct what the session ran under; buffers made from now on take it from here, those made before keep theirs."""
     require_known(session.visit, caller)
     row = conditions.change(db, session, change, caller)
-    db.commit()
     return ConditionsOut.model_validate(row)
 
 
@@ -192,7 +184,6 @@ def read_qoc(session: CurrentSession) -> QocOut | None:
 def record_qoc(session: CurrentSession, values: QocIn, db: Db, caller: CurrentCaller) -> QocOut:
     """Enter or correct the QoCs of a session."""
     row = service.record_qoc(db, session, values, caller)
-    db.commit()
     return QocOut.model_validate(row)
 
 
@@ -206,5 +197,4 @@ def read_outcomes(session: CurrentSession, db: Db) -> list[OutcomeOut]:
 def take_outcome(session: CurrentSession, choice: DerivedChoice, db: Db, caller: CurrentCaller) -> QocOut:
     """Put the value that the files give in the place of a typed one; `value` is the one that was read before."""
     row = service.take_derived(db, session, choice, caller)
-    db.commit()
     return QocOut.model_validate(row)

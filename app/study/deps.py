@@ -61,23 +61,22 @@ def results_viewed(request: Request, db: Db, caller: CurrentCaller) -> Iterator[
     form = _file_form(request)
     if form is not None:
         record(db, "export", "results", path, {"format": form})
-        db.commit()
-    elif record_view(db, "results", path):
-        db.commit()
+    else:
+        record_view(db, "results", path)
 
 
 def visit_viewed(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Iterator[None]:
     """For routes that show what ran at a visit and what came of it. Nothing is written while that is hidden from the caller."""
     yield
-    if request.method == "GET" and blinding.may_know(visit, caller) and record_view(db, "visit", visit.id):
-        db.commit()
+    if request.method == "GET" and blinding.may_know(visit, caller):
+        record_view(db, "visit", visit.id)
 
 
 def session_viewed(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller) -> Iterator[None]:
     """The same for routes of a session."""
     yield
-    if request.method == "GET" and blinding.may_know(session.visit, caller) and record_view(db, "session", session.id):
-        db.commit()
+    if request.method == "GET" and blinding.may_know(session.visit, caller):
+        record_view(db, "session", session.id)
 
 
 def _file_form(request: Request) -> str | None:

@@ -19,7 +19,7 @@ from app.accounts.browser import SIGNED_OUT, count_try, failed_sign_ins, local_p
 from app.accounts.deps import COOKIE, CurrentCaller
 from app.accounts.sign_on import service
 from app.accounts.sign_on.provider import RETURN_PATH, Begun, Identity, ProviderAway, Refused, configured, provider
-from app.platform.database import new_session, set_actor
+from app.platform.database import set_actor, transaction
 from app.platform.errors import BetaloopError, NotFound, TooMany, Unauthorized
 from app.platform.web.templates import render
 from app.settings import get_settings
@@ -104,11 +104,10 @@ def _sent_off(target: str, *, confirms: bool, fresh: bool) -> Response:
 
 
 def _arrived(request: Request, way: _Way, identity: Identity) -> Response:
-    with new_session() as db:
+    with transaction() as db:
         set_actor(db, "unknown", request_id=request.state.request_id)
         if not way.confirms:
             token = service.sign_on(db, identity)
-            db.commit()
             answer = signed_in(token, way.target)
             answer.delete_cookie(SIGNED_OUT, path=_PATH)
             return answer
@@ -117,7 +116,6 @@ def _arrived(request: Request, way: _Way, identity: Identity) -> Response:
             raise Unauthorized("Your session has ended meanwhile.", "Sign in again.")
         set_actor(db, caller.label, caller.user_id, request.state.request_id)
         service.confirm(db, caller, identity)
-        db.commit()
     return RedirectResponse(way.target, 303)
 
 

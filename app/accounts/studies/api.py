@@ -28,7 +28,6 @@ def list_studies(db: Db, caller: CurrentCaller) -> list[StudyOut]:
 def add_study(draft: StudyIn, db: Db, caller: CurrentCaller) -> StudyOut:
     """Add a study with its first site. Needs an administrator of all studies."""
     study = service.add_study(db, draft, caller)
-    db.commit()
     return study_out(db, study)
 
 
@@ -36,7 +35,6 @@ def add_study(draft: StudyIn, db: Db, caller: CurrentCaller) -> StudyOut:
 def change_study(study: ManagedStudy, change: StudyChange, db: Db, caller: CurrentCaller) -> StudyOut:
     """Give a study another name, or one without a prefix of participants' codes a prefix."""
     service.change_study(db, study, change, caller)
-    db.commit()
     return study_out(db, study)
 
 
@@ -44,7 +42,6 @@ def change_study(study: ManagedStudy, change: StudyChange, db: Db, caller: Curre
 def add_site(study: ManagedStudy, draft: SiteIn, db: Db) -> SiteOut:
     """Add a site to a study."""
     site = service.add_site(db, study, draft)
-    db.commit()
     return site_out(site)
 
 
@@ -52,7 +49,6 @@ def add_site(study: ManagedStudy, draft: SiteIn, db: Db) -> SiteOut:
 def rename_site(study: ManagedStudy, site_code: str, change: NameChange, db: Db) -> SiteOut:
     """Give a site another name."""
     site = service.rename_site(db, study, site_code, change.name, change.reason)
-    db.commit()
     return site_out(site)
 
 
@@ -67,7 +63,6 @@ def give_role(study: ManagedStudy, member: MemberIn, db: Db, caller: CurrentCall
     """Give a user a role at one site or at all; one that the user has there is replaced. Needs a browser session."""
     caller.require_browser()
     given = service.grant(db, study, member.email, member.role, member.site, caller)
-    db.commit()
     return MemberOut(email=given.user.email, role=Role(given.role), site=member.site, active=given.user.active)
 
 
@@ -76,4 +71,3 @@ def end_role(study: ManagedStudy, member: Member, db: Db, caller: CurrentCaller)
     """End a user's role, at once for whatever the user has open. Needs a browser session."""
     caller.require_browser()
     service.end_membership(db, study, member.email, member.site, caller)
-    db.commit()

@@ -115,7 +115,6 @@ def changed(request: Request, db: Session, caller: Caller, done: str, change: Ca
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, caller, error)
-    db.commit()
     return RedirectResponse(f"/studies?done={done}", 303)
 
 

@@ -54,7 +54,6 @@ def retire_policy(
             raise Invalid("A policy is retired with a reason.", "Say why it is no longer ranked or planned.", field="reason")
         change = parse(PolicyChange, {"retired_reason": "" if back else reason}, _LABELS, {"retired_reason": "reason"})
         retire(db, participant, policy, change.retired_reason, caller)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return _page(request, participant, policy, db, caller, error, reason)

@@ -40,5 +40,4 @@ def list_mappings(study_code: str, db: Db, caller: CurrentCaller) -> list[Mappin
 def remove_mapping(mapping_id: RowId, wanted: RemovalIn, db: Db, caller: CurrentCaller) -> MappingOut:
     """End a mapping: what was read by it stays; the next table with its header waits for a new one."""
     row = service.remove(db, mapping_id, wanted.reason, caller)
-    db.commit()
     return mapping_out(row, False)

@@ -99,7 +99,6 @@ def remove_mapping(request: Request, mapping_id: RowId, db: Db, caller: CurrentC
     except BetaloopError as error:
         db.rollback()
         return _list_page(request, db, study, caller, error, mapping_id)
-    db.commit()
     return RedirectResponse(f"/studies/{study.code}/column-mappings?done=removed", 303)
 
 

@@ -52,7 +52,6 @@ def read_proposal(session: CurrentProposal, db: Db, caller: CurrentCaller) -> Pr
 def correct_proposal(session: CurrentProposal, change: ProposalChange, db: Db, caller: CurrentCaller) -> ProposalOut:
     """Correct a proposal without confirming it. 409 where somebody changed it after the stated version."""
     row = proposals.change(db, session, change, caller)
-    db.commit()
     return proposal_out(db, session, row, caller)
 
 
@@ -60,7 +59,6 @@ def correct_proposal(session: CurrentProposal, change: ProposalChange, db: Db, c
 def confirm_proposal(session: CurrentProposal, change: ProposalChange, db: Db, caller: CurrentCaller) -> ConfirmedOut:
     """Correct a proposal, where members are given, and let it count from now on."""
     notes = proposals.confirm(db, session, change, caller)
-    db.commit()
     return ConfirmedOut(session=session_out(study.session(db, session.id, caller), caller), notes=notes)
 
 
@@ -68,7 +66,6 @@ def confirm_proposal(session: CurrentProposal, change: ProposalChange, db: Db, c
 def add_visit(session: CurrentProposal, of: VisitOfRecordingIn, db: Db, caller: CurrentCaller) -> VisitOfRecordingOut:
     """Add a visit on the day of the recording, and give it to every proposal of that day whose visit is open."""
     visit, moved = add_visit_of_recording(db, session, of.version, caller)
-    db.commit()
     behind = repository.proposals(db, [s.id for s in moved])
     told = [proposal_out(db, s, behind[s.id], caller) for s in moved]
     return VisitOfRecordingOut(visit=visit_out(visit, visit.participant.code), proposals=told)
@@ -78,7 +75,6 @@ def add_visit(session: CurrentProposal, of: VisitOfRecordingIn, db: Db, caller: 
 def split_proposal(session: CurrentProposal, parts: SplitIn, db: Db, caller: CurrentCaller) -> list[ProposalOut]:
     """Cut a long recording into several proposals that take the place of this one."""
     made = proposals.split(db, session, parts.version, parts.parts, caller)
-    db.commit()
     behind = repository.proposals(db, [s.id for s in made])
     return [proposal_out(db, s, behind[s.id], caller) for s in made]
 
@@ -87,7 +83,6 @@ def split_proposal(session: CurrentProposal, parts: SplitIn, db: Db, caller: Cur
 def discard_proposal(session: CurrentProposal, why: DiscardIn, db: Db, caller: CurrentCaller) -> None:
     """Say that a proposal is no session; its recordings stay, and the same file sent again proposes it anew."""
     proposals.discard(db, session, why.version, why.reason, caller)
-    db.commit()
 
 
 @router.post("/uploaded-files/{file_id}/session", responses=problems(409))
@@ -97,7 +92,6 @@ def attach_file(file_id: RowId, target: AttachIn, db: Db, caller: CurrentCaller)
     study_service.require(caller, can.WRITE_STUDY, participant)
     session = study.session(db, target.session_id, caller)
     notes = service.attach_grasps(db, file, session)
-    db.commit()
     return AttachedOut(session=session_out(study.session(db, session.id, caller), caller), notes=notes)
 
 

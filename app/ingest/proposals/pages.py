@@ -80,7 +80,6 @@ def decide(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
                     confirmed.append(session.id)
         except BetaloopError as error:
             refused[session.id] = error
-    db.commit()
     if which.isdecimal() and int(which) not in {s.id for s in rows}:
         gone = Invalid(f"Session {which} is no proposal any more: somebody confirmed, cut or dropped it.", "Nothing was changed.")
         return _page(request, db, participant, caller, error=gone)
@@ -105,7 +104,6 @@ def attach(request: Request, file_id: RowId, db: Db, caller: CurrentCaller, valu
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, participant, caller, error=error, attached=(file_id, chosen))
-    db.commit()
     return RedirectResponse(f"/participants/{participant.code}/proposals?done=attached", 303)
 
 

@@ -26,5 +26,4 @@ def read_gate(participant: CurrentParticipant, db: Db) -> GateOut:
 def decide_gate(participant: CurrentParticipant, change: GateChange, db: Db, caller: CurrentCaller) -> GateOut:
     """Decide on the gate with a reason: open it, shut it, or follow the tests again. Clinicians alone."""
     gates.decide(db, participant, change.choice, change.reason, caller)
-    db.commit()
     return read_gate(participant, db)

@@ -40,7 +40,6 @@ def decide_gate(request: Request, participant: CurrentParticipant, db: Db, calle
     try:
         change = parse(GateChange, typed, LABELS)
         gates.decide(db, participant, change.choice, change.reason, caller)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return _page(request, participant, db, caller, error, typed)

@@ -40,7 +40,6 @@ def add_policy(
 ) -> PolicyOut:
     """Add a policy made elsewhere; it is checked by running it."""
     row = service.add_external(db, participant, name.strip(), read_limited(file), file.filename or "policy.onnx", caller)
-    db.commit()
     return policy_out(db, row, participant)
 
 
@@ -55,5 +54,4 @@ def change_policy(policy: CurrentPolicy, change: PolicyChange, db: Db, caller: C
     """Retire a policy with a reason, or take it back."""
     participant = db.get_one(Participant, policy.participant_id)
     service.retire(db, participant, policy, change.retired_reason, caller)
-    db.commit()
     return policy_out(db, policy, participant)

@@ -52,7 +52,6 @@ def add_policy(
             raise Invalid("No file was chosen.", "Choose an ONNX file.", field="file")
         label = parse(PolicyLabel, {"name": name}, LABELS).name
         row = service.add_external(db, participant, label, read_limited(file), file.filename, caller)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return _policies(request, participant, db, caller, 50, 0, error, name)

@@ -29,7 +29,6 @@ def list_snapshots(participant: CurrentParticipant, db: Db, paging: PagingQuery)
 def take_snapshot(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> SnapshotOut:
     """Pin the replay buffer as it is now; the same data give the same snapshot."""
     row = snapshots.take_snapshot(db, participant, caller)
-    db.commit()
     return snapshot_out(db, row, participant)
 
 

@@ -16,7 +16,6 @@ router = APIRouter()
 def data_package(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
     """Everything of a participant as a Frictionless data package."""
     content = export_participant(db, participant, caller)
-    db.commit()
     return Response(
         content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{participant.code}.zip"'}
     )

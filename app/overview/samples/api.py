@@ -28,7 +28,6 @@ Form = Annotated[SampleFormat, Query(alias="format", description="Parquet: a row
 def read_samples(session: CurrentSession, db: Db, caller: CurrentCaller, form: Form = SampleFormat.PARQUET) -> StreamingResponse:
     """Every sample of a session's recordings with its time from the session's start, and every 2 s trace, as one file."""
     found = session_samples(db, session, form, caller)
-    db.commit()
     headers = {"Content-Disposition": f'attachment; filename="{found.name}"', "Content-Length": str(found.size)}
     return StreamingResponse(_chunks(found.content), media_type=MEDIA_TYPES[form], headers=headers)
 

@@ -39,7 +39,6 @@ def start(request: Request, participant: CurrentParticipant, db: Db, caller: Cur
     given = {name: str(values[name]) for name in _LABELS if str(values.get(name, "")).strip()}
     try:
         job = service.start(db, participant, parse(NextGenerationParams, given, _LABELS), caller)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, participant, caller, given, error)

@@ -42,7 +42,6 @@ def read_bundle(
     """
     participant = db.get_one(Participant, policy.participant_id)
     content = bundles.bundle(db, participant, policy, bundles.Limits(min_ma, max_ma, ramp_ma_per_s), hemisphere, caller)
-    db.commit()
     name = f"{participant.code}-policy-{policy.id}.zip"
     return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
@@ -62,7 +61,6 @@ def read_session_bundle(
     is stored when it is first taken; later it is the same bytes, and the audit trail has each time.
     """
     name, content = slots.bundle(db, visit, position, caller)
-    db.commit()
     return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
 

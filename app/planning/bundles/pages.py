@@ -65,7 +65,6 @@ def take_bundle(
     try:
         limits, hemisphere = _stated(typed)
         content = bundles.bundle(db, participant, policy, limits, hemisphere, caller)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return _page(request, participant, policy, db, caller, error, typed)
@@ -83,7 +82,6 @@ def release_policy(
         limits, hemisphere = _stated(typed)
         password, code = str(values.get("password", "")), str(values.get("code", ""))
         releases.release(db, participant, policy, limits, hemisphere, caller, password, code)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return _page(request, participant, policy, db, caller, error, typed, releasing=True)

@@ -54,7 +54,6 @@ def draft_plan(visit: CurrentVisit, draft: PlanIn, db: Db, caller: CurrentCaller
     It supersedes an earlier draft; an approved plan only for who may approve plans, and with a `reason`.
     """
     view = service.draft_plan(db, visit, draft, caller)
-    db.commit()
     return plan_out(view)
 
 
@@ -66,7 +65,6 @@ def approve_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller, approval: A
     policy's bytes, its limits in mA and its ramp.
     """
     view = service.approve_plan(db, visit, caller, approval.password, approval.plan_id, approval.code)
-    db.commit()
     return plan_out(view)
 
 
@@ -75,7 +73,6 @@ def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
     """The plan as a sheet to print: sessions in order, estimates, blanks to fill in, signatures. A draft says so across every page."""
     view = plan_of(db, visit, caller)
     record(db, "download", "plan", view.plan.id)
-    db.commit()
     name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
     from app.planning.sheet import pdf  # what writes PDF takes long to load: a service that was killed is back sooner without it
 
@@ -93,7 +90,6 @@ def _bundles(db: Session, view: PlanView) -> dict[int, str]:
 def move_session(visit: CurrentVisit, move: Move, db: Db, caller: CurrentCaller) -> PlanOut:
     """Move a tested session of a draft past the tested ones before or after it; cDBS stays between any two policies."""
     found = service.reorder(db, visit, move, caller)
-    db.commit()
     return plan_out(found)
 
 
@@ -106,7 +102,6 @@ def open_key(visit: CurrentVisit, opening: KeyOpening, db: Db, caller: CurrentCa
         key.give_reason(db, visit, found.plan, caller, opening.reason)
     else:
         key.open_key(db, visit, found.plan, caller, opening.reason, emergency=opening.emergency)
-    db.commit()
     return plan_out(plan_of(db, visit, caller))
 
 
@@ -114,7 +109,6 @@ def open_key(visit: CurrentVisit, opening: KeyOpening, db: Db, caller: CurrentCa
 def remove_visit(visit: CurrentVisit, removal: Removal, db: Db, caller: CurrentCaller) -> None:
     """Remove a visit in which nothing was done, with its drafts."""
     visits.remove_visit(db, visit, removal.reason, caller)
-    db.commit()
 
 
 def plan_out(view: PlanView) -> PlanOut:

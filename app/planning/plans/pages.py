@@ -55,7 +55,6 @@ def draft(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, 
     """Draft the visit from the form."""
     try:
         service.draft_plan(db, visit, draft_form.draft_of(values), caller)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return HTMLResponse(_page(request, db, visit, caller, error, values), error.status)
@@ -69,7 +68,6 @@ def approve(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller
         shown = str(values.get("plan_id", ""))
         password, code = str(values.get("password", "")), str(values.get("code", ""))
         service.approve_plan(db, visit, caller, password, int(shown) if shown.isdecimal() else None, code)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return HTMLResponse(_page(request, db, visit, caller, error), error.status)
@@ -104,7 +102,6 @@ def draft_from_ranking(request: Request, participant: CurrentParticipant, db: Db
         visit = visit_for_draft(db, participant, wanted.visit_id, wanted.visit_number, wanted.visit_date, caller)
         chosen = visit if wanted.visit_id is not None else None
         service.draft_plan(db, visit, draft_form.draft_of(values), caller)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         if chosen is None:
@@ -118,7 +115,6 @@ def move(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, v
     """Move a tested session of the draft up or down, by a button or by dragging it."""
     try:
         service.reorder(db, visit, parse(Move, values, draft_form.LABELS), caller)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return HTMLResponse(_page(request, db, visit, caller, error), error.status)
@@ -135,7 +131,6 @@ def open_key(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCalle
             key.give_reason(db, visit, found, caller, reason)
         else:
             key.open_key(db, visit, found, caller, reason, emergency="emergency" in values)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return HTMLResponse(_page(request, db, visit, caller, error), error.status)
@@ -148,7 +143,6 @@ def remove(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller,
     code = visit.participant.code
     try:
         remove_visit(db, visit, str(values.get("reason", "")), caller)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return HTMLResponse(_page(request, db, visit, caller, error), error.status)

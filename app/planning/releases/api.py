@@ -33,7 +33,6 @@ def release_policy(policy: CurrentPolicy, wanted: PolicyReleaseIn, db: Db, calle
     participant = db.get_one(Participant, policy.participant_id)
     limits = Limits(wanted.min_ma, wanted.max_ma, wanted.ramp_ma_per_s)
     found = service.release(db, participant, policy, limits, wanted.hemisphere, caller, wanted.password, wanted.code)
-    db.commit()
     return _out(policy, found)
 
 

@@ -25,5 +25,4 @@ def read_slots(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> VisitCompa
 def confirm_slots(visit: CurrentVisit, confirmation: SlotConfirmation, db: Db, caller: CurrentCaller) -> SlotsConfirmed:
     """Put every found session into its slot and confirm those that wait for it, all or none."""
     notes = service.confirm(db, visit, caller, other_day=confirmation.other_day)
-    db.commit()
     return SlotsConfirmed(comparison=comparison_out(service.compare(db, visit, caller)), notes=notes)

@@ -39,7 +39,6 @@ def confirm(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller
     """Confirm all found sessions into their slots."""
     try:
         notes = service.confirm(db, visit, caller, other_day="other_day" in values)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return HTMLResponse(_page(request, db, visit, caller, error), error.status)

@@ -35,5 +35,4 @@ def add_entries(visit: CurrentVisit, batch: EntriesIn, db: Db, caller: CurrentCa
     The same entry again is `known`; one that cannot be taken is `refused` with the reason, and the others are stored.
     """
     results = service.add_entries(db, visit, batch.plan_id, batch.entries, caller)
-    db.commit()
     return EntriesOut(server_time=now(), results=results)

@@ -123,7 +123,6 @@ def enter(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, 
         result = service.add_entries(db, visit, plan_id, [entry], caller)[0]
         if result.outcome == "refused":
             raise Invalid(result.detail, result.hint, **({"field": result.field} if result.field else {}))
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         shown = renamed(error, _EVENT_FIELDS) if values.get("kind") == "adverse_event" else error

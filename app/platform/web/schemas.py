@@ -6,7 +6,7 @@ from datetime import UTC, date, datetime
 from typing import Annotated, Any, Generic, TypeVar, cast
 
 from fastapi import Depends, Query
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, Strict
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, Strict
 from pydantic_core import CoreSchema
 
 Item = TypeVar("Item")
@@ -75,6 +75,8 @@ Day = Annotated[date, AfterValidator(sensible_day)]
 """A day of the calendar."""
 RowId = Annotated[int, Field(ge=1, le=2**31 - 1)]
 Text = Annotated[str, Field(pattern=r"^[^\x00]*$")]
+CodeOf = Annotated[str, BeforeValidator(lambda row: getattr(row, "code", row))]
+"""The code of a row that has one, such as a participant, for an answer."""
 """Text without the zero character, which PostgreSQL cannot hold."""
 
 

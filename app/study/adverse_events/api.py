@@ -26,7 +26,6 @@ def list_adverse_events(participant: CurrentParticipant, db: Db, caller: Current
 def add_adverse_event(participant: CurrentParticipant, draft: AdverseEventIn, db: Db, caller: CurrentCaller) -> AdverseEventOut:
     """Write down what happened in a session, at a visit, or apart from both. Sent twice under one `entry_key`, it is one event."""
     row = service.add_adverse_event(db, participant, draft, caller)
-    db.commit()
     return event_out(row, caller)
 
 
@@ -34,7 +33,6 @@ def add_adverse_event(participant: CurrentParticipant, draft: AdverseEventIn, db
 def change_adverse_event(event: CurrentEvent, change: AdverseEventChange, db: Db, caller: CurrentCaller) -> AdverseEventOut:
     """Correct what is known of an event: a new revision, which no clinician has cleared yet."""
     row = service.change_adverse_event(db, event, change, caller)
-    db.commit()
     return event_out(row, caller)
 
 
@@ -42,5 +40,4 @@ def change_adverse_event(event: CurrentEvent, change: AdverseEventChange, db: Db
 def clear_adverse_event(event: CurrentEvent, given: ClearanceIn, db: Db, caller: CurrentCaller) -> AdverseEventOut:
     """State that a serious event does not stand against what ran. Those who approve plans alone."""
     row = service.clear_adverse_event(db, event, given.revision, given.reason, caller)
-    db.commit()
     return event_out(row, caller)

@@ -49,7 +49,6 @@ def add_adverse_event(request: Request, participant: CurrentParticipant, db: Db,
     except BetaloopError as error:
         db.rollback()
         return _page(request, participant, db, caller, typed, error)
-    db.commit()
     back = f"/sessions/{row.session_id}" if row.session_id else f"/participants/{participant.code}/adverse-events"
     return RedirectResponse(f"{back}?done=event", 303)
 
@@ -65,7 +64,6 @@ def change_adverse_event(request: Request, event: CurrentEvent, db: Db, caller: 
     except BetaloopError as error:
         db.rollback()
         return _page(request, event.participant, db, caller, typed, error, f"correct-{event.id}")
-    db.commit()
     return RedirectResponse(f"/participants/{event.participant.code}/adverse-events?done=corrected", 303)
 
 
@@ -79,7 +77,6 @@ def clear_adverse_event(request: Request, event: CurrentEvent, db: Db, caller: C
     except BetaloopError as error:
         db.rollback()
         return _page(request, event.participant, db, caller, typed, error, f"clear-{event.id}")
-    db.commit()
     return RedirectResponse(f"/participants/{event.participant.code}/adverse-events?done=cleared", 303)
 
 

@@ -26,5 +26,4 @@ def change_characteristics(
 ) -> CharacteristicsOut:
     """State characteristics as a whole: a new version, or the present one where nothing differs."""
     row = service.change_characteristics(db, participant, change.version, change.characteristics, change.reason, caller)
-    db.commit()
     return CharacteristicsOut.model_validate(row)

@@ -45,7 +45,6 @@ def change_characteristics(
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, participant, caller, typed, error, reason_of(values))
-    db.commit()
     changed = len(participant.characteristics) != before
     return RedirectResponse(f"/participants/{participant.code}/characteristics?done={'changed' if changed else 'same'}", 303)
 

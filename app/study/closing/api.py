@@ -24,7 +24,6 @@ SiteCode = Annotated[str, Path(max_length=40, pattern=r"^[^\x00]*$")]
 def end_study(study: ManagedStudy, why: EndingReason, db: Db, caller: CurrentCaller) -> StudyOut:
     """End a study: it is read and exported, and nothing in it changes; its jobs that run are cancelled."""
     service.end_study(db, study, why.reason, caller)
-    db.commit()
     return study_out(db, study)
 
 
@@ -32,7 +31,6 @@ def end_study(study: ManagedStudy, why: EndingReason, db: Db, caller: CurrentCal
 def reopen_study(study: ManagedStudy, why: EndingReason, db: Db) -> StudyOut:
     """Open a study that has ended."""
     service.reopen_study(db, study, why.reason)
-    db.commit()
     return study_out(db, study)
 
 
@@ -40,7 +38,6 @@ def reopen_study(study: ManagedStudy, why: EndingReason, db: Db) -> StudyOut:
 def end_site(study: ManagedStudy, site_code: SiteCode, why: EndingReason, db: Db) -> SiteOut:
     """End a site: it takes neither enrolments nor uploads; what is there goes on."""
     service.end_site(db, study, site_code, why.reason)
-    db.commit()
     return site_out(studies.site_of(db, study, site_code))
 
 
@@ -48,5 +45,4 @@ def end_site(study: ManagedStudy, site_code: SiteCode, why: EndingReason, db: Db
 def reopen_site(study: ManagedStudy, site_code: SiteCode, why: EndingReason, db: Db) -> SiteOut:
     """Open a site that has ended."""
     service.reopen_site(db, study, site_code, why.reason)
-    db.commit()
     return site_out(studies.site_of(db, study, site_code))

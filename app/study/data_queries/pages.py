@@ -67,7 +67,6 @@ def ask_data_query(request: Request, participant: CurrentParticipant, db: Db, ca
     except BetaloopError as error:
         db.rollback()
         return _page(request, participant, db, caller, typed, error)
-    db.commit()
     return RedirectResponse(f"/participants/{participant.code}/data-queries?done=asked", 303)
 
 
@@ -81,7 +80,6 @@ def follow_data_query(request: Request, query: CurrentDataQuery, db: Db, caller:
     except BetaloopError as error:
         db.rollback()
         return _page(request, query.participant, db, caller, {}, error, Followed(query.id, typed.get("state", ""), typed.get("text", "")))
-    db.commit()
     return RedirectResponse(f"/participants/{query.participant.code}/data-queries?done={given.state.value}", 303)
 
 

@@ -8,7 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from app.platform.web.schemas import Int, Model, Text
+from app.platform.web.schemas import CodeOf, Int, Model, Text
 from app.study.data_queries.fields import FIELDS
 from app.tables.data_queries import OF_PARTICIPANT, QueryState, Subject
 
@@ -72,7 +72,7 @@ class DataQueryOut(Model):
     """A data query with all that was said."""
 
     id: int
-    participant: str
+    participant: CodeOf
     session_id: int | None
     upload_id: int | None
     visit_id: int | None

@@ -26,7 +26,6 @@ def list_doses(visit: CurrentVisit) -> list[DoseOut]:
 def add_dose(visit: CurrentVisit, draft: DoseIn, db: Db, caller: CurrentCaller) -> DoseOut:
     """Write down a dose that was taken; the time since the last dose of the visit's sessions follows it."""
     row = service.add_dose(db, visit, draft, caller)
-    db.commit()
     return dose_out(row)
 
 
@@ -34,4 +33,3 @@ def add_dose(visit: CurrentVisit, draft: DoseIn, db: Db, caller: CurrentCaller) 
 def remove_dose(found: CurrentDose, change: DoseRemoval, db: Db, caller: CurrentCaller) -> None:
     """Take back a dose, with a reason."""
     service.remove_dose(db, *found, change.reason, caller)
-    db.commit()

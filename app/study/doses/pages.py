@@ -29,7 +29,6 @@ def add_dose(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCalle
     except BetaloopError as error:
         db.rollback()
         return shown_visit(request, db, visit, caller, error=error, dose=typed, refused="dose")
-    db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done=dose#doses", 303)
 
 
@@ -44,5 +43,4 @@ def remove_dose(request: Request, found: CurrentDose, db: Db, caller: CurrentCal
     except BetaloopError as error:
         db.rollback()
         return shown_visit(request, db, visit, caller, typed, error, refused=f"removal-{found[0].id}")
-    db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done=dose_removed#doses", 303)

@@ -45,7 +45,6 @@ def enrol(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -
     except BetaloopError as error:
         db.rollback()
         return _enrolment(request, db, caller, known, _typed(values, form.texts(SettingsIn())), error)
-    db.commit()
     return RedirectResponse(f"/participants/{participant.code}?done=enrolled", 303)
 
 

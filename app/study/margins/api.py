@@ -25,7 +25,6 @@ def list_margins(participant: CurrentParticipant) -> list[MarginsOut]:
 def change_margins(participant: CurrentParticipant, change: MarginsChange, db: Db, caller: CurrentCaller) -> MarginsOut:
     """Change margins or levels: a new version; members left out keep their value. Those who approve plans alone."""
     row = service.change_margins(db, participant, change.margins, change.reason, caller)
-    db.commit()
     return MarginsOut.model_validate(row)
 
 
@@ -39,5 +38,4 @@ def list_margins_locks(participant: CurrentParticipant, db: Db) -> list[MarginsL
 def lock_margins(participant: CurrentParticipant, wanted: MarginsLockIn, db: Db, caller: CurrentCaller) -> MarginsLockOut:
     """Lock the present margins before the sessions that they will judge, signed over their values. Those who approve plans alone."""
     service.lock_margins(db, participant, wanted.version, wanted.reason, caller, wanted.password, wanted.code)
-    db.commit()
     return lock_rows(db, participant)[-1]

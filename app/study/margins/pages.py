@@ -69,7 +69,6 @@ def change_margins(request: Request, participant: CurrentParticipant, db: Db, ca
         db.rollback()
         typed = texts(participant.current_margins, LABELS) | changes.fields
         return _page(request, db, participant, caller, typed, error, reason_of(values))
-    db.commit()
     return RedirectResponse(f"/participants/{participant.code}/margins?done={'changed' if row.version != before else 'same'}", 303)
 
 
@@ -85,7 +84,6 @@ def lock_margins(request: Request, participant: CurrentParticipant, db: Db, call
         db.rollback()
         shown = texts(participant.current_margins, LABELS)
         return _page(request, db, participant, caller, shown, renamed(error, _LOCK_FIELDS), lock_reason=typed["reason"])
-    db.commit()
     return RedirectResponse(f"/participants/{participant.code}/margins?done=locked", 303)
 
 

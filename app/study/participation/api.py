@@ -20,5 +20,4 @@ router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 def change_status(participant: CurrentParticipant, change: StatusChange, db: Db, caller: CurrentCaller) -> ParticipantOut:
     """Say that a participant has completed the study, has withdrawn, or takes part again; a withdrawal cancels running jobs."""
     service.change_status(db, participant, change, caller)
-    db.commit()
     return participant_out(participant)

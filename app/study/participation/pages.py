@@ -26,7 +26,6 @@ def change_status(request: Request, participant: CurrentParticipant, db: Db, cal
     typed = {name: str(values.get(name, "")).strip() for name in ("status", "status_reason")}
     try:
         service.change_status(db, participant, _change(typed), caller)
-        db.commit()
     except BetaloopError as error:
         db.rollback()
         return settings_page(request, db, participant, caller, texts(participant.current_settings), error, taking_part=typed)

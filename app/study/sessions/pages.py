@@ -134,7 +134,6 @@ def record_qoc(request: Request, session: CurrentSession, db: Db, caller: Curren
         if _on_blinded_page(session, caller):
             return blinded_page(request, db, session.visit, caller, error, session, changes.fields | reason)
         return _page(request, db, session, caller, error, typed=changes.fields | reason)
-    db.commit()
     if _on_blinded_page(session, caller):
         return RedirectResponse(f"/visits/{session.visit_id}?done=qoc", 303)
     return RedirectResponse(f"/sessions/{session.id}?done=qoc", 303)
@@ -153,7 +152,6 @@ def exclude(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, session, caller, error)
-    db.commit()
     return RedirectResponse(f"/sessions/{session.id}?done={'included' if include else 'excluded'}", 303)
 
 
@@ -179,7 +177,6 @@ def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, session, caller, error, typed=changes.fields | {"correction_reason": reason})
-    db.commit()
     return RedirectResponse(f"/sessions/{session.id}?done=corrected", 303)
 
 
@@ -198,7 +195,6 @@ def correct_conditions(request: Request, session: CurrentSession, db: Db, caller
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, session, caller, error, typed=changes.fields | {"conditions_reason": reason})
-    db.commit()
     return RedirectResponse(f"/sessions/{session.id}?done=conditions", 303)
 
 
@@ -211,7 +207,6 @@ def take_derived(request: Request, session: CurrentSession, db: Db, caller: Curr
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, session, caller, error)
-    db.commit()
     return RedirectResponse(f"/sessions/{session.id}?done=derived", 303)
 
 

@@ -50,7 +50,6 @@ def change_settings(request: Request, participant: CurrentParticipant, db: Db, c
         db.rollback()
         typed = form.texts(participant.current_settings) | changes.fields
         return settings_page(request, db, participant, caller, typed, error, reason=reason_of(values))
-    db.commit()
     return RedirectResponse(f"/participants/{participant.code}/settings?done={'changed' if row.version != before else 'same'}", 303)
 
 

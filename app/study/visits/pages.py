@@ -78,7 +78,6 @@ def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller:
     except BetaloopError as error:
         db.rollback()
         return _visit_form(request, participant, typed, error)
-    db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done=added", 303)
 
 
@@ -102,7 +101,6 @@ def lock_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCal
     except BetaloopError as error:
         db.rollback()
         return shown_visit(request, db, visit, caller, None, error, lock_reason=reason, refused="lock")
-    db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done={'unlocked' if unlock else 'locked'}#lock", 303)
 
 
@@ -121,7 +119,6 @@ def change_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentC
     except BetaloopError as error:
         db.rollback()
         return shown_visit(request, db, visit, caller, typed, error)
-    db.commit()
     return RedirectResponse(f"/visits/{visit.id}?done=corrected", 303)
 
 

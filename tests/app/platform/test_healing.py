@@ -13,7 +13,7 @@ import httpx2 as httpx
 import psycopg
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import text
+from sqlalchemy import func, select, text
 from sqlalchemy.exc import IntegrityError, OperationalError
 
 from app import main
@@ -124,7 +124,7 @@ def test_an_answer_stands_whose_database_goes_away_after_it_was_made(fresh_datab
 
     @service.get("/read")
     def read(db: Db) -> dict[str, int]:
-        pid = db.scalar(text("select pg_backend_pid()"))
+        pid = db.scalar(select(func.pg_backend_pid()))
         with new_session() as other:
             other.execute(text("select pg_terminate_backend(:pid, 5000)"), {"pid": pid})
         if status == 404:
