@@ -18,20 +18,22 @@ user_app = typer.Typer(no_args_is_help=True, help="Users.")
 token_app = typer.Typer(no_args_is_help=True, help="API tokens.")
 
 
-@user_app.command("add", epilog="Example: betaloop user add ada@clinic.example --role clinician")
+@user_app.command("add", epilog="Example: betaloop user add ada@clinic.example --role clinician --site north")
 def user_add(
     email: Annotated[str, typer.Argument(help="E-mail address to sign in with.")],
     role: Annotated[Role, typer.Option(help=", ".join(Role))],
     study: Annotated[str | None, typer.Option(help="Code of the study, where there are several.")] = None,
+    site: Annotated[str | None, typer.Option(help="Code of the only site that the user sees; all sites by default.")] = None,
     password_file: Annotated[Path | None, typer.Option(help="File with the password; asked for when left out ('-': stdin).")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Add a user with a role in a study."""
     password = _password(password_file)
     with transaction(ACTOR) as db:
-        user = accounts.add_user(db, email, role, password, study)
-        result = {"id": user.id, "email": user.email, "role": role.value}
-    show(result, as_json, f"Added {result['email']} as {role.value}.")
+        user = accounts.add_user(db, email, role, password, study, site_code=site)
+        result = {"id": user.id, "email": user.email, "role": role.value, "site": site}
+        words = accounts.roles_in_words(db, user, accounts.study_of(db, study))
+    show(result, as_json, f"Added. {words}")
 
 
 @token_app.command("create", epilog="Example: betaloop token create ada@clinic.example --name upload-tablet")

@@ -191,7 +191,7 @@ def accounts(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
 def add_user(request: Request, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Add a user to the study."""
     caller.require_browser()
-    fields = {name: str(values.get(name, "")) for name in ("email", "name", "role", "study")}
+    fields = {name: str(values.get(name, "")) for name in ("email", "name", "role", "study", "site")}
     try:
         caller.require(can.MANAGE_ACCOUNTS)
         mine = [s.code for s in repository.studies(db) if service.administers(caller, s.id)]
@@ -201,7 +201,7 @@ def add_user(request: Request, db: Db, caller: CurrentCaller, values: FormValues
         if fields["role"] not in set(Role):
             raise Invalid("Choose a role.", f"Known: {', '.join(Role)}.", field="role")
         password = str(values.get("password", ""))
-        service.add_user(db, fields["email"], Role(fields["role"]), password, study, fields["name"].strip()[:200])
+        service.add_user(db, fields["email"], Role(fields["role"]), password, study, fields["name"].strip()[:200], fields["site"].strip())
     except BetaloopError as error:
         db.rollback()
         return _accounts_page(request, db, caller, error, fields)
@@ -305,7 +305,7 @@ def _accounts_page(
         users=[u for u in repository.users(db) if service.manages(caller, u)],
         studies=[s for s in repository.studies(db) if service.administers(caller, s.id)],
         roles=list(Role),
-        draft=draft or {"email": "", "name": "", "role": Role.CLINICIAN, "study": ""},
+        draft=draft or {"email": "", "name": "", "role": Role.CLINICIAN, "study": "", "site": ""},
         refused=refused,
         remarks=field_notes(error, {}),
         problem=error.problem(request.url.path) if error else None,

@@ -11,7 +11,7 @@ from sqlalchemy.orm.interfaces import LoaderOption
 
 from app.accounts.addresses import normal_address
 from app.platform.database import now
-from app.tables.accounts import ApiToken, SignIn, SignInAttempt, SignOnLink, Study, User
+from app.tables.accounts import ApiToken, Membership, Role, SignIn, SignInAttempt, SignOnLink, Site, Study, User
 
 
 def user_by_email(db: Session, email: str) -> User | None:
@@ -108,3 +108,15 @@ def prune_failures(db: Session, older_than: timedelta) -> None:
 def forget_failures(db: Session, attempt: SignInAttempt) -> None:
     """Drop a try that was right, and the failures of its address before it."""
     db.execute(delete(SignInAttempt).where(SignInAttempt.email == attempt.email, SignInAttempt.id <= attempt.id))
+
+
+def site_by_code(db: Session, study_id: int, code: str) -> Site | None:
+    """Find a study's site by its code."""
+    return db.scalar(select(Site).where(Site.study_id == study_id, Site.code == code))
+
+
+def roles_of(db: Session, user_id: int, study_id: int) -> Sequence[tuple[Role, str | None]]:
+    """List a user's roles in a study, each with the code of its site; None is all sites, which come first."""
+    query = select(Membership.role, Site.code).outerjoin(Site, Site.id == Membership.site_id)
+    mine = query.where(Membership.user_id == user_id, Membership.study_id == study_id).order_by(Site.code.nulls_first())
+    return [(Role(role), code) for role, code in db.execute(mine)]

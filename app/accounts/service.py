@@ -45,8 +45,14 @@ def _decoy() -> str:
     return _hasher.hash(secrets.token_hex(16))
 
 
-def add_user(db: Session, email: str, role: Role, password: str, study_code: str | None = None, name: str = "") -> User:
-    """Make a user with a role in a study (the only one, unless named)."""
+def add_user(
+    db: Session, email: str, role: Role, password: str, study_code: str | None = None, name: str = "", site_code: str | None = None
+) -> User:
+    """Make a user with a role in a study (the only one, unless named), at one site or at all.
+
+    Raises:
+        Invalid: no address, or a weak password. Conflict: the address is taken. NotFound: no such study or site.
+    """
     address = normal_address(email)
     if address is None or not re.fullmatch(r"[^@\s]+@[^@\s]+", address):
         raise Invalid(f"{email.strip()[:LONGEST_ADDRESS]!r} is no e-mail address.", "Give one like name@clinic.example.", field="email")
@@ -56,10 +62,24 @@ def add_user(db: Session, email: str, role: Role, password: str, study_code: str
     check_password(password, email, name)
     with place():
         user = User(email=email, name=name, password_hash=_hasher.hash(password))
-    user.memberships.append(Membership(study_id=study_of(db, study_code).id, role=role))
+    study = study_of(db, study_code)
+    site = repository.site_by_code(db, study.id, site_code) if site_code else None
+    if site_code and site is None:
+        raise NotFound(f"Study '{study.code}' has no site '{site_code}'.", "`betaloop study site` adds one.", field="site")
+    user.memberships.append(Membership(study_id=study.id, site_id=site and site.id, role=role))
     db.add(user)
     db.flush()
     return user
+
+
+def roles_in_words(db: Session, user: User, study: Study) -> str:
+    """Describe the roles that a user has in a study, and where they apply."""
+    roles = repository.roles_of(db, user.id, study.id)
+    if not roles:
+        return f"{user.email} has no role in study {study.code} and sees nothing of it."
+    parts = [f"{role.value.replace('_', ' ')} at {'all sites' if site is None else f'site {site}'}" for role, site in roles]
+    rest = "" if roles[0][1] is None else ", and sees no other site"
+    return f"{user.email} is {' and '.join(parts)} of study {study.code}{rest}."
 
 
 def check_password(password: str, email: str, name: str = "") -> None:

@@ -60,9 +60,12 @@ def list_members(study: ManagedStudy, db: Db) -> list[MemberOut]:
 
 @router.put("/studies/{study_code}/members")
 def give_role(study: ManagedStudy, member: MemberIn, db: Db, caller: CurrentCaller) -> MemberOut:
-    """Give a user a role at one site or at all; one that the user has there is replaced. Needs a browser session."""
+    """Give a user a role at one site or at all. It replaces the role there; at one site also a role at all sites, unless `also` is set.
+
+    Needs a browser session.
+    """
     caller.require_browser()
-    given = service.grant(db, study, member.email, member.role, member.site, caller)
+    given = service.grant(db, study, member.email, member.role, member.site, caller, also=member.also)
     return MemberOut(email=given.user.email, role=Role(given.role), site=member.site, active=given.user.active)
 
 

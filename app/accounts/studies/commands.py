@@ -91,9 +91,10 @@ def user_role(
     role: Annotated[str, typer.Argument(help="A role, or 'none' to end the one that the user has there.")],
     study: Annotated[str | None, typer.Option(help="Code of the study, where there are several.")] = None,
     site: Annotated[str | None, typer.Option(help="Code of the site; all sites when left out.")] = None,
+    also: Annotated[bool, typer.Option("--also", help="Keep a role at all sites besides this one at a single site.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Give a user a role in a study, or end it."""
+    """Give a user a role in a study, or end it. A role at one site ends one at all sites, unless --also is given."""
     if role not in {*Role, "none"}:
         raise Invalid(f"{role!r} is no role.", f"Known: {', '.join(Role)}, none.")
     with transaction(ACTOR) as db:
@@ -101,9 +102,10 @@ def user_role(
         if role == "none":
             service.end_membership(db, where, email, site, SYSTEM)
         else:
-            service.grant(db, where, email, Role(role), site, SYSTEM)
+            service.grant(db, where, email, Role(role), site, SYSTEM, also=also)
         result = {"email": email, "role": role, "study": where.code, "site": site}
-    show(result, as_json, f"The role of {email} has ended." if role == "none" else f"{email} is now {role} in {result['study']}.")
+        words = accounts.roles_in_words(db, service.user_of(db, email), where)
+    show(result, as_json, words)
 
 
 def user_remove_second_factor(email: Annotated[str, typer.Argument(help="E-mail address of the user.")], as_json: AsJson = False) -> None:

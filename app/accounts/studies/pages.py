@@ -85,7 +85,9 @@ def grant(request: Request, study_code: str, db: Db, caller: CurrentCaller, valu
         if role not in set(Role):
             raise Invalid("Choose a role.", f"Known: {', '.join(Role)}.", field="role")
         study = service.study_to_manage(db, study_code, caller)
-        service.grant(db, study, str(values.get("email", "")), Role(role), str(values.get("site", "")) or None, caller)
+        service.grant(
+            db, study, str(values.get("email", "")), Role(role), str(values.get("site", "")) or None, caller, also="also" in values
+        )
 
     return changed(request, db, caller, "member", change)
 

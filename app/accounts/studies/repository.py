@@ -21,11 +21,6 @@ def sites_of(db: Session, study_id: int) -> Sequence[Site]:
     return db.scalars(select(Site).where(Site.study_id == study_id).order_by(Site.code)).all()
 
 
-def site_by_code(db: Session, study_id: int, code: str) -> Site | None:
-    """Find a study's site by its code."""
-    return db.scalar(select(Site).where(Site.study_id == study_id, Site.code == code))
-
-
 def members_of(db: Session, study_id: int) -> Sequence[tuple[User, Membership, str | None]]:
     """List who works in a study, by address: the user, the role, and the code of the site, None for all sites."""
     query = (

@@ -83,9 +83,10 @@ class Member(Model):
 
 
 class MemberIn(Member):
-    """A role to give; one that the user has there is replaced."""
+    """A role to give. It replaces the role that the user has there, and a role at one site also one at all sites."""
 
     role: Role
+    also: bool = Field(False, description="Keep a role at all sites besides this one at a single site.")
 
 
 class MemberOut(Model):

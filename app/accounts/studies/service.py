@@ -84,7 +84,7 @@ def set_ended(db: Session, row: Study | Site, ended: bool, reason: str) -> None:
 
 def add_site(db: Session, study: Study, draft: SiteIn) -> Site:
     """Add a site. Raises Conflict where its code is taken."""
-    if repository.site_by_code(db, study.id, draft.code):
+    if accounts.site_by_code(db, study.id, draft.code):
         raise Conflict(f"Study '{study.code}' has a site '{draft.code}' already.", "Choose another code.", field="code")
     site = Site(study_id=study.id, code=draft.code, name=draft.name)
     db.add(site)
@@ -103,21 +103,25 @@ def rename_site(db: Session, study: Study, code: str, name: str, reason: str) ->
 
 def site_of(db: Session, study: Study, code: str) -> Site:
     """Find a study's site. Raises NotFound."""
-    site = repository.site_by_code(db, study.id, code)
+    site = accounts.site_by_code(db, study.id, code)
     if site is None:
         raise NotFound(f"Study '{study.code}' has no site '{code}'.")
     return site
 
 
-def grant(db: Session, study: Study, email: str, role: Role, site_code: str | None, caller: Caller) -> Membership:
-    """Give a user a role in a study, at one site or at all; a role that the user has there is replaced.
+def grant(db: Session, study: Study, email: str, role: Role, site_code: str | None, caller: Caller, *, also: bool = False) -> Membership:
+    """Give a user a role in a study, at one site or at all. It replaces the role that the user has there.
+
+    Args:
+        also: keep a role at all sites besides one at a single site. Without it the wider role ends: it would apply at every site.
 
     Raises:
         NotFound: no such user or site. Invalid: one's own role, or a blinded assessor with another role in the study. Forbidden: to blind a
             user who works in a study that the caller does not administer, for it would close that study to them.
     """
-    user, site_id = _user(db, email), site_of(db, study, site_code).id if site_code else None
+    user, site_id = user_of(db, email), site_of(db, study, site_code).id if site_code else None
     _require_other(user, caller)
+    wider = None if also or site_id is None else repository.membership(db, user.id, study.id, None)
     others = [m.role for m in user.memberships if m.study_id == study.id and m.site_id != site_id]
     if others and Role.BLINDED_ASSESSOR in (role, *others) and {role, *others} != {Role.BLINDED_ASSESSOR}:
         raise Invalid("A blinded assessor has no other role in the study.", "End the other role first.")
@@ -132,7 +136,10 @@ def grant(db: Session, study: Study, email: str, role: Role, site_code: str | No
         found = Membership(user_id=user.id, study_id=study.id, site_id=site_id, role=role)
         db.add(found)
     found.role = role
+    if wider is not None:
+        db.delete(wider)
     db.flush()
+    db.expire(user, ["memberships"])
     return found
 
 
@@ -142,7 +149,7 @@ def end_membership(db: Session, study: Study, email: str, site_code: str | None,
     Raises:
         NotFound: the user has no role there. Invalid: one's own.
     """
-    user, site_id = _user(db, email), site_of(db, study, site_code).id if site_code else None
+    user, site_id = user_of(db, email), site_of(db, study, site_code).id if site_code else None
     _require_other(user, caller)
     found = repository.membership(db, user.id, study.id, site_id)
     if found is None:
@@ -157,7 +164,8 @@ def _require_all(studies: Iterable[Study], caller: Caller) -> None:
         raise Forbidden("Studies and their prefixes are added by an administrator of all studies.", "Ask one.")
 
 
-def _user(db: Session, email: str) -> User:
+def user_of(db: Session, email: str) -> User:
+    """Find the user of an address. Raises NotFound."""
     user = accounts.user_by_email(db, email)
     if user is None:
         raise NotFound(f"There is no user {email.strip()[:254]}.", "Add the user first.", field="email")
