@@ -32,8 +32,8 @@ router = APIRouter(tags=["jobs"], responses=problems(401, 403, 404, 422))
 def start_job(participant: CurrentParticipant, body: JobIn, db: Db, caller: CurrentCaller, response: Response) -> JobOut:
     """Start a job; everything but `kind` has a default. It needs the threshold xi_beta and at least one usable session.
 
-    While a job of the same kind and params waits, or runs on the data as they are now, the same request is answered with that job (200) and
-    starts no other (202), so that it may be sent again after a timeout; `again` starts another all the same. There is one
+    If a job of the same kind and params waits, or runs on the current data, the same request returns that job (200). Otherwise it starts
+    one (202). A request may therefore be sent again after a timeout; `again` starts another job all the same. There is one
     `next_generation` at a time.
     """
     params = body.model_dump(mode="json", exclude={"kind", "again"})
@@ -49,14 +49,14 @@ def list_jobs(
     paging: PagingQuery,
     status: Annotated[JobStatus | None, Query(description="Only jobs of this status.")] = None,
 ) -> Page[JobOut]:
-    """Jobs of a participant, newest first."""
+    """List the jobs of a participant, newest first."""
     rows, total = jobs.find(db, participant.id, status=(status,) if status else (), limit=paging.limit, offset=paging.offset)
     return Page(items=[job_out(j, participant) for j in rows], total=total, limit=paging.limit, offset=paging.offset)
 
 
 @router.get("/jobs/{job_id}")
 def read_job(found: CurrentJob) -> JobOut:
-    """One job with its steps."""
+    """Return one job with its steps."""
     return job_out(found.job, found.participant)
 
 

@@ -1,4 +1,4 @@
-"""What jobs of the kinds `pipeline` and `next_generation` take; the other kinds take what their phases say."""
+"""Params of the jobs `pipeline` and `next_generation`; the phases define those of the other kinds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NEXT_GENERATION = "next_generation"
 
 
 class PipelineParams(SweepParams):
-    """What `pipeline` takes: everything between two visits in one job. The sweep is `DEFAULT_SWEEP` where nothing else is asked for."""
+    """Params of `pipeline`: everything between two visits in one job. The sweep is `DEFAULT_SWEEP` by default."""
 
     algorithms: Annotated[list[AlgorithmName], Field(min_length=1, max_length=5)] = Field(
         DEFAULT_SWEEP["algorithms"], description="The policies are dealt to these in turn; from scratch only."
@@ -36,27 +36,27 @@ class PipelineParams(SweepParams):
     seed: Int = Field(0, ge=0, le=10**6, description="Seed of everything in the job.")
 
     def training(self) -> TrainParams:
-        """The training stage."""
+        """Return the params of the training stage."""
         names = (*SweepParams.model_fields, "updates", "actor_lr_low", "actor_lr_high", "seed")
         return TrainParams(**{name: getattr(self, name) for name in names})
 
     def distillation(self) -> DistilParams:
-        """The distillation stage."""
+        """Return the params of the distillation stage."""
         return DistilParams(preset=self.preset, sigma=self.sigma, updates=self.distil_updates, seed=self.seed)
 
     def evaluation(self) -> EvaluateParams:
-        """The evaluation stage: every policy that is not retired, the new ones among them."""
+        """Return the params of the evaluation stage: every policy that is not retired, including the new ones."""
         return EvaluateParams(preset=self.preset, methods=self.methods, horizon_steps=self.horizon_steps, seed=self.seed)
 
 
 class NextGenerationParams(PipelineParams):
-    """What `next_generation` takes: the pipeline that goes on from what did best, with fresh policies beside it."""
+    """Params of `next_generation`: a pipeline that continues from the best tested policies and adds new ones."""
 
     policies: Annotated[PolicyIds, Field(max_length=0)] = Field(
         default_factory=list, description="Always empty: the job chooses the best tested policies; name policies in a `pipeline` instead."
     )
     parents: Int = Field(2, ge=1, le=6, description="Tested policies to go on from, the best by the posterior.")
     tuned: Int = Field(2, ge=1, le=6, description="Policies to fine-tune from each, at the paper's learning rates from 1e-7 to 1e-5.")
-    count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch beside them.")
+    count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch in addition.")
     actor_lr_low: Number | None = Field(None, gt=0, le=1, description="Lowest learning rate of the policies from scratch.")
     actor_lr_high: Number | None = Field(None, gt=0, le=1, description="Highest; in between they are spread evenly in the logarithm.")

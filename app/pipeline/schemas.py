@@ -14,7 +14,7 @@ from app.platform.web.schemas import Model
 
 
 def _start_of(kind: registry.JobKind) -> type[BaseModel]:
-    """The kind's params with its name beside them, as `POST .../jobs` takes them."""
+    """Build the model of the kind's params and name, which is the body of `POST .../jobs`."""
     name = f"{kind.name.title().replace('_', '')}Job"
     again = Field(False, description="Whether to start another one although the same waits or runs.")
     return create_model(name, __base__=kind.params, __doc__=f"{kind.title}.", kind=(Literal[kind.name], ...), again=(bool, again))  # type: ignore[arg-type]

@@ -22,7 +22,7 @@ from app.platform.database import Base
 
 
 class Role(StrEnum):
-    """What a member may do in a study; each but the blinded assessor includes the reading rights of `viewer`."""
+    """Role of a member in a study. Every role but the blinded assessor includes the reading rights of `viewer`."""
 
     BLINDED_ASSESSOR = "blinded_assessor"
     VIEWER = "viewer"
@@ -34,7 +34,7 @@ class Role(StrEnum):
 
 
 class Scope(StrEnum):
-    """What an API token may do of what its user may."""
+    """Scope of an API token: the part of its user's rights that it has."""
 
     FULL = "full"
     READ = "read"
@@ -46,8 +46,8 @@ class Scope(StrEnum):
 class Study(Base):
     """A trial under one protocol.
 
-    Every code of a participant that is enrolled in a study with a `code_prefix` begins with it, and none of another study's does: who
-    enrols is never told of codes elsewhere. The first study has none. A study that has ended is read, and nothing in it changes.
+    Codes of participants enrolled in a study with a `code_prefix` begin with it; no code of another study does. Enrolment therefore
+    reveals no code of another study. The first study has no prefix. A study that has ended can be read but not changed.
     """
 
     __tablename__ = "study"
@@ -127,7 +127,7 @@ class SignIn(Base):
 
 
 class SignOnLink(Base):
-    """Who a user is at an identity provider; made at the first sign-on of an account that exists."""
+    """Identity of a user at an identity provider. It is added at the first sign-on to an existing account."""
 
     __tablename__ = "sign_on_link"
     __table_args__ = (UniqueConstraint("issuer", "subject"), UniqueConstraint("user_id", "issuer"))

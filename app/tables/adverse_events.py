@@ -22,7 +22,7 @@ from app.tables.visits import Visit
 
 
 class EventKind(StrEnum):
-    """What happened, as far as stimulation is known to do it; anything else is `other` with a note."""
+    """Kind of an adverse event: the known side effects of stimulation. Anything else is `other`, with a note."""
 
     DYSKINESIA = "dyskinesia"
     SPEECH = "speech"
@@ -40,7 +40,7 @@ class EventKind(StrEnum):
 
 
 class Severity(StrEnum):
-    """How bad it was; `none` states that somebody looked and found nothing."""
+    """Severity of an event; `none` records that a person looked and found nothing."""
 
     NONE = "none"
     MILD = "mild"
@@ -48,10 +48,10 @@ class Severity(StrEnum):
 
 
 class AdverseEvent(Base):
-    """Something that happened to a participant: in a session, at a visit, or apart from both. What is known of it are its revisions.
+    """Something that happened to a participant: in a session, at a visit, or apart from both. Its revisions describe it.
 
-    `policy_id` is what ran where no session tells it, such as before the recording of a visit is uploaded. `entry_key` is the name that
-    an entry had on the device where it was made, so that one sent twice is one event.
+    `policy_id` is the policy that ran where no session names it, such as before a visit's recording is uploaded. `entry_key` is the
+    entry's name on the device where it was made: an entry sent twice is one event.
     """
 
     __tablename__ = "adverse_event"
@@ -72,17 +72,17 @@ class AdverseEvent(Base):
 
     @property
     def now(self) -> AdverseEventRevision:
-        """What is known of it; an event always has a revision."""
+        """The newest revision; an event always has one."""
         return self.revisions[-1]
 
     @property
     def blocks(self) -> bool:
-        """Whether it is serious and no clinician has cleared it since it was last described."""
+        """True if it is serious and no clinician has cleared its newest revision."""
         return self.now.serious and self.now.cleared_reason is None
 
 
 class AdverseEventRevision(Base):
-    """What is known of an adverse event. Never changed, only followed: a correction takes back what a clinician cleared before it."""
+    """Revision of an adverse event, never changed. A correction is a new revision; it undoes an earlier clearance by a clinician."""
 
     __tablename__ = "adverse_event_revision"
     __table_args__ = (
@@ -102,7 +102,7 @@ class AdverseEventRevision(Base):
     serious: Mapped[bool]
     note: Mapped[str] = mapped_column(Text, server_default="")
     cleared_reason: Mapped[str | None] = mapped_column(Text)
-    """Why a clinician holds that it does not stand against what ran; None where nobody did."""
+    """A clinician's reason why the event does not count against the policy that ran; None if no clinician has cleared it."""
     entered_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())

@@ -69,7 +69,7 @@ class AuditSeal(Base):
 
 
 class Signature(Base):
-    """A person signed something: its content as it was, and the hash that any later content is held against. Insert only."""
+    """Signature of a person: the content signed, and its hash, against which later content is checked. Insert only."""
 
     __tablename__ = "signature"
     __table_args__ = (

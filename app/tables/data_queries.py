@@ -1,4 +1,4 @@
-"""Tables of data queries: what is asked about, and what was said, entry by entry. Rows are only added."""
+"""Tables of data queries: their subjects and their entries. Rows are only added."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from app.tables.sessions import StudySession
 
 
 class QueryState(StrEnum):
-    """Where a query stands after an entry: it waits for an answer, for whoever asked, or for nobody."""
+    """State of a query after an entry: it waits for an answer, or for the person who asked, or is closed."""
 
     OPEN = "open"
     ANSWERED = "answered"
@@ -28,7 +28,7 @@ class QueryState(StrEnum):
 
 
 class Subject(StrEnum):
-    """What the value that is asked about stands in."""
+    """Kind of record that holds the value asked about."""
 
     SESSION = "session"
     UPLOAD = "upload"
@@ -44,7 +44,7 @@ OF_PARTICIPANT = (Subject.SETTINGS, Subject.CHARACTERISTICS)
 
 
 class DataQuery(Base):
-    """A question about one value, or about an upload. What was said, and its state, are its entries."""
+    """A question about one value, or about an upload. Its entries hold the texts and its state."""
 
     __tablename__ = "data_query"
     __table_args__ = (
@@ -58,7 +58,7 @@ class DataQuery(Base):
     upload_id: Mapped[int | None] = mapped_column(ForeignKey("upload.id"), index=True)
     visit_id: Mapped[int | None] = mapped_column(ForeignKey("visit.id"), index=True)
     dose_id: Mapped[int | None]
-    """Without a foreign key: what was asked about a dose stays when somebody takes the dose back."""
+    """Without a foreign key: a query about a dose stays when the dose is taken back."""
     event_id: Mapped[int | None] = mapped_column(ForeignKey("adverse_event.id"), index=True)
     record: Mapped[str | None] = mapped_column(String(20))
     """`settings` or `characteristics`: the participant's, whose present version holds the value."""
@@ -71,25 +71,25 @@ class DataQuery(Base):
 
     @property
     def subject(self) -> Subject:
-        """What the value stands in."""
+        """The kind of record that holds the value."""
         if self.record is not None:
             return Subject(self.record)
         return next(s for s in Subject if s not in OF_PARTICIPANT and getattr(self, f"{s.value}_id") is not None)
 
     @property
     def subject_id(self) -> int | None:
-        """The number of what the value stands in; None of settings and characteristics."""
+        """The number of the record that holds the value; None for settings and characteristics."""
         number: int | None = None if self.record is not None else getattr(self, f"{self.subject.value}_id")
         return number
 
     @property
     def state(self) -> QueryState:
-        """Where it stands; a query always has an entry."""
+        """The state after the newest entry; a query always has an entry."""
         return QueryState(self.entries[-1].state)
 
 
 class DataQueryEntry(Base):
-    """Something said about a query, with the value as it stood at that moment: a correction leaves the old one readable here."""
+    """Entry of a query: a text, and the value at that moment, which stays readable here after a correction."""
 
     __tablename__ = "data_query_entry"
     __table_args__ = (CheckConstraint("state in ('open', 'answered', 'closed')", name="state"), CheckConstraint("text <> ''", name="text"))

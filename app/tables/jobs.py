@@ -70,7 +70,7 @@ class Job(Base):
     steps: Mapped[list[JobStep]] = relationship(back_populates="job", order_by="JobStep.position")
 
     def seconds_left(self, present: datetime) -> float | None:
-        """Time until the end, if the rest takes as long per share as what is done; None while there is too little to say it from."""
+        """Estimate the time until the end, in seconds, from the mean speed so far; None unless the job runs and has progressed enough."""
         if self.started_at is None or self.status != JobStatus.RUNNING or self.progress < _LEAST_PROGRESS:
             return None
         return (present - self.started_at).total_seconds() * (1 - self.progress) / self.progress
@@ -104,7 +104,7 @@ class JobStep(Base):
 
 
 class JobEvent(Base):
-    """What a job reported, in order: progress, learning-curve points, log lines. Server-sent events are read from here."""
+    """Report of a job: progress, a learning-curve point or a log line, in order. Server-sent events are read from here."""
 
     __tablename__ = "job_event"
     __table_args__ = (Index("ix_job_event_job_id_id", "job_id", "id"),)

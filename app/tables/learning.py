@@ -32,7 +32,7 @@ class BufferSnapshot(Base):
     participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
     settings_version_id: Mapped[int] = mapped_column(ForeignKey("settings_version.id"))
     characteristics_id: Mapped[int | None] = mapped_column(ForeignKey("characteristics_version.id"))
-    """The participant's characteristics of the time; None where nobody had stated any."""
+    """The participant's characteristics of the time; None if none were stated."""
     pins_sha256: Mapped[str] = mapped_column(String(64))
     file_sha256: Mapped[str] = mapped_column(ForeignKey("stored_file.sha256"))
     sessions: Mapped[int]
@@ -46,7 +46,7 @@ class BufferSnapshot(Base):
 
 
 class SnapshotSession(Base):
-    """One session of a snapshot: the versions of everything it was made of, or why it was left out."""
+    """One session of a snapshot: the versions of everything it was made of, or the reason why it is excluded."""
 
     __tablename__ = "snapshot_session"
     __table_args__ = (CheckConstraint("(left_out_reason is null) = (steps is not null)", name="in_or_out"),)
@@ -65,7 +65,7 @@ class SnapshotSession(Base):
 
 
 class GateChoice(StrEnum):
-    """What a clinician decided about sessions of learned policies."""
+    """Decision of a clinician about sessions of learned policies."""
 
     OPEN = "open"
     SHUT = "shut"

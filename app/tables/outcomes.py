@@ -68,7 +68,7 @@ class QocRevision(HasOutcomes, Base):
     entered_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
     derived: Mapped[list[Any]] = mapped_column(server_default="[]")
-    """Names of the QoCs that stand in this revision as they were derived from uploaded files, not as a person typed them."""
+    """Names of the QoCs whose values in this revision were derived from uploaded files; a person typed the others."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     session: Mapped[StudySession] = relationship(back_populates="qocs")
 
@@ -80,8 +80,8 @@ class TremorSeries(Base):
     """Minutes of tremor from one uploaded file of a watch, in UTC.
 
     Little-endian arrays of `n` minutes in time order: `start_unix_s_f64` and `duration_s_f64` in seconds, `fractions_f32` [n, 6] in the
-    order of `ml.qoc.TREMOR_CLASSES`, `any_tremor_f32`; NaN where the export does not tell. Minutes that a newer reading of the file
-    replaced are marked as removed and count no more.
+    order of `ml.qoc.TREMOR_CLASSES`, `any_tremor_f32`. NaN where the export has no value. Minutes that a newer reading of the file
+    replaced are marked as removed and ignored.
     """
 
     __tablename__ = "tremor_series"
@@ -114,7 +114,7 @@ class GraspTest(Base):
     """One hand's grasp test near the end of a session: times of open fists, s (little-endian float64, `n` of them).
 
     `implausible` lists which of the n - 1 intervals between them are too short or too long to be a grasp. A test that a newer reading
-    replaced, or that belongs to another session, is marked as removed and counts no more; it outlasts a proposal that was given up.
+    replaced, or that belongs to another session, is marked as removed and ignored. It stays when its proposal is given up.
     """
 
     __tablename__ = "grasp_test"

@@ -44,7 +44,7 @@ HEMISPHERE_CHECK = "hemisphere in ('left', 'right')"
 
 
 class CharacteristicsVersion(Base):
-    """Who the participant is, as far as the study needs it. Never changed, only followed by a newer version.
+    """Characteristics of the participant that the study needs. Never changed, only followed by a newer version.
 
     `leads` has an object per lead: `hemisphere`, `target`, `model`, `sensing`, `stimulating` (contacts). `medication` has an object per
     dose of an ordinary visit day: `drug`, `mg`, `at` (local time of day, HH:MM).
@@ -82,9 +82,9 @@ def add_margin_columns(table: type[Base]) -> None:
 class MarginsVersion(Base):
     """By how much an outcome may be worse than under cDBS, and how sure a proposal must be of it. Never changed, only followed.
 
-    A column per margin of `ml.outcomes`. The levels: a policy is proposed for a test where it keeps all outcomes within the margins with
-    probability `test_within` and saves energy with `test_saves`; it is unsafe where an outcome lies beyond its margin with
-    `unsafe_beyond`, or where more than `nearly_off_share` of its steps are nearly off.
+    One column per margin of `ml.outcomes`. A policy is proposed for a test if it keeps all outcomes within the margins with probability
+    `test_within` and saves energy with probability `test_saves`. It is unsafe if an outcome is beyond its margin with probability
+    `unsafe_beyond`, or if more than `nearly_off_share` of its steps are nearly off.
     """
 
     __tablename__ = "margins_version"
@@ -154,7 +154,7 @@ class Participant(Base):
 
     @property
     def current_characteristics(self) -> CharacteristicsVersion | None:
-        """The newest characteristics; None where nobody stated any."""
+        """The newest characteristics; None if none were stated."""
         return self.characteristics[-1] if self.characteristics else None
 
     @property
@@ -169,7 +169,7 @@ class Participant(Base):
 
     @property
     def margins_lock(self) -> MarginsLock | None:
-        """The lock in force, which is the newest; None where nobody locked any margins."""
+        """The lock in force, which is the newest; None if no margins were locked."""
         return self.margins_locks[-1] if self.margins_locks else None
 
     @property

@@ -30,7 +30,7 @@ from app.tables.visits import Visit
 
 
 class Plan(Base):
-    """What shall happen at a visit: drafted from a ranking, approved by a clinician, then fixed."""
+    """Plan of a visit: drafted from a ranking, approved by a clinician, then fixed."""
 
     __tablename__ = "plan"
     __table_args__ = (
@@ -71,7 +71,7 @@ SEALED = and_(Plan.blinded, Plan.approved_at.is_not(None), Plan.key_opened_at.is
 class PlanItem(Base):
     """One session of a plan: the slot of the visit that a recording fills (`StudySession.plan_item_id`).
 
-    `min_ma`, `max_ma`, `ramp_ma_per_s` are the limits within which it runs, set before the plan is signed; null in plans of earlier
+    `min_ma`, `max_ma` and `ramp_ma_per_s` are the session's limits, set before the plan is signed. They are null in plans of earlier
     versions, and where the cDBS amplitude is not known. `repeat` counts the sessions of one policy (or of cDBS and so on) within the visit,
     from 1. `label` is what a blinded visit calls it.
     """
@@ -111,23 +111,23 @@ class PlanItem(Base):
     medication: Mapped[str] = mapped_column(Text, server_default="")
     """What is due before the session."""
     verdict: Mapped[str | None] = mapped_column(String(20))
-    """What the ranking said of the policy when the plan was drafted, the strictest of it and the newest one; `unsafe` after a serious
+    """Verdict on the policy when the plan was drafted: the stricter of the plan's ranking and the newest one. `unsafe` after a serious
     adverse event, ranked or not."""
     min_fraction: Mapped[float | None]
     """Lowest amplitude of the session's envelope, fraction of the cDBS amplitude; None where the plan states none."""
     override_reason: Mapped[str | None] = mapped_column(Text)
     """Why a clinician plans an unsafe policy all the same."""
     design: Mapped[dict[str, Any] | None] = mapped_column(JSONB(none_as_null=True))
-    """What a random session shall try, or one held near an amplitude, `app.planning.plans.designs.Planned.as_json`; null for other
-    controllers and in plans of before."""
+    """Design of a random session, or of one kept near an amplitude: `app.planning.plans.designs.Planned.as_json`. Null for other
+    controllers and in older plans."""
 
 
 class BundleRelease(Base):
     """A controller bundle that left the service: who took which policy within which limits, and with whose approval. Insert only.
 
     `policy_id` is null where the session's amplitudes were laid out beforehand, `plan_item_id` where the bundle is for no planned session.
-    `approvals` holds the sign-offs that stood in the manifest; null for bundles taken before they were recorded here. `content_sha256` is
-    of what the bundle holds but who took it first and when: who takes the same gets the same bytes; null for bundles of earlier versions.
+    `approvals` holds the sign-offs of the manifest; null for bundles taken before they were recorded here. `content_sha256` is the hash of
+    the content without who took it first and when. Equal content is given out as the same bytes. Null for bundles of earlier versions.
     """
 
     __tablename__ = "bundle_release"
@@ -163,10 +163,10 @@ OF_THE_DAY = ("note", "adverse_event", "clinical_settings", "dose")
 
 
 class DayEntry(Base):
-    """One thing that somebody entered on the clinic day. Insert only; a correction is a new entry that names what it replaces.
+    """Entry of the clinic day. Insert only; a correction is a new entry that names what it replaces.
 
-    `device_time` is as the tablet's clock had it, `clock_offset_ms` what must be added to it to have the service's time, as last measured
-    by the tablet; null where the tablet had not reached the service yet.
+    `device_time` is the time of the tablet's clock. Adding `clock_offset_ms`, as last measured by the tablet, gives the service's time;
+    it is null if the tablet had not reached the service yet.
     """
 
     __tablename__ = "day_entry"

@@ -28,7 +28,7 @@ from app.tables.visits import Visit
 
 
 class Controller(StrEnum):
-    """What drove the stimulation of a session."""
+    """Kind of controller that drove the stimulation of a session."""
 
     CDBS = "cdbs"
     RL = "rl"
@@ -39,7 +39,7 @@ class Controller(StrEnum):
 
 
 class Activity(StrEnum):
-    """What a participant did in the half hour before a session."""
+    """Activity of a participant in the half hour before a session."""
 
     REST = "rest"
     LIGHT = "light"
@@ -80,7 +80,7 @@ class StudySession(Base):
     started_at: Mapped[datetime | None]
     duration_s: Mapped[float]
     plan_item_id: Mapped[int | None] = mapped_column(ForeignKey("plan_item.id"), unique=True)
-    """The slot of the visit's plan that this session fills; None of a session that nobody planned."""
+    """The slot of the visit's plan that this session fills; None for an unplanned session."""
     control_stream: Mapped[str] = mapped_column(String(40), server_default="beta")
     control_channel: Mapped[str | None] = mapped_column(String(80))
     control_program: Mapped[int | None] = mapped_column(SmallInteger)
@@ -110,7 +110,7 @@ class StudySession(Base):
 
     @property
     def conditions(self) -> SessionConditions | None:
-        """What the session ran under, newest revision; None of a proposal, whose conditions are taken down when it is confirmed."""
+        """The newest conditions of the session; None for a proposal, whose conditions are recorded when it is confirmed."""
         return self.conditions_revisions[-1] if self.conditions_revisions else None
 
 
@@ -130,10 +130,10 @@ class SessionSegment(Base):
 
 
 class CountedTime(Base):
-    """Which minutes of which device and side a confirmed session counts on; kept by triggers, so that none can count twice.
+    """Time span of a device and side that a confirmed session uses. Triggers maintain it, so that no minute counts twice.
 
-    `device_side` is the range [4 device, 4 device + 4) where no side is known, else one number of it, so that a recording of no side
-    meets those of both; ranges need no extension of PostgreSQL. `span` leaves a second out at both ends: clocks are not exact.
+    `device_side` is the range [4 device, 4 device + 4) if the side is unknown, else one number of that range. A recording of unknown side
+    thus overlaps those of both sides; ranges need no extension of PostgreSQL. `span` omits a second at both ends: clocks are not exact.
     """
 
     __tablename__ = "counted_time"
@@ -151,9 +151,9 @@ class CountedTime(Base):
 
 
 class SessionConditions(Base):
-    """What a session ran under, as far as it is known; a correction is a new revision, and results pin the one they used.
+    """Known conditions of a session. A correction is a new revision; results pin the one they used.
 
-    `origin`: `stated` by a person or a plan; `settings` in force by the clock when the session ran; `assumed` where neither tells.
+    `origin`: `stated` by a person or a plan; `settings` in force by the clock when the session ran; `assumed` if neither is known.
     `design_parameters` has `level` and `holds` (objects of `start`, `steps`, `amplitude`, `log_density`) as `ml.designs` has them.
     `programming` has an object per program: `hemisphere`, `group`, `program`, `contacts`, `pulse_width_us`, `rate_hz`.
     """

@@ -102,14 +102,14 @@ class UploadFile(Base):
 
     @property
     def preview(self) -> dict[str, Any] | None:
-        """What may be shown of a table that waits for a column mapping (`ml.formats.tables.mapping.preview_of`); None for other files."""
+        """Preview of a table that waits for a column mapping (`ml.formats.tables.mapping.preview_of`); None for other files."""
         waits = self.status == "failed" and self.quarantine_sha256 is not None
         found: dict[str, Any] | None = (self.report or {}).get(PREVIEW)
         return found if waits else None
 
 
 class ColumnMapping(Base):
-    """Which column of the tables with one header holds what, in one study. Never changed, only followed by a newer version.
+    """Meaning of the columns of tables with the same header, in one study. Never changed, only followed by a newer version.
 
     `header` is the keyed hash of the line that names the columns. A version that is `removed` ends a mapping: the next table asks again.
     """
@@ -137,7 +137,7 @@ class ColumnMapping(Base):
 
 
 class SessionProposal(Base):
-    """Why an upload proposes a session, and how often the proposal was changed; it stays beside the session that it became.
+    """Evidence for a session that an upload proposes, and the number of its changes. The row stays after the session is confirmed.
 
     `evidence` has an `app.ingest.proposals.evidence.Evidence` per field (`visit`, `controller`, …), in old rows a sentence. Where
     `visit_open`, the visit is a place to store the proposal in and no guess. `version` lets no tab overwrite another's correction.

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Drug(StrEnum):
-    """What was taken."""
+    """Drug of a dose."""
 
     LEVODOPA = "levodopa"
     LEVODOPA_CR = "levodopa_cr"
@@ -73,7 +73,7 @@ _DOSES = "and_(Dose.visit_id == Visit.id, Dose.removed_at.is_(None))"
 
 
 class CdbsAmplitude(Base):
-    """The clinician's cDBS amplitude in force at a visit, per hemisphere and program, whence fractions. A removed one counts no more."""
+    """Clinician's cDBS amplitude in force at a visit, per hemisphere and program (split among programs). Removed rows are ignored."""
 
     __tablename__ = "cdbs_amplitude"
     __table_args__ = (
@@ -111,13 +111,13 @@ class Visit(Base):
     locks: Mapped[list[VisitLock]] = relationship(back_populates="visit", order_by="VisitLock.id", lazy="selectin")
     if TYPE_CHECKING:  # mapped in `app.tables.plans`
         sealed: Mapped[bool]
-        """Whether the key of its signed plan is sealed, so that nobody may know what ran (`app.study.blinding`)."""
+        """True while the key of its signed plan is sealed: what ran must stay unknown (`app.study.blinding`)."""
         unsealed_at: Mapped[datetime | None]
         """When the key of its signed plan was opened; None where it is sealed or the plan is not blinded."""
 
     @property
     def locked(self) -> bool:
-        """Whether the visit's data are closed for changes, and open to blinded assessors."""
+        """True if the visit's data are closed for changes, and open to blinded assessors."""
         return bool(self.locks) and self.locks[-1].locked
 
 

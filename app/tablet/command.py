@@ -38,7 +38,7 @@ _TELLING = frozenset({
     "latency_us", "worst_late_ms", "mean_amplitude_ma", "energy_of_cdbs", "energy_saved_percent", "battery", "battery_life_of_cdbs",
     "battery_life", "battery_days", "battery_life_on_cdbs", "battery_days_on_cdbs",
 })  # fmt: skip
-"""Entries of a summary that tell which controller a blinded session ran."""
+"""Entries of a summary that reveal which controller a blinded session ran."""
 
 
 Sink = Callable[[Row], None]
@@ -47,7 +47,7 @@ Sink = Callable[[Row], None]
 
 @dataclass
 class Run:
-    """What a session of the controller amounted to; grows with every decision."""
+    """Results of a session of the controller; they grow with every decision."""
 
     period_s: float
     cdbs_ma: float
@@ -60,7 +60,7 @@ class Run:
 
     @staticmethod
     def of(session: LiveSession) -> Run:
-        """What a session with a device side amounted to."""
+        """Collect the results of a session with a device side."""
         limits = session.controller.envelope.limits
         run = Run(limits.period_s, limits.cdbs_ma, session.decisions, [row.latency_us for row in session.rows], missed=session.missed)
         run.signal_us = [0.0] * len(run.decisions)
@@ -69,7 +69,7 @@ class Run:
         return run
 
     def summary(self, source: Source) -> dict[str, Any]:
-        """Numbers of the session by name; None where there is nothing to count."""
+        """Compute the numbers of the session by name; None where there is nothing to count."""
         amplitudes = np.array([d.amplitude_ma for d in self.decisions])
         latency = np.array(self.latency_us)
         asked = [d for d in self.decisions if not d.fallback]
@@ -95,8 +95,8 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
     """Verify a bundle and, with a source, run its controller. Returns the summary.
 
     Args:
-        bundle: the ZIP. source: a device side (`-` in real time, `tcp:PORT`, `tail:FILE`, `simulated:P1:SEED`), with which the session of
-            the signed plan runs, or one that `open_source` knows; without a source the bundle is verified and no more.
+        bundle: the ZIP. source: for the signed plan's session, a device side (`-` in real time, `tcp:PORT`, `tail:FILE`,
+            `simulated:P1:SEED`); else one that `open_source` knows. Without a source the bundle is only verified.
         wish: as `open_source` takes it. task: what else is to be done.
 
     Raises:
@@ -111,12 +111,12 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
         )
     facts: dict[str, Any] = {"bundle": bundle.name, "participant": manifest.participant, "policy_name": manifest.policy_name}
     facts |= {"policy_id": manifest.policy_id, "approved": bool(manifest.approvals), "warnings": warning_sentences(manifest)}
-    if manifest.card is not None and manifest.card.blinded:  # nobody at the tablet is told what runs
+    if manifest.card is not None and manifest.card.blinded:  # the tablet does not show what runs
         facts |= {"policy_name": manifest.card.head, "policy_id": None, "blinded": True, "warnings": []}
-    if task.timed and not is_blinded(opened.manifest_json):  # which would tell the network's size
+    if task.timed and not is_blinded(opened.manifest_json):  # which would reveal the network's size
         facts["measured_us"] = latency(opened.manifest_json, opened.controller(), task.timed)
     if source is None:
-        # how many files are inside tells a network from a schedule
+        # the number of files distinguishes a network from a schedule
         return facts | {"verified": True, "files": None if facts.get("blinded") else len(manifest.files)}
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(errors="replace")  # bytes that are no text are no number either, and no reason to stop
@@ -137,12 +137,12 @@ def control(bundle: Path, source: str | None, wish: Wish, task: Task) -> dict[st
 
 
 def _no_rows() -> Rows:
-    """Of a source that was run through already."""
+    """Yield no rows: the source was read to its end already."""
     yield from ()
 
 
 def _replayed(opened: OpenBundle, stream: Source, run: Run, wish: Wish, task: Task) -> dict[str, Any]:
-    """Drive the controller from what was recorded or is simulated; nobody is stimulated."""
+    """Drive the controller from recorded or simulated data; no person is stimulated."""
     log = None
     try:
         if task.log is not None:
@@ -163,7 +163,7 @@ def _replayed(opened: OpenBundle, stream: Source, run: Run, wish: Wish, task: Ta
 
 
 def verified(path: Path, key: str | None) -> OpenBundle:
-    """A bundle whose signature, hashes and test vectors are right.
+    """Open a bundle and check its signature, hashes and test vectors.
 
     Args:
         path: of the ZIP. key: public key as 64 hexadecimal digits, or a file with them; the one of this installation when None.
@@ -174,7 +174,7 @@ def verified(path: Path, key: str | None) -> OpenBundle:
     try:
         return open_bundle(path.read_bytes(), _public_key(key))
     except BundleError as error:
-        raise Invalid(f"{path.name} must not be used: {error}.", "Take the bundle from the study anew.") from error
+        raise Invalid(f"{path.name} must not be used: {error}.", "Take the bundle from the study again.") from error
     except OSError as error:
         raise Invalid(f"{path} cannot be read: {error.strerror}.", "Name the ZIP that the study gave you.") from error
 
@@ -226,14 +226,14 @@ def drive(
 
 
 def _masked(summary: dict[str, Any]) -> dict[str, Any]:
-    """The summary of a blinded session, without what tells its controller."""
+    """Remove the entries of a blinded session's summary that reveal its controller."""
     telling = reason_names(OF_THE_CONTROLLER)
     kept = {name: None if name in _TELLING else value for name, value in summary.items()}
     return kept | {"reasons": {name: count for name, count in summary["reasons"].items() if name not in telling}}
 
 
 def lines(summary: dict[str, Any]) -> str:
-    """The summary for a person."""
+    """Format the summary for a person."""
     use = "approved" if summary["approved"] else "NOT APPROVED: not to be used on a participant"
     who = f"participant {summary['participant']}, {_what(summary)}, {use}"
     warned = [f"warning          {text}" for text in summary["warnings"]]
@@ -283,7 +283,7 @@ def _what(summary: dict[str, Any]) -> str:
 
 
 def _measured(summary: dict[str, Any]) -> list[str]:
-    """What `--time` found, as lines of the summary."""
+    """Format the latencies that `--time` measured, as lines of the summary."""
     found = summary.get("measured_us")
     if not found:
         return []
@@ -322,7 +322,7 @@ def _spread(values: Any) -> dict[str, float] | None:
 
 
 def _foreign(run: Run, manifest: BundleManifest) -> dict[str, Any]:
-    """A warning where every beta amplitude that came was of another unit or source than the bundle's."""
+    """Warn if every beta amplitude received had another unit or source than the bundle's."""
     came = [d for d in run.decisions if not d.reasons & (Reason.NO_BETA | Reason.STALE_BETA)]
     if not came or not all(d.reasons & Reason.WRONG_SIGNAL for d in came):
         return {}
@@ -331,7 +331,7 @@ def _foreign(run: Run, manifest: BundleManifest) -> dict[str, Any]:
 
 
 def _battery(run: Run, implant: Implant | None) -> dict[str, Any]:
-    """What the session's amplitudes mean for a battery; nothing where nothing was decided."""
+    """Estimate what the session's amplitudes mean for a battery; empty if there were no decisions."""
     fractions = np.array([d.amplitude_ma for d in run.decisions]) / run.cdbs_ma
     if not fractions.size:
         return {}
@@ -346,7 +346,7 @@ def _battery(run: Run, implant: Implant | None) -> dict[str, Any]:
 
 
 def _agreement(source: Source) -> dict[str, Any]:
-    """How close P_beta in time was to P_beta as computed afterwards, over the periods that are valid in both."""
+    """Compare the streamed P_beta with P_beta computed afterwards, over the periods valid in both; empty for fewer than 3."""
     streamed = np.array(source.streamed)
     offline = source.offline[: streamed.size]
     both = np.isfinite(streamed[: offline.size]) & np.isfinite(offline)

@@ -1,6 +1,6 @@
-"""The hazard log: every way in which a controller could harm, what stands against it, and the tests that show it. In the form of ISO 14971.
+"""Hazard log in the form of ISO 14971: hazards of a controller, their controls, and the tests that verify the controls.
 
-The hazards are data, here and nowhere else; which tests show a control is read from the tests themselves, which carry the hazard's number
+The hazards are data, here and nowhere else. The tests of a control are read from the tests themselves, which carry the hazard's number
 (`@pytest.mark.hazard("H01")`). `python -m app.tablet.hazards` writes docs/hazards.md.
 """
 
@@ -18,7 +18,7 @@ PAGE = ROOT / "docs" / "hazards.md"
 
 
 class Harm(StrEnum):
-    """What a participant would suffer."""
+    """Harm to a participant."""
 
     UNDER = "too little stimulation: symptoms return"
     OVER = "too much stimulation: side effects"
@@ -27,7 +27,7 @@ class Harm(StrEnum):
 
 
 class Severity(StrEnum):
-    """How bad it would be, before any control. S4 does not occur: the stimulator's own limits stand outside of betaloop."""
+    """Severity of a harm before any control. S4 does not occur: the stimulator's own limits apply outside of betaloop."""
 
     S1 = "S1: inconvenience, or a session to repeat"
     S2 = "S2: passing discomfort, ends with the session or with the programmer"
@@ -35,7 +35,7 @@ class Severity(StrEnum):
 
 
 class Likelihood(StrEnum):
-    """How often it is expected over a study, judged, not measured."""
+    """Likelihood of a hazard over a study, judged, not measured."""
 
     P1 = "P1: not expected in a study"
     P2 = "P2: once in a study"
@@ -50,7 +50,7 @@ class Hazard:
     Attributes:
         number: `H01`, ...; never given to another one.
         situation: what goes wrong. harms: what it would do. severity, before: without the control; after: likelihood with it.
-        control: what stands against it, and where. residual: what is left, for the clinician to know.
+        control: the measure against it, and where. residual: the remaining risk, which the clinician must know.
     """
 
     number: str
@@ -222,7 +222,7 @@ HAZARDS: tuple[Hazard, ...] = (
 
 
 def marked_tests(folder: Path) -> dict[str, list[str]]:
-    """Tests by the hazards that they carry, `path::name` from the project's root, as the source says; sorted."""
+    """Read the tests' hazard marks from their source: sorted `path::name` from the project's root, by hazard number."""
     found: dict[str, list[str]] = {}
     for path in sorted(folder.rglob("test_*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -239,7 +239,7 @@ def _numbers(decorators: Sequence[ast.expr]) -> Iterator[str]:
 
 
 def page(tests: Mapping[str, Sequence[str]]) -> str:
-    """docs/hazards.md, in Markdown."""
+    """Write the text of docs/hazards.md, in Markdown."""
     lines = [
         "# Hazard log", "",
         "In which ways could a controller harm, what stands against each, and which tests show it? In the form of ISO 14971:",

@@ -20,7 +20,7 @@ router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
 @router.get("/studies")
 def list_studies(db: Db, caller: CurrentCaller) -> list[StudyOut]:
-    """The studies that the caller may read, with their sites."""
+    """List the studies that the caller may read, with their sites."""
     return [study_out(db, s) for s in accounts.studies(db) if caller.may(can.READ, s.id)]
 
 
@@ -54,7 +54,7 @@ def rename_site(study: ManagedStudy, site_code: str, change: NameChange, db: Db)
 
 @router.get("/studies/{study_code}/members")
 def list_members(study: ManagedStudy, db: Db) -> list[MemberOut]:
-    """Who works in a study in which role, by address."""
+    """List the members of a study and their roles, by address."""
     return [MemberOut(email=u.email, role=Role(m.role), site=site, active=u.active) for u, m, site in repository.members_of(db, study.id)]
 
 

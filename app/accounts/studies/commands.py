@@ -79,7 +79,7 @@ def study_prefix(
     reason: Why,
     as_json: AsJson = False,
 ) -> None:
-    """Have codes of a study's new participants begin with a prefix, so that they are never held against those of other studies."""
+    """Set the prefix of new participants' codes in a study, so that they are never compared with those of other studies."""
     with transaction(ACTOR) as db:
         change = _checked(StudyChange, code_prefix=prefix, reason=reason)
         service.change_study(db, service.study_to_manage(db, code, SYSTEM), change, SYSTEM)

@@ -52,7 +52,7 @@ class NameChange(Model):
 
 
 class EndingReason(Model):
-    """Why a study or a site ends, or is opened again."""
+    """Reason why a study or a site ends, or is opened again."""
 
     reason: Reason = Field(description="Kept in the audit trail.")
 
@@ -76,7 +76,7 @@ class StudyOut(Model):
 
 
 class Member(Model):
-    """Who has a role, and where."""
+    """Member of a study: a user with a role, at a site or at all sites."""
 
     email: Text = Field(max_length=254, description="E-mail address of the user.")
     site: ShortCode | None = Field(None, description="Code of the site; null is all sites.")

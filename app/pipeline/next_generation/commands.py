@@ -17,7 +17,7 @@ def next_generation(
     wait: Annotated[bool, typer.Option(help="Show progress until the job has ended.")] = True,
     as_json: AsJson = False,
 ) -> None:
-    """Go on from what did best in its sessions, train fresh policies beside it, distil, evaluate, rank. A worker must be running."""
+    """Continue from the policies that did best in their sessions, train new ones, distil, evaluate and rank. A worker must be running."""
     from app.pipeline.next_generation.service import start
     from app.pipeline.params import NextGenerationParams
     from app.platform.jobs.watch import follow

@@ -86,7 +86,7 @@ def _judge(job: JobContext, params: NextGenerationParams, planned: dict[str, Any
 
 
 def judging_call(params: NextGenerationParams, planned: dict[str, Any]) -> dict[str, Any]:
-    """Params by which `evaluate_method` judges the tested policies."""
+    """Build the params with which `evaluate_method` judges the tested policies."""
     others, known = planned["others"], planned["tested_so_far"]
     judged = {p["id"] for p in planned["tested"]}
     return {
