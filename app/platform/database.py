@@ -14,7 +14,7 @@ from psycopg.errors import UndefinedColumn, UndefinedTable
 from sqlalchemy import Connection, DateTime, Engine, MetaData, create_engine, event, make_url, text
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.exc import DBAPIError, ProgrammingError
-from sqlalchemy.orm import DeclarativeBase, ORMExecuteState, Session, SessionTransaction, sessionmaker
+from sqlalchemy.orm import DeclarativeBase, ORMExecuteState, Session, SessionTransaction
 
 from app.platform.connection import NOTICED, connection_url
 from app.platform.embedded import place
@@ -136,7 +136,7 @@ def get_engine() -> Engine:
 
 def new_session() -> Session:
     """A session outside a request (commands, workers); the caller commits and closes."""
-    return sessionmaker(get_engine(), expire_on_commit=False)()
+    return Session(get_engine(), expire_on_commit=False)
 
 
 @contextmanager

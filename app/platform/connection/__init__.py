@@ -5,6 +5,7 @@ Without it the operating system waits a quarter of an hour for a machine that an
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final
 
 from sqlalchemy import URL, make_url
@@ -24,6 +25,7 @@ WRITABLE: Final = {"target_session_attrs": "read-write"}
 """With several hosts: the one that takes writes, so that a standby is left alone until it is promoted."""
 
 
+@lru_cache(maxsize=8)  # every request asks
 def connection_url(setting: str, url: str) -> str:
     """SQLAlchemy's URL of a setting: several hosts are accepted as libpq writes them, and `NOTICED` is added; what the URL states stays.
 
