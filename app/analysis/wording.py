@@ -52,7 +52,7 @@ FAMILY = (
 )
 STRATEGY = (
     "A controller counts with every session of it, whichever policy ran, so that nothing is selected by its outcome. A single policy is "
-    "judged by the sessions recorded after it was last put on an approved plan; what was known before may have picked it, and does "
+    "judged by the sessions that began after it was last put on an approved plan; what was known before may have picked it, and does "
     "not count."
 )
 ADJUSTMENTS = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import date, datetime
 from enum import StrEnum
 
 import numpy as np
@@ -86,7 +86,7 @@ class Facts:
     Attributes:
         values: by metric, absent where not measured. missing: why, by metric. steps: usable share of beta and amplitude is judged on them.
         stopped: it was stopped for the patient's sake, for the reason given. medication_h: hours since the last dose, where known.
-        created_at: when the record of the session came into being.
+        created_at: when the record of the session came into being. visit_date: of its visit, where stated.
     """
 
     session_id: int
@@ -105,6 +105,13 @@ class Facts:
     sides: tuple[Side, ...]
     stopped: str | None
     medication_h: float | None
+    visit_date: date | None = None
+
+    def began_after(self, moment: datetime) -> bool:
+        """Return whether the session is known to have begun after a moment: by its start, else by the day of its visit."""
+        if self.started_at is not None:
+            return self.started_at > moment
+        return self.visit_date is not None and self.visit_date > moment.date()
 
     @property
     def controller(self) -> Controller:
@@ -161,6 +168,7 @@ def read(session: StudySession, arm: Arm, traces: TracesOf) -> Facts:
         sides=_sides(session, table, fraction, traces),
         stopped=session.stopped_reason,
         medication_h=hours_since_dose(session),
+        visit_date=session.visit.date,
     )
 
 

@@ -172,9 +172,9 @@ def _of_controller(sessions: Sequence[Facts], controller: Controller) -> Control
 def _of_policy(
     sessions: Sequence[Facts], controller: Controller, policy_id: int, name: str | None, picked_at: datetime | None
 ) -> ControllerResult:
-    """Sessions recorded before the policy was last picked may have picked it; they confirm nothing where later ones are there."""
+    """Compare a policy; sessions that may have begun before it was last picked confirm nothing where later ones are there."""
     mine = [s for s in sessions if s.arm.policy_id == policy_id and s.controller is controller]
-    before = [s for s in mine if picked_at is not None and s.created_at < picked_at]
+    before = [s for s in mine if picked_at is not None and not s.began_after(picked_at)]
     after = [s for s in mine if s not in before]
     basis, used = (Basis.CONFIRMATION, after) if after else (Basis.SELECTION, before)
     ids = {s.session_id for s in used}
