@@ -175,6 +175,7 @@ def contradiction(found: Contradiction, slots: Sequence[SlotOut]) -> str:
 
 
 MAY_NOT_RUN = "This plan may not run any more. A clinician who may open its key sees why on the page of the plan."
+CORRECTED_ON_THE_DAY = "the entry was corrected on the clinic day"
 STOPPED_FOR_PARTICIPANT = "stopped for the participant's sake on the clinic day"
 
 
@@ -183,10 +184,17 @@ def from_the_day(who: Sequence[str]) -> str:
     return "entered on the clinic day" + (f" by {', '.join(who)}" if who else "")
 
 
-def day_differs(name: str, entered: float, known: float) -> str:
-    """A QoC that the clinic day has otherwise than the session, which keeps its own."""
+def day_differs(name: str, entered: float, known: float | None) -> str:
+    """Describe a QoC that the clinic day has otherwise than the session, which keeps its own; `known` None: a person took it back."""
     what, unit = {"rating": ("rating", ""), "grasp_hz": ("grasp frequency", " Hz")}[name]
-    return f"The clinic day has a {what} of {stated(entered, 3)}{unit}, the session {stated(known, 3)}{unit}; the session keeps its own."
+    own = "none" if known is None else f"{stated(known, 3)}{unit}"
+    return f"The clinic day has a {what} of {stated(entered, 3)}{unit}, the session {own}; the session keeps its own."
+
+
+def day_ended(elapsed_s: float, recorded_s: float) -> str:
+    """Describe a session that the clinic day ends at another time than its recording."""
+    said, recorded = _clock(elapsed_s), _clock(recorded_s)
+    return f"The clinic day has it stopped after {said}, and its recording is {recorded} long: one of the two is wrong."
 
 
 def open_contradiction(kind: str) -> str:

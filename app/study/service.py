@@ -140,8 +140,10 @@ def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller
         raise Invalid("No outcome was given.", f"Enter at least one of {enumerated([o.label.lower() for o in OUTCOMES])}.")
     others = {o.field: other_values(db, session, o) for o in OUTCOMES if o.far is not None}
     questions.require_sure(given, values.sure, known, others)
-    kept = [name for name in (known.derived if known else ()) if merged[name] == getattr(known, name)]
-    return outcomes.add_revision(db, session, given, caller.label, values.reason, kept)
+    same = {name for name, value in merged.items() if value == getattr(known, name, None)}
+    kept = [name for name in (known.derived if known else ()) if name in same]
+    followed = [name for name in (known.from_day if known else ()) if name in same]
+    return outcomes.add_revision(db, session, given, caller.label, values.reason, kept, followed)
 
 
 def take_derived(db: Session, session: StudySession, choice: DerivedChoice, caller: Caller) -> QocRevision:

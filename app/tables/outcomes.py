@@ -68,7 +68,9 @@ class QocRevision(HasOutcomes, Base):
     entered_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
     derived: Mapped[list[Any]] = mapped_column(server_default="[]")
-    """Names of the QoCs whose values in this revision were derived from uploaded files; a person typed the others."""
+    """Names of the QoCs whose values in this revision were derived from uploaded files."""
+    from_day: Mapped[list[Any]] = mapped_column(server_default="[]")
+    """Names of those that have, or lack, a value as the clinic day has it: they follow its later entries."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     session: Mapped[StudySession] = relationship(back_populates="qocs")
 

@@ -1089,6 +1089,7 @@ def upgrade() -> None:
         sa.Column("reason", sa.Text(), nullable=True),
         sa.Column("created_at", sa.DateTime(timezone=True), server_default=sa.text("now()"), nullable=False),
         sa.Column("derived", postgresql.JSONB(astext_type=sa.Text()), server_default="[]", nullable=False),
+        sa.Column("from_day", postgresql.JSONB(astext_type=sa.Text()), server_default="[]", nullable=False),
         sa.CheckConstraint("grasp_hz >= 0 and grasp_hz < 20", name=op.f("ck_qoc_grasp")),
         sa.CheckConstraint("rating between 1 and 10", name=op.f("ck_qoc_rating")),
         sa.CheckConstraint("tremor_percent between 0 and 100", name=op.f("ck_qoc_tremor")),

@@ -97,7 +97,8 @@ export class Link {
       if (answer.ok) {
         const { server_time: time, results } = await answer.json();
         this.#clock(sent, time);
-        await this.#settle(batch, results);
+        // an answer comes in the order of its entries; one whose own identifier could not be read has none there
+        await this.#settle(batch, results.map((result, i) => ({ ...result, uuid: result.uuid ?? batch[i].entry.uuid })));
         this.#set("online");
         return true;
       }

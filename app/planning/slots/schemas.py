@@ -20,6 +20,7 @@ class SlotRowOut(Model):
     session_id: int | None = Field(description="That fills it; null where none was found.")
     confirmed: bool = Field(description="Whether a person has put the session there.")
     deviations: list[Deviation]
+    differences: list[str] = Field(description="What the clinic day says otherwise than the session, in sentences.")
     predicted: dict[str, float] = Field(description=f"Energy (mean squared fraction of cDBS), {', '.join(FIELDS)}; known ones.")
     done: dict[str, float]
 

@@ -32,6 +32,7 @@ def _row(row: Row, names: dict[int, str], sealed: bool) -> SlotRowOut:
         session_id=row.session.id if row.session else None,
         confirmed=row.confirmed,
         deviations=list(row.deviations),
+        differences=list(row.differences),
         predicted=row.predicted if known else {},
         # 100 % of cDBS would name the cDBS sessions
         done={name: value for name, value in row.done.items() if name != "energy"} if sealed else row.done,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +19,8 @@ from app.planning.plans.view import PlanLine, PlanView
 from app.planning.slots import repository
 from app.planning.slots.matching import NO_SLOT, Deviation, Done, Match, Planned, match
 from app.planning.visit_day import repository as clinic_day
-from app.planning.visit_day.record import SlotTimes
-from app.planning.visit_day.session_outcomes import take_outcomes
+from app.planning.visit_day.record import SlotTimes, times_of
+from app.planning.visit_day.session_outcomes import differences, take_outcomes
 from app.platform.errors import BetaloopError, Conflict
 from app.study import service as study
 from app.study.blinding import require_known, stated_arm
@@ -27,6 +28,7 @@ from app.study.sessions import logged
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.data import session_data
 from app.study.visits.service import require_unlocked
+from app.tables.plans import DayEntry
 from app.tables.sessions import Controller, StudySession
 from app.tables.uploads import SessionProposal
 from app.tables.visits import Visit
@@ -44,6 +46,7 @@ class Row:
         line: of the plan; None for a session beside it. session: that fills it; None where none was found.
         confirmed: whether a person has put it there. proposed: whether the session itself waits for confirmation.
         predicted, done: `QUANTITIES` that are known, by name.
+        differences: what the clinic day says otherwise than the confirmed session, in sentences.
     """
 
     line: PlanLine | None
@@ -53,6 +56,7 @@ class Row:
     proposed: bool
     predicted: dict[str, float]
     done: dict[str, float]
+    differences: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -102,11 +106,12 @@ def compare(db: Session, visit: Visit, caller: Caller) -> Comparison:
     if view.plan.status != "approved":
         raise Conflict(f"Plan {view.plan.id} of visit {visit.number} is not signed.", "Sessions are held against signed plans alone.")
     sessions = {s.id: s for s in repository.sessions_of_day(db, visit.id)}
-    times = clinic_day.slot_times(db, view.plan.id)
+    entries = clinic_day.entries(db, view.plan.id)
+    times = times_of(entries)
     slots = [_planned(line, times) for line in view.lines]
     lines = {line.item.id: line for line in view.lines}
     found = match(slots, [_done(db, s) for s in sessions.values()], visit.date)
-    return Comparison(view, [_row(db, one, lines, sessions) for one in found])
+    return Comparison(view, [_row(db, one, lines, sessions, entries) for one in found])
 
 
 def confirm(db: Session, visit: Visit, caller: Caller, *, other_day: bool = False) -> list[str]:
@@ -138,6 +143,7 @@ def confirm(db: Session, visit: Visit, caller: Caller, *, other_day: bool = Fals
             "Say so and confirm again, or give these sessions to their own visit.",
             asks="other_day",
         )
+    clinic_day.lock_plan(db, found.view.plan.id)  # an entry that arrives meanwhile finds the session in its place
     said: dict[str, list[int]] = {}
     waiting = ingest.proposals(db, [r.session.id for r in found.waiting if r.session is not None])
     for row in found.waiting:
@@ -191,7 +197,7 @@ def _done(db: Session, session: StudySession) -> Done:
     )
 
 
-def _row(db: Session, found: Match, lines: dict[int, PlanLine], sessions: dict[int, StudySession]) -> Row:
+def _row(db: Session, found: Match, lines: dict[int, PlanLine], sessions: dict[int, StudySession], entries: Sequence[DayEntry]) -> Row:
     line = None if found.item_id is None else lines[found.item_id]
     session = None if found.session_id is None else sessions[found.session_id]
     return Row(
@@ -202,6 +208,7 @@ def _row(db: Session, found: Match, lines: dict[int, PlanLine], sessions: dict[i
         proposed=session is not None and session.status == "proposed",
         predicted=_predicted(line),
         done=_shown(db, session) if session is not None else {},
+        differences=tuple(differences(session, entries)) if session is not None else (),
     )
 
 

@@ -132,6 +132,24 @@ def last_attempt(entries: Iterable[Entry], plan_item_id: int) -> int:
     return 1 + max((e.attempt for e in entries if e.plan_item_id == plan_item_id and e.kind == "repeat"), default=0)
 
 
+def attempt_at(entries: Sequence[Entry], plan_item_id: int, began: datetime | None) -> int:
+    """Return the number of the attempt that began nearest to a recording; that which counts, where either clock says nothing."""
+    last = last_attempt(entries, plan_item_id)
+    starts = {n: moment(said["start"]) for n in range(1, last + 1) if "start" in (said := said_of(entries, plan_item_id, n))}
+    if began is None or last not in starts:
+        return last
+    return min(starts, key=lambda n: (abs(starts[n] - began), -n))
+
+
+def said_of(entries: Iterable[Entry], item: int, attempt: int) -> dict[str, Entry]:
+    """By kind, the entry that stands of one attempt; the earliest of several that agree, none where they do not."""
+    rows: dict[str, list[Entry]] = {}
+    for entry in standing(entries):
+        if (entry.plan_item_id, entry.attempt) == (item, attempt):
+            rows.setdefault(entry.kind, []).append(entry)
+    return {kind: those[0] for kind, those in rows.items() if kind == "repeat" or all(agree(those[0], e) for e in those[1:])}
+
+
 def agree(one: Entry, other: Entry) -> bool:
     """Whether two entries of one matter say the same."""
     if one.kind in ("start", "stop"):
@@ -186,7 +204,7 @@ def times_of(entries: Sequence[Entry]) -> dict[int, SlotTimes]:
     found = {}
     for item in _items(entries):
         count = last_attempt(entries, item)
-        said = {number: _said(entries, item, number) for number in range(1, count + 1)}
+        said = {number: said_of(entries, item, number) for number in range(1, count + 1)}
         attempts = tuple(
             Attempt(
                 number,
@@ -205,31 +223,22 @@ def times_of(entries: Sequence[Entry]) -> dict[int, SlotTimes]:
 
 def outcomes_of(entries: Sequence[Entry]) -> dict[int, SlotOutcome]:
     """What was entered about each session, by its id in the plan."""
-    found = {}
-    open_matters = contradictions(entries)
-    for item in _items(entries):
-        number = last_attempt(entries, item)
-        said = _said(entries, item, number)
-        notes = tuple(e.payload["text"] for e in standing(entries) if e.kind == "note" and (e.plan_item_id, e.attempt) == (item, number))
-        found[item] = SlotOutcome(
-            rating=said["rating"].payload["value"] if "rating" in said else None,
-            grasp_hz=grasp_hz(said["grasp"].payload) if "grasp" in said else None,
-            **{name: said[name].payload["grade"] if name in said else None for name in GRADED},
-            notes=notes,
-            contradictions=tuple(c.kind for c in open_matters if (c.plan_item_id, c.attempt) == (item, number)),
-            entered_by={name: said[name].entered_by for name in ("rating", "grasp") if name in said},
-        )
-    return found
+    return {item: outcome_of(entries, item, last_attempt(entries, item)) for item in _items(entries)}
+
+
+def outcome_of(entries: Sequence[Entry], item: int, number: int) -> SlotOutcome:
+    """Return what was entered about one attempt of a session."""
+    said = said_of(entries, item, number)
+    mine = [e for e in standing(entries) if (e.plan_item_id, e.attempt) == (item, number)]
+    return SlotOutcome(
+        rating=said["rating"].payload["value"] if "rating" in said else None,
+        grasp_hz=grasp_hz(said["grasp"].payload) if "grasp" in said else None,
+        **{name: said[name].payload["grade"] if name in said else None for name in GRADED},
+        notes=tuple(e.payload["text"] for e in mine if e.kind == "note"),
+        contradictions=tuple(c.kind for c in contradictions(entries) if (c.plan_item_id, c.attempt) == (item, number)),
+        entered_by={name: said[name].entered_by for name in ("rating", "grasp") if name in said},
+    )
 
 
 def _items(entries: Iterable[Entry]) -> list[int]:
     return sorted({e.plan_item_id for e in entries if e.plan_item_id is not None})
-
-
-def _said(entries: Iterable[Entry], item: int, attempt: int) -> dict[str, Entry]:
-    """By kind, the entry that stands of one attempt; the earliest of several that agree, none where they do not."""
-    rows: dict[str, list[Entry]] = {}
-    for entry in standing(entries):
-        if (entry.plan_item_id, entry.attempt) == (item, attempt):
-            rows.setdefault(entry.kind, []).append(entry)
-    return {kind: those[0] for kind, those in rows.items() if kind == "repeat" or all(agree(those[0], e) for e in those[1:])}

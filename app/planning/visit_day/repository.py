@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 from app.planning.visit_day.record import SlotTimes, times_of
 from app.study.repository import count
 from app.tables.plans import DayEntry, Plan, PlanItem
+from app.tables.sessions import StudySession
 
 
 def entries(db: Session, plan_id: int) -> Sequence[DayEntry]:
@@ -43,6 +44,13 @@ def plan_of_visit(db: Session, visit_id: int, plan_id: int) -> Plan | None:
 def lock_plan(db: Session, plan_id: int) -> None:
     """Let one transaction at a time add entries to a plan's day."""
     db.execute(select(Plan.id).where(Plan.id == plan_id).with_for_update())
+
+
+def sessions_in_place(db: Session, plan_id: int) -> Sequence[StudySession]:
+    """Return the confirmed sessions that fill places of a plan."""
+    of_plan = select(PlanItem.id).where(PlanItem.plan_id == plan_id)
+    query = select(StudySession).where(StudySession.plan_item_id.in_(of_plan), StudySession.status == "confirmed")
+    return db.scalars(query.order_by(StudySession.id)).all()
 
 
 def slot_times(db: Session, plan_id: int) -> dict[int, SlotTimes]:

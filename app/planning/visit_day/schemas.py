@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import datetime as dt
 import itertools
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
-from pydantic import AfterValidator, Field, Strict, model_validator
+from pydantic import AfterValidator, Field, Strict, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.characteristics.schemas import PlannedDose
@@ -212,17 +213,38 @@ AnyEntry = (
 EntryIn = Annotated[AnyEntry, Field(discriminator="kind")]
 
 
+@dataclass(frozen=True)
+class Unreadable:
+    """An entry of a batch that makes no sense. uuid: None where even that cannot be read. why: a sentence on what is wrong where."""
+
+    uuid: UUID | None
+    why: str
+
+
+def _one_by_one(value: Any, read: ValidatorFunctionWrapHandler) -> Any:
+    """Read an entry; what makes no sense becomes `Unreadable`, so that it refuses none of the others."""
+    try:
+        return read(value)
+    except ValidationError as error:
+        wrong = "; ".join(f"{' > '.join(map(str, e['loc'])) or 'entry'}: {e['msg']}" for e in error.errors()[:5])
+        try:
+            uuid = UUID(str(value["uuid"]))
+        except (KeyError, TypeError, ValueError):
+            uuid = None
+        return Unreadable(uuid, f"The entry makes no sense: {wrong}.")
+
+
 class EntriesIn(Model):
     """Entries of a tablet, in the order in which they were made."""
 
     plan_id: Annotated[Int, Field(ge=1)] = Field(description="The plan that the tablet showed.")
-    entries: list[EntryIn] = Field(min_length=1, max_length=200)
+    entries: list[Annotated[EntryIn, WrapValidator(_one_by_one)]] = Field(min_length=1, max_length=200)
 
 
 class EntryResult(Model):
     """What became of one entry."""
 
-    uuid: UUID
+    uuid: UUID | None = Field(description="Null where a refused entry has none that can be read.")
     outcome: Literal["stored", "known", "refused"] = Field(description="`refused`: not stored; keep it and show why.")
     detail: str = ""
     hint: str = ""

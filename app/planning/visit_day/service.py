@@ -19,8 +19,9 @@ from app.planning.plans import repository as plans
 from app.planning.plans.view import read_plan, refuse_running
 from app.planning.visit_day import repository
 from app.planning.visit_day.record import GRADED, SEVERE, moment
-from app.planning.visit_day.schemas import AdverseEventPayload, DosePayload, EntryIn, EntryResult, NotePayload
+from app.planning.visit_day.schemas import AdverseEventPayload, DosePayload, EntryIn, EntryResult, NotePayload, Unreadable
 from app.planning.visit_day.screening import screen
+from app.planning.visit_day.session_outcomes import take_outcomes
 from app.platform.database import now
 from app.platform.errors import BetaloopError, Conflict, Forbidden, Invalid, NotFound
 from app.settings import get_settings
@@ -77,10 +78,10 @@ def read_day(db: Session, visit: Visit, caller: Caller) -> Day:
     return Day(visit, plan, policies, _not_runnable(db, visit, caller), repository.entries(db, plan.id))
 
 
-def add_entries(db: Session, visit: Visit, plan_id: int, entries: Sequence[EntryIn], caller: Caller) -> list[EntryResult]:
+def add_entries(db: Session, visit: Visit, plan_id: int, entries: Sequence[EntryIn | Unreadable], caller: Caller) -> list[EntryResult]:
     """Take what a tablet sends. An entry that is there already is `known`; one that cannot be taken is `refused`, the others are stored.
 
-    The plan may have been replaced since: what was done under it stays true.
+    The plan may have been replaced since: what was done under it stays true. Outcomes of confirmed sessions follow at once.
 
     Raises:
         NotFound: the visit never had this plan approved. Forbidden: the caller may only read.
@@ -91,9 +92,12 @@ def add_entries(db: Session, visit: Visit, plan_id: int, entries: Sequence[Entry
         raise NotFound(f"Visit {visit.number} has no approved plan {plan_id}.", "Load the page of the day again.")
     repository.lock_plan(db, plan.id)
     items = {item.id: item for item in plan.items}
-    known = repository.entries_named(db, [e.uuid for e in entries])
+    known = repository.entries_named(db, [e.uuid for e in entries if e.uuid is not None])
     results = []
     for entry in entries:
+        if isinstance(entry, Unreadable):
+            results.append(EntryResult(uuid=entry.uuid, outcome="refused", detail=entry.why, hint="Enter it again."))
+            continue
         stored = known.get(entry.uuid)
         try:
             if stored is not None:
@@ -113,6 +117,9 @@ def add_entries(db: Session, visit: Visit, plan_id: int, entries: Sequence[Entry
         _record_event(db, visit, items.get(entry.plan_item_id or 0), known[entry.uuid], caller)
         results.append(EntryResult(uuid=entry.uuid, outcome="stored"))
     db.flush()
+    if not visit.locked:
+        for session in repository.sessions_in_place(db, plan.id):
+            take_outcomes(db, session, caller)
     return results
 
 

@@ -1,73 +1,128 @@
-"""What was entered on the clinic day becomes the outcome of the session that takes its place in the plan. The caller commits."""
+"""What was entered on the clinic day becomes the outcome of the session that takes its place in the plan. The caller commits.
+
+It joins the session whenever the later of both arrives: log, confirmation and entries may come in any order.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import timedelta
 
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.planning import wording
 from app.planning.visit_day import repository
-from app.planning.visit_day.record import GRADED, MILD, SlotOutcome, SlotTimes, last_attempt, outcomes_of, standing, times_of
+from app.planning.visit_day.record import GRADED, MILD, attempt_at, moment, outcome_of, said_of, standing
+from app.platform.database import set_reason
+from app.study.adverse_events import repository as events
 from app.study.adverse_events.schemas import AdverseEventIn
-from app.study.adverse_events.service import add_adverse_event
-from app.study.schemas import QocIn, SessionChange
-from app.study.service import change_session, record_qoc
+from app.study.adverse_events.service import add_adverse_event, take_back_entry
+from app.study.outcomes.service import follow_day
+from app.study.visits.service import require_unlocked
 from app.tables.plans import DayEntry
 from app.tables.sessions import StudySession
 
+QOCS = ("rating", "grasp_hz")
+"""Outcomes that a clinic day has."""
+SAME_END = timedelta(seconds=60)
+"""A stop that was entered within this time of its recording's end is that end: it is pressed by hand."""
+
 
 def take_outcomes(db: Session, session: StudySession, caller: Caller) -> list[str]:
-    """Give a confirmed session the rating, the grasp frequency, the mild side effects and the early stop that were entered about its place.
+    """Give a confirmed session the rating, grasp frequency, mild side effects and early stop that were entered about its place.
 
-    What the session has already, typed or derived from files, stays. Contradicting entries count for nothing. Again, it adds nothing.
+    They are those of the attempt that its recording began nearest to. What a person typed for the session, or a file gave, stays.
+    Contradicting entries count for nothing. Again, it adds nothing.
 
     Args:
-        db: the session of the database. session: confirmed, with `plan_item_id`; without one nothing is taken. caller: who confirms.
+        db: the session of the database. session: confirmed, with `plan_item_id`; without one nothing is taken. caller: who confirms, or
+            sends the entries.
 
     Returns:
         Sentences on what the clinic day says otherwise than the session.
 
     Raises:
-        Forbidden: the caller may not enter outcomes. Conflict: the visit is locked.
+        Conflict: the visit is locked.
     """
     if session.plan_item_id is None:
         return []
     entries = repository.entries_beside(db, session.plan_item_id)
-    outcome, times = outcomes_of(entries).get(session.plan_item_id), times_of(entries).get(session.plan_item_id)
-    if outcome is None or times is None:
+    if not any(e.plan_item_id == session.plan_item_id for e in entries):
         return []
-    differences = _qoc(db, session, outcome, caller)
-    _early_stop(db, session, times, caller)
-    _mild(db, session, entries, caller)
-    return differences + [wording.open_contradiction(kind) for kind in outcome.contradictions]
+    require_unlocked(session.visit)
+    number = attempt_at(entries, session.plan_item_id, session.started_at)
+    found = outcome_of(entries, session.plan_item_id, number)
+    reason = wording.from_the_day(sorted(set(found.entered_by.values())))
+    follow_day(db, session, {name: getattr(found, name) for name in QOCS}, caller.label, reason)
+    _early_stop(session, entries, number, db)
+    _mild(db, session, entries, number, caller)
+    db.flush()
+    return differences(session, entries)
 
 
-def _qoc(db: Session, session: StudySession, outcome: SlotOutcome, caller: Caller) -> list[str]:
-    known = {name: getattr(session.qoc, name, None) for name in ("rating", "grasp_hz")}
-    entered = {name: value for name in known if (value := getattr(outcome, name)) is not None}
-    new = {name: value for name, value in entered.items() if known[name] is None}
-    if new:
-        who = sorted(set(outcome.entered_by.values()))
-        record_qoc(db, session, QocIn.model_validate(new | {"reason": wording.from_the_day(who), "sure": list(new)}), caller)
-    both = [(name, value, before) for name, value in entered.items() if (before := known[name]) is not None]
-    return [wording.day_differs(name, value, before) for name, value, before in both if value != before]
+def differences(session: StudySession, entries: Sequence[DayEntry]) -> list[str]:
+    """Return what the entries of a day say otherwise than the session that fills their place, in sentences.
 
-
-def _early_stop(db: Session, session: StudySession, times: SlotTimes, caller: Caller) -> None:
-    if times.stop_cause == "participant" and session.stopped_reason is None:
-        stopped = times.stop_text or wording.STOPPED_FOR_PARTICIPANT
-        change_session(db, session, SessionChange(stopped_reason=stopped, reason=wording.from_the_day([])), caller)
-
-
-def _mild(db: Session, session: StudySession, entries: Sequence[DayEntry], caller: Caller) -> None:
-    """Mild side effects become adverse events of the session; severe ones are events since they arrived."""
+    Args:
+        session: in its place of the plan, or proposed for it. entries: all of the plan's day.
+    """
     item = session.plan_item_id
-    attempt = last_attempt(entries, item or 0)
-    for entry in standing(entries):
-        if entry.kind in GRADED and entry.payload["grade"] == MILD and (entry.plan_item_id, entry.attempt) == (item, attempt):
+    if item is None:
+        return []
+    number = attempt_at(entries, item, session.started_at)
+    found = outcome_of(entries, item, number)
+    told = []
+    for name in QOCS:
+        entered, known = getattr(found, name), getattr(session.qoc, name, None)
+        if entered is not None and entered != known:
+            told.append(wording.day_differs(name, entered, known))
+    elapsed = elapsed_s(entries, item, number)
+    if elapsed is not None and abs(elapsed - session.duration_s) > SAME_END.total_seconds():
+        told.append(wording.day_ended(elapsed, session.duration_s))
+    return told + [wording.open_contradiction(kind) for kind in found.contradictions]
+
+
+def elapsed_s(entries: Sequence[DayEntry], item: int, number: int) -> float | None:
+    """Return the time from the start of an attempt to its stop, s; None where one of them was not entered."""
+    marks = said_of(entries, item, number)
+    if "start" not in marks or "stop" not in marks:
+        return None
+    return (moment(marks["stop"]) - moment(marks["start"])).total_seconds()
+
+
+def _early_stop(session: StudySession, entries: Sequence[DayEntry], number: int, db: Session) -> None:
+    """Let the session's stop follow the day's: a stop for the participant's sake counts while one such entry is not replaced."""
+    mine = [e for e in entries if e.kind == "stop_cause" and e.plan_item_id == session.plan_item_id]
+    sake = [e for e in mine if e.payload["cause"] == "participant"]
+    standing_ones = [e for e in standing(entries) if e in sake and e.attempt == number]
+    wanted = _stop_words(standing_ones[0]) if standing_ones else None
+    if session.stopped_reason not in (None, *(_stop_words(e) for e in sake)):
+        return  # a person wrote a stop of their own
+    if session.stopped_reason != wanted:
+        set_reason(db, wording.from_the_day(sorted({e.entered_by for e in mine})))
+        session.stopped_reason = wanted
+
+
+def _stop_words(entry: DayEntry) -> str:
+    return str(entry.payload["text"]).strip() or wording.STOPPED_FOR_PARTICIPANT
+
+
+def _mild(db: Session, session: StudySession, entries: Sequence[DayEntry], number: int, caller: Caller) -> None:
+    """Mild side effects become adverse events of the session; severe ones are events since they arrived.
+
+    One whose entry was corrected since becomes none.
+    """
+    valid = {e.uuid for e in standing(entries)}
+    mine = [e for e in entries if (e.plan_item_id, e.attempt) == (session.plan_item_id, number)]
+    for entry in mine:
+        if entry.kind not in GRADED or entry.payload["grade"] != MILD:
+            continue
+        known = events.event_by_key(db, session.visit.participant_id, str(entry.uuid))
+        if entry.uuid in valid and known is None:
             draft = AdverseEventIn.model_validate(
                 {"kind": entry.kind, "severity": MILD, "session_id": session.id, "entry_key": str(entry.uuid)}
             )
             add_adverse_event(db, session.visit.participant, draft, caller)
+        elif entry.uuid not in valid and known is not None:
+            take_back_entry(db, known, wording.CORRECTED_ON_THE_DAY, caller)

@@ -19,7 +19,7 @@ from app.study import repository as study_repository
 from app.study import service as study
 from app.study.adverse_events import repository
 from app.study.adverse_events.schemas import AdverseEventChange, AdverseEventFields, AdverseEventIn
-from app.tables.adverse_events import AdverseEvent, AdverseEventRevision
+from app.tables.adverse_events import AdverseEvent, AdverseEventRevision, Severity
 from app.tables.participants import Participant
 
 _BELONGS = ("session_id", "visit_id", "policy_id", "occurred_at")
@@ -70,6 +70,18 @@ def change_adverse_event(db: Session, event: AdverseEvent, change: AdverseEventC
     """
     study.require(caller, can.WRITE_STUDY, event.participant)
     return _follow(db, event, change.revision, change.reason, caller, change, None)
+
+
+def take_back_entry(db: Session, event: AdverseEvent, reason: str, caller: Caller) -> None:
+    """Correct the event of an entry that was itself corrected to "none", unless a person has changed the event since.
+
+    Raises:
+        Forbidden: the caller may not enter outcomes.
+    """
+    study.require(caller, can.WRITE_QOC, event.participant)
+    if event.now.revision == 1:
+        none = AdverseEventFields(kind=event.now.kind, severity=Severity.NONE, serious=False, note=event.now.note)
+        _follow(db, event, 1, reason, caller, none, None)
 
 
 def clear_adverse_event(db: Session, event: AdverseEvent, revision: int, reason: str, caller: Caller) -> AdverseEvent:

@@ -153,8 +153,10 @@ def derive_for_session(db: Session, session: StudySession) -> list[str]:
     if session.visit.locked:
         return [f"Session {session.id}: visit {session.visit.number} is locked, so that its outcomes stay as they are."] if found else []
     repository.lock_session(db, session)
-    free = {d.name: d for d in found if person_behind(session, d.name) is None}
     known = session.qoc
+    followed = () if known is None else known.from_day
+    # files without a value leave what the clinic day has
+    free = {d.name: d for d in found if person_behind(session, d.name) is None and (d.value is not None or d.name not in followed)}
     if known is not None:
         # a derived value whose minutes no longer lie in the session is taken back
         gone = [n for n in known.derived if n not in {d.name for d in found}]
@@ -193,14 +195,38 @@ def disagreements(session: StudySession, found: Sequence[Derived]) -> list[Disag
 def person_behind(session: StudySession, name: str) -> str | None:
     """Who typed, or took back, the present value of a QoC; None where nobody did or where it was derived."""
     known = session.qoc
-    if known is None or name in known.derived:
+    if known is None or name in known.derived or name in known.from_day:
         return None
     author, before, was_derived = None, None, False
     for revision in session.qocs:
-        value, derived = getattr(revision, name), name in revision.derived
+        value, derived = getattr(revision, name), name in (*revision.derived, *revision.from_day)
         if value != before or derived != was_derived:
             author, before, was_derived = revision.entered_by, value, derived
     return author
+
+
+def follow_day(db: Session, session: StudySession, day_values: Mapping[str, float | None], entered_by: str, reason: str) -> None:
+    """Add a revision where the QoCs that a session has from its clinic day alone are others by now.
+
+    What a person typed for the session, or a file gave, stays. Same values, no revision.
+
+    Args:
+        db: the caller commits. session: confirmed, of a visit that is not locked.
+        day_values: of each QoC that the day can have, in its unit; None where it says nothing, or contradicts itself.
+        entered_by: who sent it. reason: kept with the revision.
+    """
+    repository.lock_session(db, session)
+    known = session.qoc
+    new = {
+        name: value
+        for name, value in day_values.items()
+        if (known is None or name not in known.derived or getattr(known, name) is None)
+        and person_behind(session, name) is None
+        and not _same(getattr(known, name, None), value)
+    }
+    if new:
+        from_day = sorted({*(known.from_day if known else ()), *new})
+        add_revision(db, session, new, entered_by, reason, [n for n in (known.derived if known else ()) if n not in new], from_day)
 
 
 def take_derived(db: Session, session: StudySession, name: str, shown: float, author: str) -> QocRevision:
@@ -220,9 +246,18 @@ def take_derived(db: Session, session: StudySession, name: str, shown: float, au
 
 
 def add_revision(
-    db: Session, session: StudySession, given: Mapping[str, Any], entered_by: str, reason: str | None, derived: Sequence[str]
+    db: Session,
+    session: StudySession,
+    given: Mapping[str, Any],
+    entered_by: str,
+    reason: str | None,
+    derived: Sequence[str],
+    from_day: Sequence[str],
 ) -> QocRevision:
-    """A new revision under the session's lock: `given` values, the others as they are; `derived` names those that come from files."""
+    """Add a revision under the session's lock: `given` values, the others as they are.
+
+    `derived` names those that come from files, `from_day` those of the clinic day.
+    """
     known = session.qoc
     merged = {name: getattr(known, name, None) for name in FIELDS} | dict(given)
     set_reason(db, reason)
@@ -232,6 +267,7 @@ def add_revision(
         entered_by=entered_by,
         reason=reason,
         derived=sorted(derived),
+        from_day=sorted(from_day),
         **merged,
     )
     db.add(revision)
@@ -249,7 +285,8 @@ def _add_revision(db: Session, session: StudySession, changed: Sequence[Derived]
     names = {d.name for d in changed} | set(session.qoc.derived if session.qoc else ())
     values = {d.name: d.value for d in changed}
     before = db.info.get("actor", {}).get("reason")
-    row = add_revision(db, session, values, author or origin, f"{origin}: {reason}" if author else reason, sorted(names))
+    from_day = [name for name in (session.qoc.from_day if session.qoc else ()) if name not in values]
+    row = add_revision(db, session, values, author or origin, f"{origin}: {reason}" if author else reason, sorted(names), from_day)
     set_reason(db, before)  # what the caller writes next has its own reason
     return row
 

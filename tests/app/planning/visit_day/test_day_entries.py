@@ -162,8 +162,19 @@ def test_a_word_that_is_said_to_be_no_name_is_kept(clinic_day: Any, db: Session)
         {"kind": "reboot", "payload": {}},
     ],
 )
-def test_an_entry_that_makes_no_sense_is_no_entry(clinic_day: Any, wrong: dict[str, Any]) -> None:
-    assert clinic_day.send(clinic_day.entry("start") | wrong).status_code == 422
+def test_an_entry_that_makes_no_sense_is_refused_and_the_others_are_stored(clinic_day: Any, wrong: dict[str, Any]) -> None:
+    bad = clinic_day.entry("start") | wrong
+    answer = clinic_day.send(clinic_day.entry("start"), bad, clinic_day.entry("stop"))
+    assert answer.status_code == 200, answer.text
+    results = answer.json()["results"]
+    assert [r["outcome"] for r in results] == ["stored", "refused", "stored"]
+    assert results[1]["uuid"] == bad["uuid"]
+    assert results[1]["detail"].startswith("The entry makes no sense: ")
+
+
+def test_an_entry_without_an_identifier_is_refused_in_its_place(clinic_day: Any) -> None:
+    results = clinic_day.send(clinic_day.entry("start") | {"uuid": "none"}, clinic_day.entry("stop")).json()["results"]
+    assert [(r["outcome"], r["uuid"] is None) for r in results] == [("refused", True), ("stored", False)]
 
 
 def test_entries_about_a_replaced_plan_stay_true(clinic_day: Any, db: Session) -> None:
