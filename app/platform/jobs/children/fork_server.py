@@ -31,8 +31,7 @@ DESCRIPTORS = 3
 LONGEST_ORDER = 1 << 16
 LARGE_PAGE = 1 << 21
 """Bytes."""
-_COLLAPSE = 25
-"""MADV_COLLAPSE of madvise(2), Linux 6.1 and newer."""
+_COLLAPSE = 25  # MADV_COLLAPSE of madvise(2), Linux 6.1 and newer
 
 
 def main(arguments: list[str]) -> int:
