@@ -7,15 +7,24 @@ events) are reduced to known words or numbers. So a redacted report gives the sa
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from datetime import datetime
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ml.formats.percept.annotations import Annotation
-from ml.formats.percept.enums import word
+from ml.formats.percept.enums import UNKNOWN, mask, word
+from ml.formats.percept.facts import AMPLITUDE, BATTERY_MONTHS, BATTERY_PERCENT, IMPEDANCE, MAGNITUDE, POWER
+from ml.formats.percept.keys import KEYS
 from ml.formats.percept.report_json import SIDES, entries, finite, inside, moment, samples, side_of
-from ml.formats.percept.words import EVENT_WORDS
+from ml.formats.percept.words import EVENT_WORDS, cleaned
 from ml.formats.recording import EventLog
+from ml.formats.sentinels import reading, readings
+
+ToUtc = Callable[[datetime], datetime]
+"""Converts a date of the report, on the implant's clock, to UTC."""
 
 MAX_EVENTS = 5_000
 
@@ -136,19 +145,20 @@ def limits(value: dict[str, Any], side: str) -> dict[str, Any]:
     return {f"group {_letter(value.get('ActiveGroup')) or '?'}": {side: {"lower_ma": low, "upper_ma": high}}}
 
 
-def group_history(value: Any) -> list[dict[str, Any]]:
+def group_history(value: Any, utc: ToUtc) -> list[dict[str, Any]]:
     """List therapy groups at earlier visits, oldest first. The key of the date is `SessionDate` or `Sessiondate`."""
     dated = []
     for entry in entries(value):
         when = moment(entry.get("SessionDate", entry.get("Sessiondate")))
-        dated.append({"at": _iso(when), "groups": groups(entry.get("Groups", entry.get("Settings")))})
+        dated.append({"at": _iso(when, utc), "groups": groups(entry.get("Groups", entry.get("Settings")))})
     return sorted(dated, key=lambda d: str(d["at"] or ""))
 
 
-def trends(value: Any) -> dict[str, Any]:
+def trends(value: Any, utc: ToUtc) -> tuple[dict[str, Any], int]:
     """Read averages over 10 minutes by side: times, power in device units, amplitude in mA. They are sorted; of equal times the newest read
-    counts."""
+    counts. Also count the values that are no readings."""
     out: dict[str, Any] = {}
+    void = 0
     for hemisphere, blocks in value.items() if isinstance(value, dict) else ():
         side = side_of(word(hemisphere) or hemisphere)
         if side is None:
@@ -161,15 +171,18 @@ def trends(value: Any) -> dict[str, Any]:
                     by_time[when] = finite(row.get("LFP")), finite(row.get("AmplitudeInMilliAmps"))
         times = sorted(by_time)
         if times:
-            out[side] = {
-                "unix_s": [t.timestamp() for t in times],
-                "power_device_units": [by_time[t][0] for t in times],
-                "amplitude_ma": [by_time[t][1] for t in times],
-            }
-    return out
+            power = [reading(by_time[t][0], POWER) for t in times]
+            amplitude = [reading(by_time[t][1], AMPLITUDE) for t in times]
+            void += sum(
+                kept is None and by_time[t][i] is not None
+                for i, row in enumerate((power, amplitude))
+                for t, kept in zip(times, row, strict=True)
+            )
+            out[side] = {"unix_s": [utc(t).timestamp() for t in times], "power_device_units": power, "amplitude_ma": amplitude}
+    return out, void
 
 
-def snapshot_events(value: Any) -> list[dict[str, Any]]:
+def snapshot_events(value: Any, utc: ToUtc) -> list[dict[str, Any]]:
     """List spectra that the device stored when the patient marked an event. Events may promise a spectrum (`LFP: true`) and have none."""
     out = []
     for entry in entries(value)[:MAX_EVENTS]:
@@ -179,9 +192,14 @@ def snapshot_events(value: Any) -> list[dict[str, Any]]:
             side = side_of(word(hemisphere) or hemisphere)
             hz, bins = samples(inside(data, "Frequency")), samples(inside(data, "FFTBinData"))
             if side and 0 < hz.size == bins.size <= 1000:
-                spectra[side] = {"hz": hz.tolist(), "magnitude": bins.tolist(), "group": _letter(inside(data, "GroupId"))}
-        out.append({"at": _iso(moment(entry.get("DateTime"))), "label": event_label(entry), "spectra": spectra})
+                spectra[side] = {"hz": hz.tolist(), "magnitude": _magnitudes(bins), "group": _letter(inside(data, "GroupId"))}
+        out.append({"at": _iso(moment(entry.get("DateTime")), utc), "label": event_label(entry), "spectra": spectra})
     return out
+
+
+def _magnitudes(values: NDArray[np.float64]) -> list[float | None]:
+    """List magnitudes, None where there is no reading."""
+    return [None if np.isnan(v) else float(v) for v in readings(values, MAGNITUDE)[0]]
 
 
 def montage(value: Any) -> list[dict[str, Any]]:
@@ -197,7 +215,7 @@ def montage(value: Any) -> list[dict[str, Any]]:
                 "artifact": word(entry.get("ArtifactStatus")),
                 "peak_hz": finite(entry.get("PeakFrequencyInHertz")),
             }
-            out.append({**said, "hz": hz.tolist(), "magnitude": magnitude.tolist()})
+            out.append({**said, "hz": hz.tolist(), "magnitude": _magnitudes(magnitude)})
     return out
 
 
@@ -205,21 +223,24 @@ def battery(report: dict[str, Any]) -> dict[str, Any]:
     """Read the state of the battery, without its telemetry codes."""
     state = report.get("BatteryInformation")
     return {
-        "percent": finite(inside(state, "BatteryPercentage")),
-        "months_left": finite(inside(state, "EstimatedBatteryLifeMonths")),
+        "percent": reading(finite(inside(state, "BatteryPercentage")), BATTERY_PERCENT),
+        "months_left": reading(finite(inside(state, "EstimatedBatteryLifeMonths")), BATTERY_MONTHS),
         "status": word(inside(state, "BatteryStatus")),
     }
 
 
 def impedance(value: Any) -> list[dict[str, Any]]:
-    """List impedances by side in ohm."""
+    """List impedances by side in ohm, with the state of the test."""
     out = []
     for test in entries(value):
         for half in entries(test.get("Hemisphere")):
             measured = inside(half, "SessionImpedance")
             pairs = [*entries(inside(measured, "Monopolar")), *entries(inside(measured, "Bipolar"))]
-            named = [[word(p.get("Electrode1")), word(p.get("Electrode2")), finite(p.get("ResultValue"))] for p in pairs[:200]]
-            out.append({"side": side_of(word(half.get("Hemisphere"))), "ohm": named})
+            named = [
+                [word(p.get("Electrode1")), word(p.get("Electrode2")), reading(finite(p.get("ResultValue")), IMPEDANCE)]
+                for p in pairs[:200]
+            ]
+            out.append({"side": side_of(word(half.get("Hemisphere"))), "ohm": named, "status": word(test.get("ImpedanceStatus"))})
     return out
 
 
@@ -227,33 +248,71 @@ DatedEvent = tuple[datetime, str, str, dict[str, Any]]
 """Time, kind (`device`, `patient`, `annotation`, `rating`), label, data."""
 
 
-def dated_events(report: dict[str, Any], annotations: Iterable[Annotation] = ()) -> list[DatedEvent]:
-    """List the device's event log, the patient's events and the annotations, in time order."""
-    out: list[DatedEvent] = [_event_of(a) for a in annotations]
+def dated_events(report: dict[str, Any], utc: ToUtc, annotations: Iterable[Annotation] = ()) -> list[DatedEvent]:
+    """List the device's event log, the patient's events and the annotations, in UTC and in time order."""
+    out: list[DatedEvent] = [_event_of(a, utc) for a in annotations]
     for entry in _log_entries(report):
         when = moment(entry.get("DateTime", entry.get("EventDateTime")))
         if when is None:
             continue
         if "EventName" in entry or "EventID" in entry or "EventId" in entry:
-            out.append((when, "patient", event_label(entry), {}))
+            out.append((utc(when), "patient", event_label(entry), {}))
             continue
-        said = {k: word(v) for k, v in entry.items() if word(v) and k in LOG_WORDS}
-        out.append((when, "device", " ".join(filter(None, said.values())) or "log entry", said))
+        said = {k if k in KEYS else cleaned(k): named for k, v in entry.items() if (named := word(v))}
+        out.append((utc(when), "device", _log_label(said), said))
+    when = moment(inside(report, "DeviceInformation", "Initial", "DeviceDateTime"))
+    for state in dict.fromkeys(filter(None, (word(t.get("ImpedanceStatus")) for t in entries(report.get("Impedance"))))):
+        if when is not None:
+            out.append((utc(when), "device", f"impedance {state.lower()}", {"ImpedanceStatus": state}))
     return sorted(out, key=lambda e: e[0])[-MAX_EVENTS:]
 
 
-def _event_of(a: Annotation) -> DatedEvent:
+_LABELS = {
+    "RechargeSessionType": "recharge",
+    "TherapyStatus": "therapy",
+    "AdaptiveTherapyStatus": "adaptive therapy",
+    "SensingStatus": "sensing",
+    "SessionType": "session",
+}
+_STATES = {"SessionStart": "started", "SessionEnd": "ended"}
+
+
+def _log_label(states: dict[str, str]) -> str:
+    """Name an entry of the event log; a key that is not in `_LABELS` keeps its technical name."""
+    left = {k: v for k, v in states.items() if k != "ParameterTrendId"}
+    parts = []
+    groups = [(left.pop(k, "") or "?").removeprefix("GROUP_") for k in ("OldGroupId", "NewGroupId")] if "NewGroupId" in left else []
+    if groups:
+        parts.append(f"active group {groups[0]} to {groups[1]}")
+    for key, state in left.items():
+        name = _LABELS.get(key) or (cleaned(key) if key in KEYS else key)
+        parts.append(f"{name} {_STATES.get(state) or (state.lower() if key in _LABELS else state)}")
+    return ", ".join(parts) or states.get("ParameterTrendId") or "log entry"
+
+
+def unknown_names(report: dict[str, Any]) -> list[str]:
+    """List enumerations and keys of the device's log, impedance and leads that have a word which is not knowned."""
+    out: dict[str, None] = {}
+    held = [*_log_entries(report), *entries(report.get("Impedance"))]
+    for part in ("Initial", "Final"):
+        held += entries(inside(report, "LeadConfiguration", part))
+    for entry in held:
+        for key, value in entry.items():
+            shown = mask(value) if isinstance(value, str) and len(value) <= 102 else None
+            if shown and key != "EventName" and (UNKNOWN in shown or key not in KEYS):
+                out[f"{cleaned(key)}: {shown}"] = None
+    return list(out)
+
+
+def _event_of(a: Annotation, utc: ToUtc) -> DatedEvent:
     if a.value is None:
-        return a.at, "annotation", a.label, {"under": a.under}
-    return a.at, "rating", a.label, {"under": a.under, "value": a.value}
+        return utc(a.at), "annotation", a.label, {"under": a.under}
+    return utc(a.at), "rating", a.label, {"under": a.under, "value": a.value}
 
 
 def undated_events(report: dict[str, Any]) -> int:
     """Count entries of the patient's events without a time: the programmer lists there which events can be marked."""
     return sum(moment(e.get("DateTime", e.get("EventDateTime"))) is None for e in _patient_entries(report))
-
-
-LOG_WORDS = ("SessionType", "NewGroupId", "OldGroupId", "TherapyStatus", "AdaptiveTherapyStatus", "ParameterTrendId", "SensingStatus")
 
 
 def _log_entries(report: dict[str, Any]) -> Iterable[dict[str, Any]]:
@@ -276,5 +335,5 @@ def as_events(dated: Iterable[DatedEvent], origin: datetime) -> tuple[EventLog, 
     return tuple(EventLog(round((when - origin).total_seconds(), 3), kind, label, data) for when, kind, label, data in dated)
 
 
-def _iso(when: datetime | None) -> str | None:
-    return when.isoformat() if when else None
+def _iso(when: datetime | None, utc: ToUtc) -> str | None:
+    return utc(when).isoformat() if when else None

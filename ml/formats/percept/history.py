@@ -16,6 +16,9 @@ from ml.formats.recording import FileReport, RecordingLog, SpectrumLog, fingerpr
 
 SURVEYS = ("LfpMontageTimeDomain", "BrainSenseSurveysTimeDomain", "SenseChannelTests", "CalibrationTests")
 
+MOST_NAMES = 12
+"""Unknown names that one sentence lists."""
+
 
 def _surveys(report: dict[str, Any], said: FileReport) -> list[SpectrumLog]:
     """Read spectra of surveys and tests of 20 s, named by channel, section and time."""
@@ -34,6 +37,7 @@ def _surveys(report: dict[str, Any], said: FileReport) -> list[SpectrumLog]:
         if channels:
             said.understood.append(f"{section}: {len(channels)} channels; their spectra are kept, no session")
             said.repaired.extend(dict.fromkeys(f"{section}: {n}" for c in channels for n in c.notes))
+            said.flagged.extend(f"{section}, {c.channel}: {loss}" for c in channels for loss in c.losses())
     return out
 
 
@@ -49,20 +53,22 @@ def _counts(dated: Sequence[details.DatedEvent]) -> list[str]:
 
 
 def history_recording(
-    report: dict[str, Any], said: FileReport, options: DecodeOptions, dated: Sequence[details.DatedEvent]
+    report: dict[str, Any], said: FileReport, options: DecodeOptions, dated: Sequence[details.DatedEvent], utc: details.ToUtc
 ) -> RecordingLog | None:
     """Build the recording of surveys and of the device's history: groups, trends, snapshots, events. It belongs to no session.
 
     Args:
-        report: as it was read. `said`: receives what was understood. options: of the decoder. dated: the report's events.
+        report: as it was read. `said`: receives what was understood. options: of the decoder. dated: the report's events in UTC.
+        utc: converts the report's dates.
     """
     spectra = _surveys(report, said)
     diagnostic = report.get("DiagnosticData")
+    trends, void = details.trends(inside(diagnostic, "LFPTrendLogs"), utc)
     kept: dict[str, Any] = {
         "groups": details.groups(inside(report, "Groups", "Final") or inside(report, "Groups", "Initial")),
-        "group_history": details.group_history(report.get("GroupHistory")),
-        "trends": details.trends(inside(diagnostic, "LFPTrendLogs")),
-        "snapshots": [e for e in details.snapshot_events(inside(diagnostic, "LfpFrequencySnapshotEvents")) if e["spectra"]],
+        "group_history": details.group_history(report.get("GroupHistory"), utc),
+        "trends": trends,
+        "snapshots": [e for e in details.snapshot_events(inside(diagnostic, "LfpFrequencySnapshotEvents"), utc) if e["spectra"]],
         "montage": details.montage(report.get("LFPMontage") or _inner(report.get("BrainSenseSurveys"))),
         "impedance": details.impedance(report.get("Impedance")),
     }
@@ -70,12 +76,18 @@ def history_recording(
     if not (kept or dated or spectra):
         return None
     battery = {k: v for k, v in details.battery(report).items() if v is not None}
-    started = moment(inside(report, "DeviceInformation", "Initial", "DeviceDateTime")) or (dated[0][0] if dated else None)
+    stated = moment(inside(report, "DeviceInformation", "Initial", "DeviceDateTime"))
+    started = utc(stated) if stated is not None else dated[0][0] if dated else None
     origin = started or datetime.fromisoformat("2000-01-01T00:00:00+00:00")
     counts = [f"{len(v)} {name.replace('_', ' ')}" for name, v in kept.items()] + _counts(dated)
     if undated := details.undated_events(report):
         entries_of = f"{undated} entr{'y' if undated == 1 else 'ies'} of PatientEvents"
         said.ignored.append(f"{entries_of} without a time: names of events, none that was marked")
+    if void:
+        said.flagged.append(f"trends: {void} values are the device's sign for no reading, or impossible: gaps")
+    if names := details.unknown_names(report):
+        listed = "; ".join(names[:MOST_NAMES]) + (f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else "")
+        said.flagged.append(f"names that this version does not know, shown as they are: {listed}")
     if counts:
         said.understood.append(f"history of the device: {', '.join(counts)}; kept, no session")
     return RecordingLog(

@@ -16,7 +16,7 @@ from typing import Any
 from ml.formats.archive import ZipFiles, told
 from ml.formats.options import ArchiveLimits
 from ml.formats.percept.annotations import SECTION, as_section, gather, speaks_of
-from ml.formats.percept.enums import is_known
+from ml.formats.percept.enums import UNKNOWN, is_known, mask
 from ml.formats.percept.keys import KEYS
 from ml.formats.percept.report import report_members
 from ml.formats.percept.report_json import HINT, SECTIONS, channel_names, moment, read_report
@@ -51,7 +51,7 @@ TEXTS = {
     "SurveyMode": re.compile(r"ElectrodeSurvey|ElectrodeIdentifier"),
     "Pass": re.compile(r"(FIRST|SECOND|THIRD)_PASS|SQC|((ZERO|ONE|TWO|THREE)_?)+"),
 }
-ENUM = re.compile(r"(Ins(Location|Port)|[A-Za-z]{2,40}Def)[._][A-Za-z0-9_]{1,60}")
+ENUM = re.compile(r"(Ins(Location|Port)|[A-Za-z…]{1,40}Def)[._][A-Za-z0-9_…]{1,60}")
 """What looks like an enumeration; only those of `enums.py` stay."""
 
 
@@ -119,7 +119,7 @@ class _Scrubber:
     def __init__(self, key: bytes) -> None:
         self._key = key
         self._gone: Counter[str] = Counter()
-        self._named: dict[str, Counter[str]] = {"section": Counter(), "key": Counter()}
+        self._named: dict[str, Counter[str]] = {"section": Counter(), "key": Counter(), "enum": Counter()}
         self._lost: Counter[str] = Counter()
 
     def report(self, report: dict[str, Any]) -> dict[str, Any]:
@@ -147,7 +147,7 @@ class _Scrubber:
             self._gone["deep"] += 1
             return None
         if isinstance(node, dict):
-            kept = ((name, self._entry(name, item, depth)) for name, item in node.items())
+            kept = (self._entry(name, item, depth) for name, item in node.items())
             return {name: value for name, value in kept if value is not _GONE}
         if isinstance(node, list):
             if all(type(v) is float or type(v) is int for v in node):
@@ -157,22 +157,31 @@ class _Scrubber:
             return self._text(node, key)
         return node
 
-    def _entry(self, name: str, item: Any, depth: int) -> Any:
+    def _entry(self, name: str, item: Any, depth: int) -> tuple[str, Any]:
         if name == SERIAL:
             if not isinstance(item, str) or not item.strip():
-                return ""
+                return name, ""
             self._gone["device"] += 1
-            return pseudonym(item, self._key)
+            return name, pseudonym(item, self._key)
         if not (name in KEYS or HEMISPHERE.fullmatch(name) or moment(name) is not None):
-            if not speaks_of(name):
+            if isinstance(item, str) and ENUM.fullmatch(item):
+                # a state of the device under a new name: what of both is technical stays, so that the history can show it
                 self._unknown("key", name)
-            return _GONE
-        return self._clean(item, name, depth + 1)
+                return cleaned(name), self._text(item, name)
+            if not speaks_of(name) and name != cleaned(name):
+                self._unknown("key", name)
+            return name, _GONE
+        return name, self._clean(item, name, depth + 1)
 
     def _text(self, text: str, key: str) -> str:
         if self._technical(text, key):
             return text
-        self._gone["enum" if ENUM.fullmatch(text) else "text"] += 1
+        if (shown := mask(text)) is not None and ENUM.fullmatch(text):
+            if UNKNOWN not in text:
+                self._gone["enum"] += 1
+                self._named["enum"][shown] += 1
+            return shown
+        self._gone["text"] += 1
         return ""
 
     @staticmethod
@@ -198,7 +207,7 @@ class _Scrubber:
             "place": "time zone and language of the programmer, feature codes (the offset from UTC stays)",
             "device": "serial number of the neurostimulator: a keyed pseudonym stays",
             "section": "sections not known to be technical",
-            "enum": "enumerations with values that no report is known to have",
+            "enum": "words of enumerations that no report is known to have",
             "text": "texts not known to be technical, such as names of events",
             "key": "fields not known to be technical, such as names of devices and groups, notes and the date of the implant",
             "deep": "parts nested beyond reason",

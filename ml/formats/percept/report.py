@@ -2,7 +2,7 @@
 
 Each streaming run gives one recording per side of the brain, on the common grid of steps. It has `beta` from the samples (`time_domain`),
 the device's `band_power` (`percept_lfp`) and the `amplitude`. The recordings of one run carry the same `run`, and belong to one session.
-Runs of the device's own clock are paired by ticks and channel; the programmer's FirstPacketDateTime gives their time.
+Runs are paired by ticks, channel and FirstPacketDateTime, which is on the implant's clock (`clock.py`).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from datetime import datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.archive import READ_ERRORS, ZipFiles, told
-from ml.formats.beta import LARGEST_UV, channel_spectrum, step_trace, time_domain_traces
+from ml.formats.beta import channel_spectrum, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
 from ml.formats.percept import details
 from ml.formats.percept.annotations import gather
+from ml.formats.percept.clock import describe_clock, implant_clock, to_utc
+from ml.formats.percept.dose import cycling, describe_cycling, leads_of
 from ml.formats.percept.enums import word
 from ml.formats.percept.history import history_recording
-from ml.formats.percept.report_json import SIDES, entries, inside, looks_like_report, moment, read_report, side_of, utc_offset_h
-from ml.formats.percept.runs import Run, apart_s, pair_runs
+from ml.formats.percept.report_json import SIDES, entries, inside, looks_like_report, read_report, side_of, utc_offset_h
+from ml.formats.percept.runs import Run, pair_runs
 from ml.formats.percept.streams import DevicePower, Side, TimeDomain, device_powers, time_domains
 from ml.formats.recording import DecodedFile, EventLog, FileReport, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
 from ml.signals import row_means
-
-WRONG_DATE_S = 24 * 3600.0
 
 
 def decode_percept(path: Path, options: DecodeOptions, name: str | None = None) -> DecodedFile:
@@ -93,19 +94,22 @@ def decode_report(report: dict[str, Any], said: FileReport, options: DecodeOptio
     device = device_name(report)
     channels = time_domains("BrainSenseTimeDomain", report.get("BrainSenseTimeDomain"))
     runs = pair_runs(channels, device_powers(report.get("BrainSenseLfp")), said)
+    packets = [run.first_packet for run in runs]
+    clock = implant_clock(report, packets)
+    utc = partial(to_utc, clock)
+    describe_clock(clock, report, packets, said)
     recordings: list[RecordingLog] = []
-    dated = details.dated_events(report, gather(report).kept)
+    dated = details.dated_events(report, utc, gather(report).kept)
     for number, run in enumerate(runs):
-        recordings += _run_recordings(run, number, first_run, report, said, options, dated)
+        recordings += _run_recordings(run, number, first_run, report, said, options, dated, utc)
     if not runs:
         said.flagged.append("no streaming run (BrainSenseTimeDomain, BrainSenseLfp) in this report: nothing in it can be a session")
-    recordings += _indefinite(report, said, options)
-    history = history_recording(report, said, options, dated)
+    recordings += _indefinite(report, said, options, utc)
+    history = history_recording(report, said, options, dated, utc)
     recordings += [history] if history is not None else []
-    _check_dates(report, recordings, said)
     if not recordings:
         said.flagged.append("a report without data: none of its sections holds samples, history or events")
-    offset = {"utc_offset_h": utc_offset_h(report.get("ProgrammerUtcOffset"))}
+    offset = {"utc_offset_h": utc_offset_h(report.get("ProgrammerUtcOffset")), "clock": clock.as_settings()}
     return tuple(replace(r, device_key=device, settings={**r.settings, **offset}) for r in recordings)
 
 
@@ -119,14 +123,26 @@ def device_name(report: dict[str, Any]) -> str | None:
 
 
 def _run_recordings(
-    run: Run, number: int, first_run: int, report: dict[str, Any], said: FileReport, options: DecodeOptions, dated: list[details.DatedEvent]
+    run: Run,
+    number: int,
+    first_run: int,
+    report: dict[str, Any],
+    said: FileReport,
+    options: DecodeOptions,
+    dated: list[details.DatedEvent],
+    utc: details.ToUtc,
 ) -> list[RecordingLog]:
     """Build one recording per side that streamed or was stimulated, with what was marked, noted and rated during the run."""
     begin, end = run.span_ms
-    noted = _noted_within(dated, run.first_packet, (end - begin) / 1000.0)
+    start = utc(run.first_packet) if run.first_packet else None
+    noted = _noted_within(dated, start, (end - begin) / 1000.0)
     rows = math.ceil((end - begin) / 1000.0 / options.period_s - 1e-6)
     label = f"run {first_run + number + 1}"
     leads = {side_of(word(lead.get("Hemisphere"))) for lead in entries(inside(report, "LeadConfiguration", "Final"))}
+    targets = leads_of(report)
+    group = details.snapshot(run.power.snapshot, "left")["group"] if run.power is not None else None
+    cycles = cycling(report, group)
+    unsteady = cycles is not None and cycles["enabled"] and run.power is not None
     out = []
     for side in (*SIDES, None):
         channels = [c for c in run.channels if c.side == side]
@@ -136,18 +152,32 @@ def _run_recordings(
             traces += _power_traces(run.power, side, begin - run.power_origin_ms, rows, options)
             driven = bool(np.nanmax(run.power.amplitude_ma[side], initial=0.0) > 0)
         sensed = bool(channels) or any(t.stream == "band_power" for t in traces)
+        if unsteady:
+            traces = [_unknown_amplitude(t) if t.stream == "amplitude" else t for t in traces]
         # the amplitude of a side without a lead is a row of zeros that means nothing
         if not (sensed or driven or (traces and side in leads)):
             continue
         one = _recording(run, side, channels, traces, begin, end, first_run + number, options)
-        out.append(replace(one, events=noted))
+        known: dict[str, Any] = {"leads": [targets[side]]} if side in targets else {}
+        known |= {"cycling": cycles} if cycles is not None else {}
+        out.append(replace(one, events=noted, started_at=start, settings={**one.settings, **known}))
         _describe(said, label, side, channels, traces, (end - begin) / 1000.0)
     for note in dict.fromkeys(n for c in run.channels for n in c.notes):
         said.repaired.append(f"{label}: {note}")
+    if unsteady and cycles is not None and out:
+        said.flagged.append(f"{label}: {describe_cycling(cycles, group)}")
     for note in run.power.notes if run.power else ():
         said.repaired.append(f"{label}: {note}")
+    for note in run.power.void if run.power else ():
+        said.flagged.append(f"{label}, {note}")
     _check_lengths(run, label, said)
     return out
+
+
+def _unknown_amplitude(trace: TraceLog) -> TraceLog:
+    """Take the values out of an amplitude that was not delivered all the time."""
+    none, invalid = np.full_like(trace.values, np.nan), np.zeros_like(trace.valid)
+    return replace(trace, values=none, valid=invalid, details={**trace.details, "cycling": True})
 
 
 def _noted_within(dated: list[details.DatedEvent], start: datetime | None, length_s: float) -> tuple[EventLog, ...]:
@@ -240,13 +270,7 @@ def _describe(
     parts += ["amplitude" for t in traces if t.stream == "amplitude"]
     said.understood.append(f"{label}, {side or 'side unknown'}: {length_s:.1f} s, {', '.join(parts)}")
     for c in channels:
-        if c.lost:
-            said.flagged.append(
-                f"{label}, {c.channel}: {100 * c.lost / (c.lost + c.values.size):.1f} % of the samples are missing ({c.lost})"
-            )
-        if c.void:
-            beyond = f"or one beyond {LARGEST_UV / 1000:g} mV, which no electrode gives"
-            said.flagged.append(f"{label}, {c.channel}: {c.void} samples hold no number, {beyond}: gaps")
+        said.flagged.extend(f"{label}, {c.channel}: {loss}" for loss in c.losses())
         if not c.ticked:
             said.flagged.append(f"{label}, {c.channel}: no ticks, so lost samples cannot be seen")
         if not any(t.channel == c.channel and t.source == "time_domain" for t in traces):
@@ -261,29 +285,26 @@ def _check_lengths(run: Run, label: str, said: FileReport) -> None:
             said.flagged.append(f"{label}, {c.channel}: ticks and number of samples disagree by more than 1 s")
 
 
-def _indefinite(report: dict[str, Any], said: FileReport, options: DecodeOptions) -> list[RecordingLog]:
+def _indefinite(report: dict[str, Any], said: FileReport, options: DecodeOptions, utc: details.ToUtc) -> list[RecordingLog]:
     """Build recordings of indefinite streaming: up to six channels, no amplitude, so beta and spectra and no session."""
     runs = pair_runs(time_domains("IndefiniteStreaming", report.get("IndefiniteStreaming")), [], said)
     out = []
+    targets = leads_of(report)
     for run in runs:
         begin, end = run.span_ms
+        start = utc(run.first_packet) if run.first_packet else None
         rows = math.ceil((end - begin) / 1000.0 / options.period_s - 1e-6)
         for side in (*SIDES, None):
             channels = [c for c in run.channels if c.side == side]
             traces = [t for c in channels for t in _beta(c, begin, rows, options)]
             if channels:
-                out.append(_recording(run, side, channels, traces, begin, end, None, options))
+                one = _recording(run, side, channels, traces, begin, end, None, options)
+                known = {"leads": [targets[side]]} if side in targets else {}
+                out.append(replace(one, started_at=start, settings={**one.settings, **known}))
     if runs:
         count = sum(len(r.channels) for r in runs)
         kept = "beta and spectra kept, no session, because no amplitude is logged with it"
         said.understood.append(f"IndefiniteStreaming: {len(runs)} runs, {count} channels; {kept}")
         said.repaired.extend(dict.fromkeys(f"IndefiniteStreaming: {n}" for r in runs for c in r.channels for n in c.notes))
+        said.flagged.extend(f"IndefiniteStreaming, {c.channel}: {loss}" for r in runs for c in r.channels for loss in c.losses())
     return out
-
-
-def _check_dates(report: dict[str, Any], recordings: list[RecordingLog], said: FileReport) -> None:
-    """Say where the report's own date is not that of its packets: it is known to be wrong in some versions."""
-    stated = moment(report.get("SessionDate"))
-    packets = [r.started_at for r in recordings if r.run is not None and r.started_at is not None]
-    if stated and packets and apart_s(stated, packets[0]) > WRONG_DATE_S:
-        said.flagged.append(f"SessionDate says {stated:%Y-%m-%d}, the packets {packets[0]:%Y-%m-%d}: the packets' time is used")

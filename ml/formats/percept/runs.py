@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from ml.formats.percept.streams import DevicePower, TimeDomain
+from ml.formats.counters import shift_by_turns
+from ml.formats.percept.streams import TURN_MS, DevicePower, TimeDomain
 from ml.formats.recording import FileReport
 
 SAME_RUN_MS = 2_000.0
@@ -55,7 +56,8 @@ class Run:
 def pair_runs(channels: list[TimeDomain], powers: list[DevicePower], said: FileReport) -> list[Run]:
     """Pair channels and powers that were streamed together, in the order of the file.
 
-    By ticks and channel: FirstPacketDateTime has seconds only and may differ by one within a run.
+    They pair by channel, by ticks modulo a turn of their counter, and by FirstPacketDateTime. The date has seconds only and may differ by
+    one within a run. Where ticks fit and dates do not, the ticks of two runs are equal by chance.
     """
     runs: list[Run] = []
     for channel in channels:
@@ -63,20 +65,32 @@ def pair_runs(channels: list[TimeDomain], powers: list[DevicePower], said: FileR
         if run is None:
             run = Run()
             runs.append(run)
+        elif channel.ticked:
+            channel.meet(run.channels[0].begin_ms)
         run.channels.append(channel)
     for power in powers:
-        fitting = [r for r in runs if r.power is None and _fits(r, power)]
-        run = min(fitting, key=lambda r: apart_s(r.first_packet, power.first_packet)) if fitting else None
-        if run is None:
-            run = Run()
-            runs.append(run)
-        elif apart_s(run.first_packet, power.first_packet) > SAME_RUN_S:
+        fits = [(fit, r) for r in runs if r.power is None and (fit := _fit(r, power)) is not None]
+        dated = [(fit, r) for fit, r in fits if fit.seconds <= SAME_RUN_S]
+        # without dates, runs that fit after another number of turns cannot be distinguished
+        best = min(dated, key=lambda pair: (pair[0].seconds, pair[0].apart_ms), default=None)
+        if best is not None and any(not fit.dated and r is not best[1] for fit, r in dated):
+            said.flagged.append(f"the power of {_channels_in_words(power)} fits several runs and a date is missing: it is a run of its own")
+            best = None
+        elif best is None and fits:
             said.flagged.append(
-                "a run's power is paired with its samples by ticks and channel, though the report dates them "
-                f"{apart_s(run.first_packet, power.first_packet):.0f} s apart"
+                f"the ticks of the power of {_channels_in_words(power)} fit a run's samples, but the report dates them "
+                f"{min(fit.seconds for fit, _ in fits):.0f} s apart: they are two runs"
             )
-        run.power = power
+        if best is None:
+            runs.append(Run(power=power))
+        else:
+            power.shift(best[0].turns_ms)
+            best[1].power = power
     return runs
+
+
+def _channels_in_words(power: DevicePower) -> str:
+    return ", ".join(power.channels) or "an unnamed channel"
 
 
 def _same_run(run: Run, channel: TimeDomain) -> bool:
@@ -93,32 +107,55 @@ def _same_run(run: Run, channel: TimeDomain) -> bool:
         return False
     if not other.ticked:
         return apart_s(other.first_packet, channel.first_packet) <= SAME_RUN_S
-    later_ms = channel.begin_ms - other.begin_ms
+    turns_ms = shift_by_turns(channel.begin_ms, other.begin_ms, TURN_MS)
+    later_ms = channel.begin_ms + turns_ms - other.begin_ms
     if abs(later_ms) <= SAME_RUN_MS:
         return apart_s(other.first_packet, channel.first_packet) <= SAME_RUN_S
     if other.first_packet is None or channel.first_packet is None:
         return False
-    begin, end = max(channel.begin_ms, other.begin_ms), min(channel.end_ms, other.end_ms)
+    begin, end = max(channel.begin_ms + turns_ms, other.begin_ms), min(channel.end_ms + turns_ms, other.end_ms)
     together = end - begin >= MOSTLY * min(channel.end_ms - channel.begin_ms, other.end_ms - other.begin_ms)
     return together and abs((channel.first_packet - other.first_packet).total_seconds() - later_ms / 1000.0) <= SAME_RUN_S
 
 
-def _fits(run: Run, power: DevicePower) -> bool:
-    """Decide whether power is of the run: of one of its channels, and beginning with it, or within it where the first values were lost."""
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Fit of a power to a run.
+
+    Attributes:
+        turns_ms: to add to the power's ticks. apart_ms: distance of the first ticks then.
+        seconds: what the dates differ by, more than the ticks do; 0 where one is missing. dated: both have a date.
+    """
+
+    turns_ms: float
+    apart_ms: float
+    seconds: float
+    dated: bool
+
+
+def _fit(run: Run, power: DevicePower) -> _Fit | None:
+    """Fit a power to a run: of one of its channels, and beginning with it. Power whose first values were lost is within the run.
+
+    Of several numbers of turns the dates decide.
+    """
+    if power.channels and not {c.channel for c in run.channels} & set(power.channels):
+        return None
+    dated = run.first_packet is not None and power.first_packet is not None
+    difference_s = (power.first_packet - run.first_packet).total_seconds() if run.first_packet and power.first_packet else 0.0
+    if not run.channels or not run.channels[0].ticked:
+        return _Fit(0.0, 0.0, abs(difference_s), dated) if run.channels else None
     first, last = float(power.ticks_ms[0]) - power.interval_ms, float(power.ticks_ms[-1])
-    named = {c.channel for c in run.channels}
-    if power.channels and not named & set(power.channels):
-        return False
-    seconds = apart_s(run.first_packet, power.first_packet)
-    if not run.channels[0].ticked:
-        return seconds <= SAME_RUN_S
     begin, end = run.span_ms
-    later_ms = abs(begin - first)
-    if later_ms <= SAME_RUN_MS:
-        return True
-    # ticks of two runs may cover the same range after the device has restarted them: then the programmer's times differ
-    within = min(end, last) - max(begin, first) >= MOSTLY * min(end - begin, last - first)
-    return within and seconds <= SAME_RUN_S + later_ms / 1000.0
+    nearest_ms = shift_by_turns(first, begin, TURN_MS)
+    found = []
+    for turns_ms in (nearest_ms + k * TURN_MS for k in range(int((end - begin) // TURN_MS) + 2)):
+        later_ms = first + turns_ms - begin
+        within = min(end, last + turns_ms) - max(begin, first + turns_ms) >= MOSTLY * min(end - begin, last - first)
+        if abs(later_ms) <= SAME_RUN_MS or within:
+            # the date of a power whose first values are lost may be that of its run
+            seconds = min(abs(difference_s), abs(difference_s - later_ms / 1000.0)) if dated else 0.0
+            found.append(_Fit(turns_ms, abs(later_ms), seconds, dated))
+    return min(found, key=lambda fit: (fit.seconds > SAME_RUN_S, fit.apart_ms), default=None)
 
 
 def apart_s(one: datetime | None, other: datetime | None) -> float:

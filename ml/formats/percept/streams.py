@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.beta import LARGEST_UV
+from ml.formats.counters import shift_by_turns, unwrap
 from ml.formats.percept.enums import word
+from ml.formats.percept.facts import AMPLITUDE, FACTS, POWER
 from ml.formats.percept.report_json import SIDES, channel_names, entries, finite, inside, moment, packet_list, samples, side_of
+from ml.formats.sentinels import readings
 
 Side = Literal["left", "right"]
-TURN_MS = 65_536 * 50.0
-"""Time after which the ticks restart."""
-
+TURN_MS = FACTS.counters["TicksInMs"].turn
 MAX_SPAN_MS = 3 * 24 * 3600 * 1000.0
 """Longest span of the ticks of one run; a longer one is broken, since no run lasts three days."""
 
@@ -62,6 +63,22 @@ class TimeDomain:
     void: int = 0
     notes: list[str] = field(default_factory=list)
 
+    def meet(self, begin_ms: float) -> None:
+        """Move all ticks by the whole turns of their counter that bring them nearest to another channel's begin."""
+        turns_ms = shift_by_turns(self.begin_ms, begin_ms, TURN_MS)
+        self.begin_ms, self.end_ms = self.begin_ms + turns_ms, self.end_ms + turns_ms
+        self.pieces = [(start_ms + turns_ms, first, end) for start_ms, first, end in self.pieces]
+
+    def losses(self) -> list[str]:
+        """List what is missing from the channel, in sentences."""
+        out = []
+        if self.lost:
+            out.append(f"{100 * self.lost / (self.lost + self.values.size):.1f} % of the samples are missing ({self.lost})")
+        if self.void:
+            beyond = f"or one beyond {LARGEST_UV / 1000:g} mV, which no electrode gives"
+            out.append(f"{self.void} samples hold no number, {beyond}: gaps")
+        return out
+
     def stretches(self, origin_ms: float) -> list[tuple[float, float, NDArray[np.float64]]]:
         """List gap-free pieces (time of the first sample in s after `origin_ms`, rate, samples in uV); NaN samples cut them too."""
         out = []
@@ -83,7 +100,7 @@ class DevicePower:
         ticks_ms: end of each value's interval, [n], strictly increasing. interval_ms: time that one value covers.
         power: device units by side, [n]; NaN where there is none. amplitude_ma: delivered current by side, [n].
         snapshot: the therapy that was set.
-        notes: what was adapted, in sentences.
+        notes: what was adapted, in sentences. void: values that are no readings, in sentences.
     """
 
     channels: list[str]
@@ -94,6 +111,11 @@ class DevicePower:
     amplitude_ma: dict[Side, NDArray[np.float64]]
     snapshot: dict[str, Any]
     notes: list[str] = field(default_factory=list)
+    void: list[str] = field(default_factory=list)
+
+    def shift(self, turns_ms: float) -> None:
+        """Move all ticks by whole turns of their counter, ms."""
+        self.ticks_ms = self.ticks_ms + turns_ms
 
     def channel_of(self, side: Side) -> str | None:
         """Find the sensed channel of a side."""
@@ -133,7 +155,7 @@ def _check_rate(data: TimeDomain, sizes: NDArray[np.float64], ticks_ms: NDArray[
     n = min(sizes.size, ticks_ms.size)
     if n < LEAST_PACKETS or not _usable(ticks_ms[:n]) or not np.all(np.isfinite(sizes[:n])):
         return
-    at, first = np.unique(unrolled(ticks_ms[:n]), return_index=True)
+    at, first = np.unique(unwrap(ticks_ms[:n], TURN_MS), return_index=True)
     count = np.add.reduceat(sizes[:n], first)
     by_ticks = float(np.median(1000.0 * count[1:] / np.diff(at))) if at.size >= LEAST_PACKETS and np.all(np.diff(first) > 0) else 0.0
     if 1 <= by_ticks <= 10_000 and abs(by_ticks / data.rate_hz - 1.0) > RATE_TOLERANCE:
@@ -150,7 +172,7 @@ def place(data: TimeDomain, sizes: NDArray[np.float64], ticks_ms: NDArray[np.flo
             data.notes.append("the packets' ticks make no sense: samples are taken to follow each other")
         _in_one_piece(data)
         return
-    ticks_ms = unrolled(ticks_ms[:n])
+    ticks_ms = unwrap(ticks_ms[:n], TURN_MS)
     if ticks_ms[-1] - ticks_ms[0] > MAX_SPAN_MS or ticks_ms.max() - ticks_ms.min() > MAX_SPAN_MS:
         data.notes.append("the packets' ticks span days: samples are taken to follow each other")
         _in_one_piece(data)
@@ -191,12 +213,6 @@ def _true_sizes(data: TimeDomain, sizes: NDArray[np.float64]) -> NDArray[np.floa
 
 def _usable(ticks_ms: NDArray[np.float64]) -> bool:
     return bool(np.all(np.isfinite(ticks_ms)) and np.all(np.abs(ticks_ms) < 1e12))
-
-
-def unrolled(ticks_ms: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Extend ticks so that they continue where the counter restarted."""
-    turns = np.concatenate(([0], np.cumsum(np.diff(ticks_ms) < -TURN_MS / 2)))
-    return ticks_ms + TURN_MS * turns
 
 
 def _not_repeated(ticks_ms: NDArray[np.float64], sequences: NDArray[np.float64], data: TimeDomain) -> NDArray[np.bool_]:
@@ -254,7 +270,7 @@ def device_powers(value: Any) -> list[DevicePower]:
         ticks = samples([row.get("TicksInMs") for row in rows])
         if ticks.size == 0 or not _usable(ticks):
             continue
-        ticks = unrolled(ticks)
+        ticks = unwrap(ticks, TURN_MS)
         forward = np.concatenate(([True], ticks[1:] > np.maximum.accumulate(ticks)[:-1])) & (ticks - ticks[0] < MAX_SPAN_MS)
         interval_ms, note = _interval_ms(finite(entry.get("SampleRateInHz")), ticks[forward])
         channels = channel_names(entry.get("Channel"))
@@ -269,8 +285,11 @@ def device_powers(value: Any) -> list[DevicePower]:
             snapshot=snapshot if isinstance(snapshot, dict) else {},
         )
         for side in SIDES:
-            data.power[side] = _column(rows, side, "LFP")[forward]
-            data.amplitude_ma[side] = _column(rows, side, "mA")[forward]
+            for what, field_of, kept in (("LFP", POWER, data.power), ("mA", AMPLITUDE, data.amplitude_ma)):
+                values, void = readings(samples([inside(row, side.capitalize(), what) for row in rows]), field_of)
+                kept[side] = values[forward]
+                if void:
+                    data.void.append(f"{side}: {void} values of {what} are the device's sign for no reading, or impossible: gaps")
         if note:
             data.notes.append(note)
         if dropped := int(np.sum(~forward)):
@@ -291,12 +310,3 @@ def _interval_ms(rate_hz: float | None, ticks_ms: NDArray[np.float64]) -> tuple[
     if abs(by_ticks / stated - 1.0) <= RATE_TOLERANCE or not 1.0 <= by_ticks <= 100_000.0:
         return stated, None
     return by_ticks, f"a power value every {stated:g} ms is stated, the ticks say every {by_ticks:g} ms: the ticks count"
-
-
-def _column(rows: list[dict[str, Any]], side: Side, key: str) -> NDArray[np.float64]:
-    """Read one side's values, NaN where there is none or it is impossible: power and current are 0 or more."""
-    values = samples([inside(row, side.capitalize(), key) for row in rows])
-    values[~(values >= 0)] = np.nan
-    if key == "mA":
-        values[values > 25.5] = np.nan
-    return values

@@ -76,6 +76,11 @@ def parts(key: str) -> list[str]:
     return [part.lower() for part in _PART.findall(key[:200])]
 
 
+def technical(key: str) -> bool:
+    """Decide whether every word of a key is a known technical one."""
+    return "…" not in cleaned(key)
+
+
 def cleaned(key: str) -> str:
     """Clean a key so that it may be shown: technical words stay, others become `…`."""
     out: list[str] = []

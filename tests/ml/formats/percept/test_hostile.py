@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -198,7 +199,7 @@ def test_whatever_stands_at_any_place_of_a_report_the_rest_is_read_and_redacts_t
         for key in path[:-1]:
             node = node[key] if there(node, key) else {}
         if there(node, path[-1]):
-            node[path[-1]] = junk
+            node[path[-1]] = deepcopy(junk)  # the strategies give one object many times
     folder = tmp_path_factory.mktemp("t")
     (folder / "s.json").write_text(json.dumps(report))
     before = decode(folder / "s.json", "percept")

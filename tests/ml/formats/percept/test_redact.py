@@ -91,7 +91,11 @@ def test_enumerations_that_could_hold_a_name_are_replaced_and_counted(write, tmp
     text = target.read_text()
     assert [s for s in ("ZZ", "Anton") if s in text or s in repr(decode(target))] == []
     assert "GroupIdDef.GROUP_B" in text
-    assert "enumerations with values that no report is known to have (4×)" in done.removed
+    said = next(text for text in done.removed if text.startswith("words of enumerations that no report is known to have (4×"))
+    assert all(shown in said for shown in ("GroupIdDef.…", "InsLocation.…", "LeadLocationDef.…", "…Def.LEAD_…"))
+    again = tmp_path / "again.json"
+    redact(target, again, "percept", KEY)
+    assert json.loads(again.read_text())["Groups"] == json.loads(text)["Groups"]
 
 
 @pytest.mark.parametrize(
