@@ -17,7 +17,7 @@ from app.accounts.addresses import LONGEST_ADDRESS, normal_address
 from app.accounts.passwords import MIN_PASSWORD, FewAtOnce, place, weakness
 from app.accounts.permissions import MANAGE_ACCOUNTS, READ_AUDIT, Caller, Grant
 from app.platform.audit import record, record_once
-from app.platform.database import new_session, now, set_actor
+from app.platform.database import now, set_actor, transaction
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized, about
 from app.platform.sources import in_words
 from app.settings import get_settings
@@ -128,7 +128,7 @@ def confirm_password(user_id: int, password: str, code: str = "") -> None:
         TooMany: too many wrong passwords lately, or too many people at this moment. Forbidden: it or the code is wrong, or the account
             is closed.
     """
-    with place(), new_session() as db:
+    with place(), transaction() as db:
         user = db.get_one(User, user_id)
         set_actor(db, user.email, user_id)
         attempt = _count_attempt(db, user.email, known=True)
@@ -137,13 +137,13 @@ def confirm_password(user_id: int, password: str, code: str = "") -> None:
             wrong = "The password is wrong.", "Nothing was changed; try again."
         elif not second_factor.accepts(db, user.id, code):
             wrong = "The code of the second factor is wrong or missing.", "Nothing was changed; give the one of now."
-        if wrong is not None:
+        if wrong is None:
+            repository.forget_failures(db, attempt)
+        else:
             repository.mark_failed(db, attempt)
             record(db, "refuse", "confirmation", user.email, {"why": wrong[0]})
-            db.commit()
-            raise Forbidden(*wrong)
-        repository.forget_failures(db, attempt)
-        db.commit()
+    if wrong is not None:
+        raise Forbidden(*wrong)
 
 
 def administers(caller: Caller, study_id: int, site_id: int | None = None) -> bool:
@@ -223,17 +223,18 @@ def _count_attempt(db: Session, address: str, known: bool) -> SignInAttempt:
     repository.lock_address(db, address)
     repository.prune_failures(db, FAILURE_WINDOW)
     failed, undecided = repository.recent_tries(db, address, FAILURE_WINDOW, UNDECIDED_WINDOW)
-    if failed + undecided >= FAILURES_ALLOWED:
-        locked = failed >= FAILURES_ALLOWED
+    locked, refused = failed >= FAILURES_ALLOWED, failed + undecided >= FAILURES_ALLOWED
+    attempt = SignInAttempt(email=address, failed=False)
+    if refused:
         # what was typed as an unknown address may be a password
         record_once(db, "refuse", "sign_in", address if known else "unknown address", LOCKED_OUT if locked else AT_ONCE, FAILURE_WINDOW)
-        db.commit()
+    else:
+        db.add(attempt)
+    db.commit()
+    if refused:
         wait_s = (FAILURE_WINDOW if locked else UNDECIDED_WINDOW).seconds
         said = "failed sign-ins for {}" if locked else "sign-ins for {} are waiting for an answer"
         raise TooMany(f"Too many {said.format(address)}.", f"Wait {in_words(wait_s)} and try again.", wait_s)
-    attempt = SignInAttempt(email=address, failed=False)
-    db.add(attempt)
-    db.commit()
     return attempt
 
 
@@ -252,9 +253,8 @@ def caller_of_cookie(db: Session, token: str, used: bool = True) -> Caller | Non
     )
     if row is None or not row.user.active:
         return None
-    if used and now() - row.last_seen_at > _SEEN_RESOLUTION:
-        row.last_seen_at = now()
-        db.commit()
+    if used:
+        _note_use(db, row, "last_seen_at")
     return replace(caller_of(row.user), sign_in_id=row.id, confirmed_at=row.confirmed_at)
 
 
@@ -269,10 +269,16 @@ def caller_of_token(db: Session, token: str) -> Caller | None:
     row = repository.api_token_by_hash(db, _hash(token))
     if row is None or not row.user.active:
         return None
-    if row.last_used_at is None or now() - row.last_used_at > _SEEN_RESOLUTION:
-        row.last_used_at = now()
-        db.commit()
+    _note_use(db, row, "last_used_at")
     return replace(caller_of(row.user), token_scope=Scope(row.scope))
+
+
+def _note_use(db: Session, row: SignIn | ApiToken, column: str) -> None:
+    """Store when a session or token was used, and commit: that is no part of the request, and no other request waits for its row."""
+    last = getattr(row, column)
+    if last is None or now() - last > _SEEN_RESOLUTION:
+        setattr(row, column, now())
+        db.commit()
 
 
 def caller_of(user: User) -> Caller:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import datetime as dt
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,7 +26,7 @@ from app.planning.plans.schemas import OverrideIn, PlanIn
 from app.planning.plans.view import PlanLine
 from app.planning.protocol.schedule import total_minutes
 from app.planning.slots import service as slots
-from app.platform.database import new_session, set_actor
+from app.platform.database import set_actor, transaction
 from app.platform.errors import BetaloopError, Conflict, NotFound
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.watch import POLL_S, look
@@ -104,14 +105,14 @@ class ParticipantLoop:
         """
         with self._transaction() as db:
             self._participant(db)
-            db.commit()
         for number in range(1, self.design.visits + 1):
             self._visit(number)
 
-    def _transaction(self) -> Session:
-        db = new_session()
-        set_actor(db, self.caller.label, self.caller.user_id)
-        return db
+    @contextmanager
+    def _transaction(self) -> Iterator[Session]:
+        with transaction() as db:
+            set_actor(db, self.caller.label, self.caller.user_id)
+            yield db
 
     def _participant(self, db: Session) -> Participant:
         try:
@@ -130,7 +131,6 @@ class ParticipantLoop:
             if visit is None:
                 note = "Simulated: the participant is synthetic and not fitted to a patient."
                 visit = study.add_visit(db, person, VisitIn(number=number, date=day, note=note), self.caller)
-                db.commit()
             if plans.live_plan(db, visit.id) is None:
                 if not collects:
                     self._learn(db, person, number)
@@ -162,7 +162,6 @@ class ParticipantLoop:
         for row in slots.compare(db, visit, self.caller).rows:
             if row.line is not None and row.session is not None:
                 the_day.tremor(db, row.session, row.line.item, row.line.start_minute)
-                db.commit()
 
     def _learn(self, db: Session, person: Participant, number: int) -> None:
         """The job before a visit: the one that was begun for it, or a new one; waits for its end."""
@@ -214,7 +213,6 @@ class ParticipantLoop:
         )
         needed = total_minutes(len(chosen), planning.rules_of(draft))
         planning.draft_plan(db, visit, draft.model_copy(update={"total_minutes": max(needed, draft.total_minutes)}), self.caller)
-        db.commit()
 
     def _chosen(self, db: Session, person: Participant) -> tuple[list[int], list[OverrideIn]]:
         """The first policies of each kind in the ranking, with one to test with care at most.

@@ -103,7 +103,6 @@ def read_held(db: Session, file: UploadFile, participant: Participant, reason: s
         db.commit()  # what was read is safe before the original goes
         if not redaction.unreadable:
             _erase(db, file)
-    db.commit()
     return outcome
 
 

@@ -118,7 +118,7 @@ class Receiver:
         try:
             with raw_bytes.received(one.stream, limit_mb * 1024 * 1024) as (raw, sha256, size):
                 if known := self._known(name, sha256):
-                    return self._mended(raw, known)
+                    return self._keep_outcome(self._mended(raw, known))
                 content = self._store(raw) if size else StoredContent("unreadable", None, None, Redaction(), EMPTY)
         except OverflowError as error:
             raise TooLarge(f"'{name}' is larger than {limit_mb} MiB.", "Split it, or have BETALOOP_UPLOAD_LIMIT_MB raised.") from error
@@ -157,7 +157,6 @@ class Receiver:
         content = self._store(raw)
         if content.problem is not None or content.stored_sha256 is None:
             self._forget(content.quarantine_sha256)
-            self.db.commit()
             return known
         log.warning("a stored file was damaged and is made anew", upload_file=row.id, sha256=row.stored_sha256)
         damaged, spare = row.stored_sha256, content.quarantine_sha256
@@ -168,7 +167,6 @@ class Receiver:
             row.quarantine_sha256, spare = spare, row.quarantine_sha256
         self._forget(spare)
         self._forget(damaged)
-        self.db.commit()
         known.reports[0].understood.append(wording.MADE_ANEW)
         return known
 
@@ -194,7 +192,7 @@ class Receiver:
             return FileOutcome(row.name, row, stored_reports(row), recordings=self._recordings(row))
         sealed = row.stored_sha256 is None or row.stored_sha256 == row.quarantine_sha256
         if not sealed and row.report.get(BEGUN, 0) >= LETHAL:
-            return self._put_aside(row, self._content(row), ENDED_THE_SERVICE)
+            return self._keep_outcome(self._put_aside(row, self._content(row), ENDED_THE_SERVICE))
         # committed before the file is read, so that it is known whom to blame when that ends the process
         row.report = {**lasting(row), BEGUN: row.report.get(BEGUN, 0) + 1}
         self.db.commit()
@@ -275,7 +273,15 @@ class Receiver:
         return files.store(self.db, encryption.encrypt(raw), copy=False).sha256
 
     def decode(self, name: str, row: UploadFile, content: StoredContent) -> FileOutcome:
-        """Decode a stored file; whatever is wrong with it becomes its report."""
+        """Decode a stored file; whatever is wrong with it becomes its report. Commits."""
+        return self._keep_outcome(self._outcome(name, row, content))
+
+    def _keep_outcome(self, outcome: FileOutcome) -> FileOutcome:
+        """Commit what became of a file: no file that follows it can take that back."""
+        self.db.commit()
+        return outcome
+
+    def _outcome(self, name: str, row: UploadFile, content: StoredContent) -> FileOutcome:
         if content.problem is not None or content.stored_sha256 is None:
             return self._failed(name, row, content, content.problem or CUT_SHORT)
         try:
@@ -313,7 +319,6 @@ class Receiver:
         reports[0].flagged.extend(stored.flagged)
         row.status = "decoded"
         store_reports(row, reports, [r.id for r in stored.known], content.redaction.unreadable)
-        self.db.commit()
         all_known = bool(stored.known) and not stored.fresh
         return FileOutcome(name, row, reports, all_known, recordings=[*stored.known, *stored.fresh], grasps=decoded.grasps)
 
@@ -324,7 +329,6 @@ class Receiver:
             return None
         self.db.delete(row)
         self._forget(row.quarantine_sha256)
-        self.db.commit()
         return known
 
     def _decoded(self, row: UploadFile, content: StoredContent) -> DecodedFile:
@@ -356,7 +360,6 @@ class Receiver:
             return self._failed_before(name, row, before, report, problem)
         row.status = "failed"
         store_reports(row, [report])
-        self.db.commit()
         return FileOutcome(name, row, [report], for_sender=problem.for_sender)
 
     def _failed_before(self, name: str, row: UploadFile, before: UploadFile, report: FileReport, problem: UndecodableFile) -> FileOutcome:
@@ -370,7 +373,6 @@ class Receiver:
         self.db.delete(row)
         store_reports(before, [report])
         self._forget(sealed)
-        self.db.commit()
         return FileOutcome(name, before, [report], duplicate=True, same_bytes=True, for_sender=problem.for_sender)
 
 
