@@ -45,7 +45,7 @@ ONE_STANDING: dict[str, Any] = {"unique": True, "postgresql_where": text("remove
 
 
 def now() -> datetime:
-    """The present, UTC."""
+    """Return the present time, UTC."""
     return datetime.now(UTC)
 
 
@@ -55,7 +55,7 @@ _embedded: dict[str, EmbeddedPostgres] = {}
 
 
 def database_url(settings: Settings | None = None) -> str:
-    """The SQLAlchemy URL; starts the embedded PostgreSQL when the settings name none."""
+    """Return the SQLAlchemy URL; start the embedded PostgreSQL if the settings name no database."""
     settings = settings or get_settings()
     if settings.database_url:
         return connection_url("BETALOOP_DATABASE_URL", settings.database_url)
@@ -63,7 +63,7 @@ def database_url(settings: Settings | None = None) -> str:
 
 
 def owner_url(settings: Settings | None = None) -> str:
-    """The same for the role that owns the tables: migrations, backup, restore. The service's where the settings name none."""
+    """Return the URL for the owner of the tables (migrations, backup, restore); the service's if the settings name no owner."""
     settings = settings or get_settings()
     if settings.database_url and settings.owner_url:
         return connection_url("BETALOOP_OWNER_URL", settings.owner_url)
@@ -85,7 +85,7 @@ HEAL_POLL_S = 1.0
 
 
 def supervise_database(stop: threading.Event | None = None) -> None:
-    """Have a thread of this process start the embedded server again whenever it dies; a PostgreSQL of one's own is left to its keeper.
+    """Start a thread that restarts the embedded server whenever it dies; an external PostgreSQL is left to its keeper.
 
     Args:
         stop: ends the thread; without one it ends with the process.
@@ -111,7 +111,7 @@ def _supervise(server: EmbeddedPostgres, stop: threading.Event) -> None:
 
 
 def database_place(settings: Settings | None = None) -> str:
-    """Where the database lies, for people: a folder, or the address of a PostgreSQL of one's own without its password. Starts nothing."""
+    """Return the place of the database for people: a folder, or an external address without its password. Start nothing."""
     settings = settings or get_settings()
     if settings.database_url:
         url = make_url(database_url(settings))
@@ -125,7 +125,7 @@ KEPT_CONNECTIONS, MOST_CONNECTIONS = 2, 30
 
 
 def get_engine() -> Engine:
-    """The engine of this process."""
+    """Return the engine of this process, made at the first call."""
     url = database_url()
     with _lock:
         if url not in _engines:
@@ -135,15 +135,15 @@ def get_engine() -> Engine:
 
 
 def new_session() -> Session:
-    """A session outside a request (commands, workers); the caller commits and closes."""
+    """Open a session outside a request (commands, workers); the caller commits and closes."""
     return Session(get_engine(), expire_on_commit=False)
 
 
 @contextmanager
 def transaction(actor: str = "system") -> Iterator[Session]:
-    """A session that commits at the end and rolls back on an error; `actor` stands in the audit trail.
+    """Open a session that commits at the end and rolls back on an error; `actor` is written to the audit trail.
 
-    Raises RuntimeError, in the words of a command line, where the database does not have the tables of this version.
+    Raises RuntimeError, worded for a command line, if the database does not have the tables of this version.
     """
     with new_session() as db:
         set_actor(db, actor)
@@ -166,8 +166,7 @@ def get_db() -> Iterator[Session]:
 
 
 def _let_go(db: Session) -> None:
-    """Close a session, also where its database has gone since it was asked last: it rolls back by itself, and the answer stands, or is
-    on its way already."""
+    """Close a session. If the connection is lost, ignore it: the server has rolled back and the response is already sent or on its way."""
     try:
         db.close()
     except DBAPIError as error:
@@ -221,7 +220,7 @@ def set_actor(db: Session, label: str, user_id: int | None = None, request_id: s
 
 
 def set_reason(db: Session, reason: str | None) -> None:
-    """Why the following changes of this session are made (kept in the audit trail)."""
+    """Set the reason for the following changes of this session (kept in the audit trail)."""
     actor = db.info.get("actor", {"label": "system"})
     set_actor(db, actor["label"], actor.get("user_id"), actor.get("request_id"), reason)
 

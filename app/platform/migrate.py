@@ -25,7 +25,7 @@ _LOCK = 0x62657461  # any number that only this project uses
 def migrate() -> None:
     """Run every migration that is missing, as the owner of the tables, and give the service's role its rights.
 
-    Processes that start at once wait for each other. Folders that stand open to other users of the machine are closed on the way.
+    Processes that start at once wait for each other. Folders open to other users of the machine are closed on the way.
 
     Raises:
         RuntimeError: migrations are missing and the role may not run them, or the database has a schema that this version does not know.

@@ -1,8 +1,8 @@
 """Raw bytes of uploads, which may name a person: in files without a name, encrypted with keys that never leave the memory.
 
-No reader of the disk finds a file or a byte that can be read, neither while the service runs nor after it was killed. Each file has a key
-of its own (AES-256 in counter mode, which decrypts from any place on). The key is drawn when the file is made and forgotten with it. Where
-the system has no files in memory (it is not Linux), a key is on disk with its file as long as that is used (`files.in_memory`).
+The disk never holds a readable file or byte, neither while the service runs nor after it was killed. Each file has a key of its own
+(AES-256 in counter mode, which decrypts from any place on). The key is drawn when the file is made and forgotten with it. On systems
+without files in memory (other than Linux), a key is on disk with its file while that is used (`files.in_memory`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Limits of what one source may use in a span of time: failed sign-ins of a network address, bytes of files of an address or user.
+"""Limits of one source in a span of time: failed sign-ins per network address, bytes of files per address or user.
 
 Kept in the memory of one process: several web processes each count for themselves, and a restart forgets.
 """

@@ -35,8 +35,9 @@ class Break:
     """One break, with what applies to it.
 
     Attributes:
-        position: its place in the chain. event_id: the number of the row of the trail. table: the audited table, or that of a wrong
-            trigger. row: the key of a row of that table. columns: those that differ. name: of a trigger, a rule or a function.
+        position: its place in the chain. event_id: the number of the trail's row.
+        table: the audited table, or that of a wrong trigger. row: the key of a row of that table.
+        columns: those that differ. name: of a trigger, a rule or a function.
     """
 
     kind: BreakKind

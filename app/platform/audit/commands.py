@@ -48,7 +48,7 @@ def seal_() -> None:
 
 
 def sentences(found: Verified) -> list[str]:
-    """What was found, a line each."""
+    """List what was found, one line each."""
     sealed = f"sealed up to link {found.sealed_to}" if found.sealed_to else "not sealed yet"
     said = [f"The audit trail is whole: {found.links} links, {sealed}."]
     if not found.whole:

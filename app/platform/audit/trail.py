@@ -1,7 +1,7 @@
 """Rows of the audit trail: one for every write, made by triggers in the database, so that no code path can forget it.
 
-What changes no row and must be known all the same (a refused sign-in, a record or a bundle that left) is told to `record`. Both write as
-the owner of the tables: the service's own role may read the trail, and nothing else.
+`record` adds events that change no row: a refused sign-in, a record or a bundle that left. Both write as the owner of the tables; the
+service's own role may only read the trail.
 """
 
 from __future__ import annotations

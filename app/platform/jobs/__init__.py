@@ -2,9 +2,9 @@
 
 How to add a job kind
 ---------------------
-A kind has two parts. The *orchestration* runs in a worker and says which steps there are and in which order; the *compute functions* do
-the work, each call in a child process of its own (true cancel, memory returned, one crash harms nobody else). One record registers a kind,
-in a module that `registry.KIND_MODULES` names; API, pages and form derive from it::
+A kind has two parts. The *orchestration* runs in a worker and defines the steps and their order. The *compute functions* do the work, each
+call in a child process of its own (true cancel, memory returned, a crash harms no other call). One record registers a kind, in a module
+that `registry.KIND_MODULES` names; API, pages and form derive from it::
 
     class TrainParams(BaseModel):                          # what POST .../jobs accepts besides `kind`; checked on submit
         policies: list[int]
@@ -47,19 +47,19 @@ Rules
 * A step's `key` is its identity in the job (at most 100 of `a-z 0-9 _ . / -`), stable over restarts; no key twice.
 * `job.transact(key, fn)` runs `fn(db)` and records its result in one transaction: exactly once. `fn` returns a JSON dict and never
   commits. The audit trail names the person who submitted the job. Keep it short: no computing in it.
-* A compute function may be killed at any moment and called again with the same params and workdir: write checkpoints to another name
+* A compute function may be killed at any moment and called again with the same params and workdir. Write checkpoints to another name
   and rename them (`write_atomically`). When the params differ (they are compared by hash), the workdir is emptied first.
 * Raise `JobError("what, where, what to do")` for errors that a person can correct; its text is shown as it is. Any other exception shows
   its last line and keeps the traceback in the step's log. A failed step raises `StepFailed` in the orchestration, which fails the job.
 * Do not catch `BaseException` in an orchestration: cancelling and stopping travel as such.
-* Records name functions by strings, so that the web service, which knows every kind, never loads torch; a compute module imports what it
-  needs at its top, and the child imports only the module of its function.
+* Records name functions by strings, so that the web service, which knows every kind, never loads torch. A compute module imports what it
+  needs at its top; the child imports only the module of its function.
 
-Everybody else
---------------
-`service.submit(db, kind, participant_id, params, created_by)` enqueues within the caller's transaction, `service.cancel`, `service.retry`,
-`service.events_after`; `repository` holds the queries; `stream.job_events` serves server-sent events; `watch.watch(job_id)` feeds a
-terminal's progress bar; `worker.run_worker(slots, stop_event)` is the worker. `engine.prepare(url)` belongs to every migration run.
+Other entry points
+------------------
+`service.submit(db, kind, participant_id, params, created_by)` enqueues within the caller's transaction. The module `repository` holds the
+queries; `stream.job_events` serves server-sent events; `watch.watch(job_id)` feeds a terminal's progress bar. The worker is
+`worker.run_worker(slots, stop_event)`. Every migration run calls `engine.prepare(url)`.
 """
 
 from __future__ import annotations

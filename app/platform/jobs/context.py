@@ -1,4 +1,4 @@
-"""What an orchestration works with: steps, compute, fan-out, transactions."""
+"""Tools of an orchestration: steps, compute, fan-out, transactions."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _KEY = re.compile(r"[a-z0-9][a-z0-9_.\-]*(/[a-z0-9][a-z0-9_.\-]*)*")
 _KEY_LENGTH = 100
 
 StepOutcome = dict[str, Any]
-"""`{"ok": True, "result": {...}}`, `{"ok": False, "message": "..."}` or, never started, `{"ok": False, "skipped": True}`. What a child
-failed of stands under `cause` too, a `Cause` of `children.child`."""
+"""`{"ok": True, "result": {...}}`, `{"ok": False, "message": "..."}` or, never started, `{"ok": False, "skipped": True}`. The
+child's error is also stored as `cause`, a `Cause` of `children.child`."""
 
 
 class Steps(Protocol):
@@ -34,7 +34,7 @@ class Steps(Protocol):
         """Run a function in a database transaction together with its record."""
 
     def workdir(self, key: str) -> Path:
-        """Folder of a step."""
+        """Return the folder of a step."""
 
 
 class JobContext:
@@ -62,7 +62,7 @@ class JobContext:
 
         Args:
             key: identity of the step, as in `train/2`.
-            title: what the user reads; the key when left out.
+            title: what the user reads; the key by default.
             weight: its share of the job's progress, for instance its expected minutes.
 
         Raises:
@@ -127,7 +127,7 @@ class JobContext:
         return result
 
     def workdir(self, key: str) -> Path:
-        """Folder of a compute step, for files that its function left there."""
+        """Return the folder of a compute step, for files that its function left there."""
         return self._steps.workdir(key)
 
     def _use(self, key: str) -> None:

@@ -1,9 +1,9 @@
 """The durable-workflow engine: the only module that knows DBOS (3.4 or later, below 4).
 
 Every job is one workflow `betaloop.job(job_id)` on one queue, in the schema `dbos` of our own PostgreSQL. DBOS keeps the queue, says which
-executor owns a workflow and starts it again after a crash. It records no step: status, steps and results stand once, in our own tables
-(`ledger`). Three things the library leaves to us: noticing dead executors (`recover`), moving waiting jobs to a new protocol
-(`adopt_older_protocols`), and deleting what finished long ago (`delete_finished`).
+executor owns a workflow and starts it again after a crash. It records no step: status, steps and results are stored once, in our own tables
+(`ledger`). The library leaves three things to us: detect dead executors (`recover`), move waiting jobs to a new protocol
+(`adopt_older_protocols`), and delete old finished jobs (`delete_finished`).
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class JsonSerializer(Serializer):
     """Arguments and results as readable JSON; an exception keeps its name and text. The default would be pickle, which can run code."""
 
     def serialize(self, data: Any) -> str:
-        """Python to JSON; raises ValueError for NaN and TypeError for what JSON lacks."""
+        """Convert Python to JSON; raises ValueError for NaN and TypeError for what JSON lacks."""
         return json.dumps(data, default=_exception_to_json, allow_nan=False)
 
     def deserialize(self, serialized_data: str) -> Any:
-        """JSON to Python."""
+        """Convert JSON to Python."""
         data = json.loads(serialized_data)
         if isinstance(data, dict) and set(data) == {"__exception__", "text"}:
             return RuntimeError(f"{data['__exception__']}: {data['text']}")
@@ -52,7 +52,7 @@ class JsonSerializer(Serializer):
         return data
 
     def name(self) -> str:
-        """The name that stands beside each stored value."""
+        """Return the name that is stored with each value."""
         return "betaloop_json"
 
 
@@ -66,7 +66,7 @@ class CancelNoise(logging.Filter):
     """Drops the tracebacks that DBOS logs whenever a workflow was cancelled: a cancelled job is no error."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """False for a record about a cancelled workflow."""
+        """Return False for a record about a cancelled workflow."""
         error = record.exc_info[1] if record.exc_info else None
         names = {type(error).__name__, *(base.__name__ for base in type(error).__mro__)} if error else set()
         return not any("Cancelled" in name for name in names) and "CancelledError" not in record.getMessage()
@@ -93,7 +93,7 @@ _clients_lock = threading.Lock()
 
 
 def _client(url: str) -> DBOSClient:
-    """A client that only writes and reads the queue; it never runs a workflow."""
+    """Return a client that only writes and reads the queue; it never runs a workflow."""
     with _clients_lock:
         if url not in _clients:
             _quieten()
@@ -159,15 +159,15 @@ def shutdown() -> None:
 def recover(executor_ids: Sequence[str]) -> list[str]:
     """Put the unfinished jobs of dead executors back on the queue; returns the ids of those that this call found.
 
-    Safe when several workers do it at once: the update asks for PENDING and the dead executor's id, so a job that somebody took meanwhile
-    is left alone. The public `resume_workflow` is not: it also revives cancelled jobs and resets the count of recoveries. Hence a private
-    name, held in this one place and by a contract test.
+    Safe when several workers do it at once. The update asks for PENDING and the dead executor's id, so a job that another worker took
+    meanwhile is left alone. The public `resume_workflow` is not safe: it also revives cancelled jobs and resets the count of recoveries.
+    Hence a private name, used only here and checked by a contract test.
     """
     return [handle.get_workflow_id() for handle in DBOS._recover_pending_workflows(list(executor_ids))]
 
 
 def owners(db: Session) -> dict[str, str]:
-    """Executor of every job that is being run, by job id."""
+    """Return the executor of every running job, by job id."""
     rows = db.execute(
         text("select workflow_uuid, executor_id from dbos.workflow_status where status = 'PENDING' and name = :name"), {"name": WORKFLOW}
     )
@@ -175,7 +175,7 @@ def owners(db: Session) -> dict[str, str]:
 
 
 def ended(db: Session, job_ids: Sequence[str]) -> dict[str, str]:
-    """Of these jobs, those that the engine will never run again, with its word for why ('GONE': it has no record of the job)."""
+    """Find those of these jobs that the engine will never run again, with their status ('GONE': it has no record of the job)."""
     rows = db.execute(
         text("select workflow_uuid, status from dbos.workflow_status where workflow_uuid = any(:ids)"), {"ids": list(job_ids)}
     )
@@ -200,7 +200,7 @@ def adopt_older_protocols(db: Session) -> int:
 
 
 def forgive_attempt(db: Session, executor_id: str) -> None:
-    """An orderly stop is no crash: take back the attempt that it will cost the jobs this executor still holds."""
+    """Reduce the attempts of the jobs that this executor still has by one: an orderly stop is no crash."""
     db.execute(
         text(
             "update dbos.workflow_status set recovery_attempts = greatest(recovery_attempts - 1, 0)"

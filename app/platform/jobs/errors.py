@@ -1,4 +1,4 @@
-"""What can go wrong in a job."""
+"""Errors of jobs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class UnknownKind(BetaloopError):
 
 
 class JobCancelled(BaseException):
-    """Somebody cancelled the job: unwinds the orchestration. Not an Exception, so that no `except Exception` swallows it."""
+    """Cancellation of the job by a user: unwinds the orchestration. Not an Exception, so that no `except Exception` swallows it."""
 
 
 class WorkerStopping(BaseException):

@@ -1,7 +1,7 @@
 """The record of one job while it runs: every change of job, steps and events goes through here.
 
-Each change locks the job's row first. So a cancel is seen by the very next change, and events get their numbers in the order in which they
-become visible: a reader that has seen event 7 never misses an event 6.
+Each change locks the job's row first, so that a cancel is seen by the very next change. Events get their numbers in the order in which
+they become visible: a reader that has seen event 7 never misses an event 6.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Ledger:
         self._persist(write)
 
     def outcome(self, key: str) -> StepOutcome | None:
-        """The outcome of a step that has ended, else None. This record alone says what a job has done before a crash."""
+        """Return the outcome of a step that has ended, else None. Only this record shows what a job has done before a crash."""
 
         def read() -> StepOutcome | None:
             with self._locked() as (db, job):
@@ -215,8 +215,8 @@ def persist(action: Callable[[], Value], check: Callable[[], None]) -> Value:
 
 
 def _worth_repeating(error: DBAPIError) -> bool:
-    """The connection broke or the database restarts (class 08, 57P), transactions got into each other's way (class 40), or the database
-    takes no writes for now: read-only before a standby is promoted (25006), its disk full (53100).
+    """Decide if a retry may succeed: connection broken or database restarting (class 08, 57P), transactions in conflict (class 40), or
+    no writes for now: read-only before a standby is promoted (25006), disk full (53100).
     """
     state = getattr(error.orig, "sqlstate", None)
     waits = state in {"25006", "53100"}

@@ -1,7 +1,7 @@
-"""Which kinds of jobs there are, and which functions their child processes run.
+"""Registry of the kinds of jobs, and of the functions that their child processes run.
 
-A kind is one record. What it runs is named by strings, `module:function`, and imported by the process that runs it: the orchestration by
-workers, compute functions by children. So the web service knows every kind and loads none of the learners.
+A kind is one record. It names what it runs by strings, `module:function`. The process that runs it imports it: workers the orchestration,
+children the compute functions. So the web service knows every kind and loads none of the learners.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from app.platform.jobs.context import JobContext
 
 KIND_MODULES = ("app.pipeline.kinds",)
-"""Modules that register kinds, as names: the platform lies below the phases and may not import them."""
+"""Modules that register kinds, as names: the platform is below the phases and may not import them."""
 
 Orchestration = Callable[["JobContext"], dict[str, Any]]
 ComputeFunction = Callable[[dict[str, Any], Path, "StepReport"], dict[str, Any]]
@@ -36,7 +36,7 @@ _REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 class Priority(IntEnum):
-    """Who goes first in the queue; the engine lets a missing priority overtake all others, so every kind has one."""
+    """Priority in the queue. The engine lets a missing priority overtake all others, so every kind has one."""
 
     INTERACTIVE = 10
     NORMAL = 50
@@ -114,13 +114,13 @@ def load_kinds() -> None:
 
 
 def kinds() -> dict[str, JobKind]:
-    """All kinds, by name, in the order of registration."""
+    """Return all kinds, by name, in the order of registration."""
     load_kinds()
     return dict(_kinds)
 
 
 def kind(name: str) -> JobKind:
-    """The kind of a name.
+    """Find a kind by its name.
 
     Raises:
         UnknownKind: there is none; the message lists those there are.
@@ -133,7 +133,7 @@ def kind(name: str) -> JobKind:
 
 
 def compute_reference(name: str) -> str:
-    """Where the compute function of a name is, as `module:function`; nothing of it is imported.
+    """Return the place of a compute function, as `module:function`; nothing of it is imported.
 
     Raises:
         UnknownKind: no kind has such a function.

@@ -18,7 +18,7 @@ ENDED = (JobStatus.SUCCEEDED, JobStatus.FAILED, JobStatus.CANCELLED)
 
 
 def get(db: Session, job_id: str) -> Job:
-    """A job with its steps.
+    """Load a job with its steps.
 
     Raises:
         NotFound: there is none.
@@ -30,7 +30,7 @@ def get(db: Session, job_id: str) -> Job:
 
 
 def locked(db: Session, job_id: str) -> Job:
-    """A job's row as it stands now, locked against other changes.
+    """Load a job's current row and lock it against other changes.
 
     Raises:
         NotFound: there is none.
@@ -50,7 +50,7 @@ def find(
     offset: int = 0,
     participants: Collection[int] | None = None,
 ) -> tuple[list[Job], int]:
-    """Jobs, newest first, with their steps, and how many there are in all; `participants`: of these alone."""
+    """Find jobs, newest first, with their steps, and their total number; `participants` limits them to these."""
     query = select(Job)
     if participants is not None:
         query = query.where(Job.participant_id.in_(participants))
@@ -66,13 +66,13 @@ def find(
 
 
 def of_kind(db: Session, participant_id: int, kind: str) -> Sequence[Job]:
-    """A participant's jobs of a kind, oldest first."""
+    """Load a participant's jobs of a kind, oldest first."""
     query = select(Job).where(Job.participant_id == participant_id, Job.kind == kind)
     return db.scalars(query.order_by(Job.created_at, Job.id)).all()
 
 
 def step(db: Session, job_id: str, key: str) -> JobStep:
-    """A step of a job; it must have been declared."""
+    """Load a step of a job; it must have been declared."""
     return db.scalars(select(JobStep).where(JobStep.job_id == job_id, JobStep.key == key)).one()
 
 
@@ -83,7 +83,7 @@ def add_event(db: Session, job_id: str, kind: str, data: dict[str, Any], step_ke
 
 
 def events_after(db: Session, job_id: str, last_id: int, limit: int = 500) -> list[JobEvent]:
-    """Events of a job that came after one, oldest first."""
+    """Load the events of a job that came after one, oldest first."""
     return list(db.scalars(select(JobEvent).where(JobEvent.job_id == job_id, JobEvent.id > last_id).order_by(JobEvent.id).limit(limit)))
 
 
@@ -105,24 +105,24 @@ def end_job(db: Session, job: Job, status: JobStatus, result: dict[str, Any] | N
 
 
 def live_ids(db: Session) -> list[str]:
-    """Jobs that have not ended."""
+    """List the ids of jobs that have not ended."""
     return list(db.scalars(select(Job.id).where(Job.status.in_(LIVE))))
 
 
 def cancel_requests(db: Session, job_ids: Sequence[str]) -> set[str]:
-    """Of these jobs, those that somebody wants cancelled or that have ended."""
+    """Find those of these jobs that a user wants cancelled or that have ended."""
     wanted = select(Job.id).where(Job.id.in_(job_ids), Job.cancel_requested_at.is_not(None) | Job.status.not_in(LIVE))
     return set(db.scalars(wanted))
 
 
 def ended_before(db: Session, job_ids: Sequence[str], days: float) -> set[str]:
-    """Of these ids, those of jobs that ended longer ago, or that are no jobs at all."""
+    """Find those of these ids whose jobs ended more than `days` ago, or that are no jobs at all."""
     keep = select(Job.id).where(Job.id.in_(job_ids), (Job.finished_at.is_(None)) | (Job.finished_at > func.now() - _seconds(86400 * days)))
     return set(job_ids) - set(db.scalars(keep))
 
 
 def beat(db: Session, worker_id: str, host: str, pid: int) -> float:
-    """Sign of life of a worker; returns the seconds since its last one by the database's clock (0 for a new worker)."""
+    """Record a worker's heartbeat; returns the seconds since its last one by the database's clock (0 for a new worker)."""
     row = db.execute(
         text(
             "with old as (select seen_at from worker where id = :id)"
@@ -142,7 +142,7 @@ def leave(db: Session, worker_id: str) -> None:
 
 
 def live_workers(db: Session, stale_s: float) -> list[Worker]:
-    """Workers seen within the last `stale_s` seconds, by the database's clock."""
+    """List the workers seen within the last `stale_s` seconds, by the database's clock."""
     return list(db.scalars(select(Worker).where(Worker.seen_at > func.clock_timestamp() - _seconds(stale_s)).order_by(Worker.id)))
 
 

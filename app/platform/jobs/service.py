@@ -29,7 +29,7 @@ _ROOT = Path(__file__).resolve().parents[3]
 
 
 def checked_params(kind: str, params: Mapping[str, Any]) -> BaseModel:
-    """Params as their kind reads them, with its defaults. Raises UnknownKind, Invalid: as `submit`."""
+    """Validate params by the schema of their kind, with its defaults. Raises UnknownKind, Invalid: as `submit`."""
     try:
         return registry.kind(kind).params.model_validate(dict(params))
     except ValidationError as error:
@@ -46,7 +46,7 @@ def submit(db: Session, kind: str, participant_id: int | None, params: dict[str,
         kind: a registered name.
         participant_id: whose data it works on.
         params: checked by the kind's schema.
-        created_by: who asks for it; stands in the audit trail beside everything that the job writes.
+        created_by: the user who asks for it; the audit trail names them with everything that the job writes.
 
     Raises:
         UnknownKind: there is no such kind.
@@ -73,7 +73,7 @@ def submit(db: Session, kind: str, participant_id: int | None, params: dict[str,
 
 
 def live_of(db: Session, participant_id: int) -> list[Job]:
-    """A participant's jobs that have not ended."""
+    """List a participant's jobs that have not ended."""
     found, _ = repository.find(db, participant_id, None, repository.LIVE, limit=_MANY)
     return [job for job in found if job.participant_id == participant_id]
 
@@ -96,13 +96,13 @@ def cancel(db: Session, job: Job, by: str) -> Job:
 
 
 def retry(db: Session, job: Job, by: str) -> Job:
-    """A new job of the same kind with the same params. Raises as `repeatable` does."""
+    """Start a new job of the same kind with the same params. Raises as `repeatable` does."""
     job = repeatable(db, job)
     return submit(db, job.kind, job.participant_id, job.params, by)
 
 
 def repeatable(db: Session, job: Job) -> Job:
-    """The job, its row locked, where it may be repeated.
+    """Return the job, its row locked, if it may be repeated.
 
     Raises:
         Conflict: it has not ended, or another one that has not ended repeats it already.
@@ -119,13 +119,13 @@ def repeatable(db: Session, job: Job) -> Job:
 
 
 def describe_event(event: JobEvent) -> dict[str, Any]:
-    """An event as the API and the event stream show it."""
+    """Describe an event as the API and the event stream show it."""
     return {"id": event.id, "kind": event.kind, "step": event.step_key, "at": event.at.isoformat(), "data": event.data}
 
 
 @lru_cache(maxsize=1)
 def code_version() -> str:
-    """Version and hash of the source that runs here: the same text means the same code, with git or without."""
+    """Return version and hash of the source that runs here: the same text means the same code, with git or without."""
     digest = hashlib.sha256()
     for package in ("app", "ml"):
         for path in sorted((_ROOT / package).rglob("*.py")):

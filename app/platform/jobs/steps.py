@@ -1,4 +1,4 @@
-"""How a worker runs one job: the orchestration around, the steps inside."""
+"""Run of one job by a worker: the orchestration around, the steps inside."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ KILLED_RETRIES = 1
 
 @dataclass
 class StopRequests:
-    """What the worker asks of the threads of one job: to end as cancelled, or to leave the job to another worker."""
+    """Requests of the worker to the threads of one job: to end as cancelled, or to leave the job to another worker."""
 
     cancelled: threading.Event = field(default_factory=threading.Event)
     abandoned: threading.Event = field(default_factory=threading.Event)
@@ -96,7 +96,7 @@ class JobSteps:
             return {"ok": False, "message": message}
 
     def workdir(self, key: str) -> Path:
-        """Folder of a step; the parts of a key are joined so that no step's folder lies within another's."""
+        """Return the folder of a step; the parts of a key are joined so that no step's folder is within another's."""
         return private_folder(private_folder(get_settings().jobs_dir) / self.ledger.job_id) / key.replace("/", "__")
 
 
@@ -131,7 +131,7 @@ class JobRunner:
                 self._changed.notify_all()
 
     def running(self) -> list[str]:
-        """Ids of the jobs that run here."""
+        """List the ids of the jobs that run here."""
         with self._changed:
             return list(self._running)
 
@@ -181,7 +181,7 @@ class JobRunner:
 
 
 def worded(error: Exception) -> str:
-    """One line for the user."""
+    """Phrase an error in one line for the user."""
     if isinstance(error, BetaloopError):
         return str(error)
     text = str(error.orig if isinstance(error, DBAPIError) else error).strip()
@@ -202,7 +202,7 @@ def _check_abandoned(requests: StopRequests) -> Callable[[], None]:
 
 
 def _as_json(value: dict[str, Any], what: str) -> dict[str, Any]:
-    """The value as a replay would see it, so that the first run sees the same."""
+    """Convert a value to what a replay would see, so that the first run sees the same."""
     if not isinstance(value, dict):
         raise TypeError(f"{what} must be a dict, not {type(value).__name__}")
     try:

@@ -27,14 +27,14 @@ _BATCH = 500
 async def job_events(
     job_id: str, last_event_id: str | None = None, still: Callable[[Session], bool] = lambda _: True
 ) -> AsyncIterator[str]:
-    """The events of a job as the lines of a `text/event-stream`, until it ends.
+    """Yield the events of a job as the lines of a `text/event-stream`, until it ends.
 
     First comes an event `job` without an id: the state of the job and its steps. Then every event after `last_event_id` (the header
     Last-Event-ID; anything but a number counts as none) under its kind: `status`, `step`, `progress`, `points`, `log`, `cancel`. Last comes
     `end` with the final state; the browser must then close its EventSource, which would connect again otherwise.
 
     Args:
-        still: whether whoever listens still may, asked every ASK_AGAIN_S; without an `end` the stream stops where not.
+        still: asked every ASK_AGAIN_S if the listener still may listen; if not, the stream stops without an `end`.
 
     Raises:
         NotFound: there is no such job.
@@ -65,7 +65,7 @@ async def job_events(
 
 
 def describe(job: Job) -> dict[str, Any]:
-    """State of a job with its steps, as the event stream and the terminal show it."""
+    """Describe the state of a job with its steps, as the event stream and the terminal show it."""
     return {
         "id": job.id,
         "kind": job.kind,
@@ -103,7 +103,7 @@ def _read(job_id: str, last_id: int | None) -> tuple[dict[str, Any], list[dict[s
 
 
 def shown(event: JobEvent) -> dict[str, Any]:
-    """An event as pages show it: what a step does without names of methods, and the time that is left in words."""
+    """Describe an event as pages show it: without names of methods, and with the remaining time in words."""
     described = describe_event(event)
     data = dict(described["data"])
     if "message" in data:

@@ -1,4 +1,4 @@
-"""What a step is called where anybody reads it: its title and messages without names of methods.
+"""Titles and messages of steps for all readers, without names of methods.
 
 The stored title names the method, for engineers: their folds and the interface give it as it is.
 """
@@ -29,18 +29,18 @@ _PLAIN: tuple[tuple[re.Pattern[str], str], ...] = tuple(
 _OF_A_STEP = re.compile(r"Step (?P<key>\S+) failed: (?P<message>.*)", re.S)
 """As `StepFailed` words what ended a job."""
 _UNFORESEEN = re.compile(r"\A[A-Za-z_]\w*(?:: |\Z)|\b\w+(?:Error|Exception)\b")
-"""Of an error that is none of our own (`app.platform.jobs.steps.worded`): the name of its class comes first, or stands in what holds it."""
+"""Text of an error that is not our own (`app.platform.jobs.steps.worded`): it begins with the name of its class, or contains one."""
 
 
 def plain_words(text: str) -> str:
-    """A step's title, its message, or both (`title: message`), without names of methods."""
+    """Remove names of methods from a step's title, its message, or both (`title: message`)."""
     for stored, plain in _PLAIN:
         text = stored.sub(plain, text)
     return text
 
 
 def numbered(titles: Sequence[str]) -> list[str]:
-    """The plain titles of a job's steps; those that differ by their method alone are counted: `..., method 2 of 5`."""
+    """Return the plain titles of a job's steps; those that differ only by method are counted: `..., method 2 of 5`."""
     plain = [plain_words(title) for title in titles]
     of, seen = Counter(plain), Counter[str]()
     shown = []
@@ -51,12 +51,12 @@ def numbered(titles: Sequence[str]) -> list[str]:
 
 
 def reason(message: str) -> str:
-    """What an error of our own says, without names of methods; nothing of any other, which engineers alone can read."""
+    """Return our own error's text without names of methods; nothing of any other error, which only engineers can read."""
     return "" if _UNFORESEEN.search(message) else plain_words(message)
 
 
 def failure(error: str, titles: Mapping[str, str] | None = None) -> str:
-    """Why a job or a step failed, for who reads results: our own errors in their words, of any other which step it was.
+    """Explain to readers of results why a job or a step failed: our own errors in their words; for others, which step it was.
 
     The stored text names classes and methods, for engineers: their fold and the interface give it as it is.
 

@@ -46,7 +46,7 @@ class JobView:
 
 
 def look(job_id: str) -> JobView:
-    """The job as it stands.
+    """Read the current state of the job.
 
     Raises:
         NotFound: there is none.
@@ -60,7 +60,7 @@ def look(job_id: str) -> JobView:
 
 
 def watch(job_id: str, poll_s: float = POLL_S) -> Iterator[JobView]:
-    """The job again and again, whenever it changed; the last one has ended.
+    """Yield the state of the job whenever it changed; the last one has ended.
 
     Raises:
         NotFound: there is none.
@@ -100,7 +100,7 @@ def show_progress(job_id: str, console: Console | None = None) -> JobView:
 
 
 def follow(job_id: str, wait: bool, as_json: bool) -> None:
-    """End of a command that starts a job: show its progress where `wait`, and print how it stands.
+    """Finish a command that starts a job: show its progress if `wait`, and print its status.
 
     Raises:
         typer.Exit: 1 where it failed or was cancelled.

@@ -33,7 +33,7 @@ _ACTOR = "worker"
 
 @dataclass(frozen=True)
 class Pace:
-    """How often a worker does what, seconds; tests run faster."""
+    """Intervals of a worker's tasks, seconds; tests run faster."""
 
     beat_s: float = 5.0
     stale_s: float = 60.0
@@ -66,7 +66,7 @@ class Identity:
         """Take the name again if the connection was lost.
 
         Raises:
-            IdentityLost: somebody else has it now.
+            IdentityLost: another worker has it now.
         """
         try:
             if self._connection is not None:
@@ -103,7 +103,7 @@ class WorkerMonitor:
         self._next_beat = self._next_housekeeping = 0.0
 
     def look(self) -> None:
-        """One round; called every CANCEL_POLL_S.
+        """Do one round; called every CANCEL_POLL_S.
 
         Raises:
             IdentityLost: the worker must stop.
@@ -187,7 +187,7 @@ class WorkerMonitor:
 
 
 def run_worker(slots: int, stop_event: threading.Event, pace: Pace | None = None) -> None:
-    """Work until `stop_event` is set; then kill the children and leave unfinished jobs to whoever comes next.
+    """Run jobs until `stop_event` is set; then kill the children and leave unfinished jobs to the next worker.
 
     Args:
         slots: compute steps to run side by side.

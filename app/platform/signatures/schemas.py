@@ -10,14 +10,14 @@ from app.platform.web.schemas import Model, Text
 
 
 class Signing(Model):
-    """Who signs shows anew who they are."""
+    """Credentials of a signer, who proves their identity again."""
 
     password: Text = Field(max_length=1000, description="The signer's own, asked for again.")
     code: Text = Field("", max_length=40, description="Of the signer's second factor, or a recovery code; empty where there is none.")
 
 
 class SignatureOut(Model):
-    """Who signed, when, and with which meaning."""
+    """Signature: its signer, time and meaning."""
 
     signer: str
     signed_at: datetime

@@ -197,7 +197,7 @@ def _sealing(path: Path, key: bytes) -> Iterator[SealedWriter]:
 
 
 def _program(name: str) -> str:
-    """A PostgreSQL client program: the newest of the wheel's and the machine's own, for an older one cannot read a newer server."""
+    """Find a PostgreSQL client program: the newer of the wheel's and the machine's, for an older one cannot read a newer server."""
     found = [str(wheel_programs() / name), shutil.which(name)]
     return max((p for p in found if p), key=_major_version)
 

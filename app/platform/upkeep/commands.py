@@ -17,7 +17,7 @@ from app.settings import get_settings
 app = typer.Typer(no_args_is_help=True)
 
 KeyFile = Annotated[
-    Path, typer.Option(help="File with the key of the backup (`betaloop backup-key`); neither beside it nor in the data folder.")
+    Path, typer.Option(help="File with the key of the backup (`betaloop backup-key`); neither next to it nor in the data folder.")
 ]
 
 
@@ -30,7 +30,7 @@ def migrate() -> None:
 
 @app.command(epilog="Example: betaloop where")
 def where(as_json: AsJson = False) -> None:
-    """Tell where the database, the stored files and the keys of this installation lie; nothing is started."""
+    """Show the places of the database, the stored files and the keys of this installation; nothing is started."""
     data_dir = get_settings().data_dir.resolve()
     result = {"data_folder": str(data_dir), "database": database_place()}
     result |= {"files": str(data_dir / "files"), "keys": str(data_dir / "secrets")}
@@ -65,7 +65,7 @@ def restore(folder: Annotated[Path, typer.Argument(help="Folder of the backup.")
 
 
 def _damaged(hashes: list[str], rest: str) -> list[str]:
-    """Lines that name stored files which are missing or damaged; none where all are whole."""
+    """List the stored files that are missing or damaged, as lines of text; none if all are whole."""
     if not hashes:
         return []
     hint = f"{rest} Send their files once more, or take them from an older backup; `betaloop doctor --hashes` names what is still missing."

@@ -17,10 +17,10 @@ LEAST_INT, MOST_INT = -(2**31), 2**31 - 1
 
 
 class _FitsTheDatabase:
-    """Bounds a whole number where nobody has bounded it closer.
+    """Default bounds of a whole number that states no narrower ones.
 
-    No validator of its own: pydantic cannot look into one, and would publish the bounds of a field as they stand in the code (`ge`, `le`),
-    which no reader of a JSON schema knows. No `Field(ge=…, le=…)` either: it would silently replace the bounds that a field states.
+    A validator of its own would make pydantic publish a field's bounds by their names in the code (`ge`, `le`), which JSON schema lacks.
+    It is no `Field(ge=…, le=…)` either: it would silently replace the bounds that a field states.
     """
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -44,7 +44,7 @@ Bool = Annotated[bool, Strict()]
 
 
 def sensible_time(value: datetime) -> datetime:
-    """UTC, and within the years that any recording can have; offsets would otherwise carry a time out of the calendar.
+    """Convert a time to UTC and check that its year is plausible; an offset could otherwise carry it out of the calendar.
 
     Raises:
         ValueError: a year outside 1990-2200.
@@ -61,7 +61,7 @@ Moment = Annotated[datetime, AfterValidator(sensible_time)]
 
 
 def sensible_day(value: date) -> date:
-    """A day within the same years; a year that was mistyped would stand before, or after, every other visit.
+    """Check that a day's year is plausible; a mistyped year would sort before, or after, every other visit.
 
     Raises:
         ValueError: a year outside 1990-2200.
@@ -96,7 +96,7 @@ class Page(BaseModel, Generic[Item]):
 
 
 class Paging(BaseModel):
-    """Which page."""
+    """Page of a list: its limit and offset."""
 
     limit: int
     offset: int
@@ -125,5 +125,5 @@ class Problem(BaseModel):
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI entries for the problems that a route may answer with."""
+    """Build the OpenAPI entries for the problems that a route may answer with."""
     return {s: {"model": Problem, "content": {"application/problem+json": {}}} for s in statuses}

@@ -43,8 +43,7 @@ _AUTOGROUP, _AUTOGROUP_TRIES = Path("/proc/self/autogroup"), 50
 _AUTOGROUPS_ON = Path("/proc/sys/kernel/sched_autogroup_enabled")
 
 Cause = Literal["memory", "time", "full", "killed", "error"]
-"""Why a call gave no result: it met its limit of memory or time, the disk is full, its process was killed or broke down, or its function
-raised."""
+"""Reason for a missing result: the call reached its limit of memory or time, the disk is full, its process was killed, or it raised."""
 LEAST_ROOM = 1 << 16
 """Bytes: a disk with less is full."""
 NO_ROOM = 28
@@ -54,7 +53,7 @@ FULL_DISK = "There is no room left on the disk of the machine that computes. Mak
 
 @dataclass(frozen=True)
 class ChildLimits:
-    """What one child may take of the machine.
+    """Limits of what one child may take of the machine.
 
     Attributes:
         memory_mb: data of the process, what it has imported included, MiB.
@@ -70,12 +69,12 @@ class ChildLimits:
 
 
 def params_hash(name: str, params: dict[str, Any]) -> str:
-    """SHA-256 of a call; equal for equal params whatever the order of their keys."""
+    """Compute the SHA-256 of a call; equal for equal params whatever the order of their keys."""
     return hashlib.sha256(json.dumps([name, params], sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
 def stored_result(workdir: Path, sha256: str) -> dict[str, Any] | None:
-    """The result that an earlier run of the same call left in its folder, or None."""
+    """Read the result that an earlier run of the same call left in its folder, or None."""
     try:
         stored = json.loads((workdir / "result.json").read_bytes())
     except FileNotFoundError:
@@ -87,14 +86,14 @@ def stored_result(workdir: Path, sha256: str) -> dict[str, Any] | None:
 
 
 def too_much_memory(limit_mb: int) -> str:
-    """What the user reads when a step outgrew its limit."""
+    """Phrase the message for a step that outgrew its memory limit."""
     return (
         f"The step needs more memory than its limit of {limit_mb} MiB. Make the job smaller or raise BETALOOP_JOB_MEMORY_MB for the worker."
     )
 
 
 def main(name: str, workdir: Path) -> int:
-    """Run one call; 0 when it gave a result, NO_ROOM where the disk is full, else 1: the reason stands in result.json."""
+    """Run one call and return its exit code: 0 for a result, NO_ROOM for a full disk, else 1, with the reason in result.json."""
     die_with_parent()
     os.umask(0o077)  # checkpoints and results are of participants
     call = json.loads((workdir / "params.json").read_bytes())
@@ -108,7 +107,7 @@ def main(name: str, workdir: Path) -> int:
     except Exception as error:
         # memory to write the message with, when it was the memory that ran out
         resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-        # stderr is the step's log, which shows the traceback to those who can read one; it may lie on a disk that is full
+        # stderr is the step's log, which shows the traceback to those who can read one; its disk may be full
         with suppress(OSError):
             if limits.quotes:
                 traceback.print_exc()
@@ -128,7 +127,7 @@ def main(name: str, workdir: Path) -> int:
 
 
 def places(error: BaseException) -> str:
-    """The kind of an error and the lines of code that it passed, without the values that it may quote."""
+    """Format the kind of an error and the lines of code that it passed, without the values that it may quote."""
     return "".join([*traceback.format_tb(error.__traceback__), type(error).__name__, "\n"])
 
 
@@ -168,7 +167,7 @@ def _cause(error: Exception, workdir: Path) -> Cause:
 
 
 def _worded(error: Exception, limits: ChildLimits) -> str:
-    """One line for the user."""
+    """Phrase an error in one line for the user."""
     if _lacked_memory(error):
         return too_much_memory(limits.memory_mb)
     text = str(error).strip()
@@ -194,14 +193,14 @@ def die_with_parent() -> None:
 
 
 def _watch_parent(parent: int) -> None:
-    """The same where the kernel has no such service."""
+    """Kill this process when its parent dies, on systems whose kernel offers no such service."""
     while os.getppid() == parent:
         time.sleep(0.5)
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _be_modest(limits: ChildLimits) -> None:
-    """Step back behind the web service, offer ourselves first when the machine runs out of memory, and leave no image of it on the disk."""
+    """Lower this process's priority, let it be killed first when memory runs out, and write no core dump."""
     step_back(limits.niceness)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     score = Path("/proc/self/oom_score_adj")
@@ -210,10 +209,10 @@ def _be_modest(limits: ChildLimits) -> None:
 
 
 def step_back(niceness: int) -> None:
-    """Be so much nicer, 0 to 19, than who started us, and have the kernel count it against every other process.
+    """Raise this process's niceness by `niceness`, 0 to 19, over its starter's, and apply it against every other process.
 
-    A fork of a process that has stepped back already adds only what is missing. Linux (sched(7), "The autogroup feature") shares the
-    processor out among sessions first: within ours, of one process, niceness alone would count against nobody.
+    A fork of a process that has stepped back already adds only what is missing. Linux (sched(7), "The autogroup feature") divides the
+    processor among sessions first. Ours has one process, in which niceness alone has no effect.
     """
     if niceness <= 0:
         return
@@ -226,7 +225,7 @@ def step_back(niceness: int) -> None:
             _AUTOGROUP.write_text(str(nice))
             return
         except BlockingIOError:
-            time.sleep(0.1)  # whoever is not root may do this once in a tenth of a second
+            time.sleep(0.1)  # users other than root may do this once in a tenth of a second
         except OSError as error:  # as in a container whose /proc is read-only
             sys.stderr.write(f"this step does not step back behind other processes: {error}\n")
             return
@@ -234,7 +233,7 @@ def step_back(niceness: int) -> None:
 
 
 def _lock(workdir: Path) -> int:
-    """Hold the folder alone: a child of a worker that was given up too early may still be at it for a moment."""
+    """Lock the folder: a child of a worker that was given up too early may still use it for a moment."""
     fd = os.open(workdir / ".lock", os.O_RDWR | os.O_CREAT, 0o600)
     deadline = time.monotonic() + _LOCK_WAIT_S
     while True:

@@ -1,12 +1,12 @@
 """A process that has imported what its children need, and forks one child per order.
 
 It is started as `python -m app.platform.jobs.children.fork_server NICENESS NAME...`.
-A fresh interpreter needs seconds until the decoders are imported; a fork of this process needs some milliseconds, and has a memory of its
-own all the same. It runs one thread, so that a fork finds no lock held, and holds no data: orders go to the children unread.
+A fresh interpreter needs seconds until the decoders are imported. A fork of this process needs some milliseconds, and still has its own
+memory. It runs one thread, so that a fork finds no lock taken, and holds no data: orders go to the children unread.
 
-Each order is one byte on the socket at standard input, with three descriptors: a socket of its own, the log and the pipe of reports. The
-order itself, JSON, comes on the order's socket, which answers `{"pid": ...}` at once and `{"status": ...}`, as of `waitpid`, at the end. An
-order that names a `module` has it imported first, once, and its `prepare()` called where it has one: torch alone takes five seconds.
+Each order is one byte on the socket at standard input. With it come three descriptors: the order's socket, the log and the pipe of
+reports. The order itself, JSON, comes on its socket, which answers `{"pid": ...}` at once and `{"status": ...}`, as of `waitpid`, at the
+end. If an order names a `module`, that is imported first, once, and its `prepare()` called if it has one: torch alone takes five seconds.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _leave_to_itself() -> None:
-    """What is loaded stays: the collector would touch, and so copy, every page that the children share."""
+    """Freeze what is loaded: the garbage collector would touch, and so copy, every page that the children share."""
     gc.collect()
     gc.freeze()
 
@@ -83,7 +83,7 @@ def _own_ranges() -> list[tuple[int, int]]:
 
 
 class _Server:
-    """Forks children and tells how they ended."""
+    """Server that forks children and reports how they ended."""
 
     def __init__(self, orders: socket.socket) -> None:
         self._orders = orders
@@ -97,7 +97,7 @@ class _Server:
         signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
 
     def serve(self) -> None:
-        """Until the other end of the socket is closed."""
+        """Serve orders until the other end of the socket is closed."""
         while True:
             ready, _, _ = select.select([self._orders.fileno(), self._awake], [], [])
             if self._awake in ready:
@@ -123,7 +123,7 @@ class _Server:
         _tell(order, {"pid": pid})
 
     def _load(self, module: str) -> None:
-        """Import a module of compute functions for the children to come; what goes wrong with it, its child tells in its own log."""
+        """Import a module of compute functions for later children. An error is also reported by the child, in its own log."""
         if module in self._loaded:
             return
         self._loaded.add(module)
@@ -169,14 +169,14 @@ class _Server:
                 sys.stdout.flush()
                 sys.stderr.flush()
             finally:
-                os._exit(status)  # also where the log lies on a full disk: the fork must not go on as a second server
+                os._exit(status)  # also if the log's disk is full: the fork must not go on as a second server
 
 
 def _tell(order: socket.socket, words: dict[str, int]) -> None:
     try:
         order.sendall(json.dumps(words).encode() + b"\n")
     except OSError:
-        traceback.print_exc()  # whoever ordered has gone
+        traceback.print_exc()  # the process that ordered has gone
 
 
 if __name__ == "__main__":

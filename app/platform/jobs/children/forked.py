@@ -25,8 +25,8 @@ class ForkedProcesses(ChildProcesses):
 
     Args:
         prepared: what the server imports (`module`) and calls (`module:function`) before it forks.
-        learns: whether it also imports the module of each call before it forks the first child for it, and calls its `prepare()` where it
-            has one, so that later children of that module find everything loaded.
+        learns: whether it also imports the module of each call before its first child, and calls its `prepare()` if there is one. Later
+            children of that module then find everything loaded.
         niceness: how far the server steps back behind other processes while it imports, 0 to 19; children go by their limits.
         idle_s: time without a call after which the server ends, seconds.
     """
@@ -39,7 +39,7 @@ class ForkedProcesses(ChildProcesses):
         self._one_at_a_time = threading.Lock()
         self._server: subprocess.Popen[bytes] | None = None
         self._to_server: socket.socket | None = None
-        self._counting = threading.Lock()  # never held while the server loads, which takes seconds
+        self._counting = threading.Lock()  # never taken while the server loads, which takes seconds
         self._calls = 0
         self._used_at = 0.0
         self._alarm: threading.Timer | None = None
@@ -156,13 +156,13 @@ class ForkedChild:
         return self._returncode
 
     def poll(self) -> int | None:
-        """Its exit code, negative for a signal; None while it runs."""
+        """Return its exit code, negative for a signal; None while it runs."""
         if self._returncode is None and _readable(self._order):
             self.wait()
         return self._returncode
 
     def wait(self) -> int:
-        """Its exit code, when it has ended."""
+        """Wait for its end and return its exit code."""
         if self._returncode is None:
             line = self._lines.readline()
             # without a last word the server has been killed, and the child with it

@@ -1,4 +1,4 @@
-"""Functions that work on files of strangers, each call in a forked child with limits of its own: what they do to it harms nobody else."""
+"""Functions that work on untrusted files, each call in a forked child with its own limits, so that a crash harms no other process."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from app.platform.jobs.children.supervisor import ChildMessages, ComputeCall
 from app.settings import get_settings
 
 PREPARED = ("app.ingest.uploads.compute:prepare", f"{MODULE}:use_large_pages")
-"""What children are to have ready, as names: the platform lies below the phases and may not import them. A file takes two forks."""
+"""Names of what children import in advance: the platform is below the phases and may not import them. A file takes two forks."""
 IDLE_S = 120.0
 """Time after the last file at which the process that forks readers ends, seconds: files of one sitting come within two minutes."""
 WALL_PER_CPU = 5
@@ -97,7 +97,7 @@ def prepare() -> None:
 
 
 def server_pid() -> int | None:
-    """Number of the process that forks children; None while there is none."""
+    """Return the number of the process that forks children; None while there is none."""
     return _children()[0].server_pid
 
 

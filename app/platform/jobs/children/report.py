@@ -1,4 +1,4 @@
-"""How a compute function reports while it works: progress, learning-curve points and log lines, as JSON lines on a pipe."""
+"""Reports of a compute function while it works: progress, learning-curve points and log lines, as JSON lines on a pipe."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ class StepReport:
     def point(self, x: float, **values: float) -> None:
         """Add one point to the learning curves named by the keywords; after a resumed step the last point of an x counts.
 
-        A value that is no finite number is left out (JSON has none), as a gap in its curve.
+        A value that is no finite number is omitted (JSON has none), as a gap in its curve.
         """
         finite = {name: float(value) for name, value in values.items() if math.isfinite(value)}
         self._points.append({"x": float(x), "values": finite})
         self._maybe_send()
 
     def curves(self, x_end: float, prefix: str = "") -> Report:
-        """This report for a computation of `ml`: fractions become progress, numbers points of learning curves from 0 to `x_end`."""
+        """Wrap this report for a computation of `ml`: fractions become progress, numbers points of learning curves from 0 to `x_end`."""
 
         def report(fraction: float, message: str = "", **numbers: float) -> None:
             self.progress(fraction, message or None)
@@ -90,7 +90,7 @@ class StepReport:
 
 
 def pipe_sender(fd: int) -> Callable[[dict[str, Any]], None]:
-    """A `send` that writes JSON lines to a file descriptor."""
+    """Return a `send` that writes JSON lines to a file descriptor."""
     pipe = os.fdopen(fd, "w", encoding="utf-8", buffering=1)
 
     def send(message: dict[str, Any]) -> None:

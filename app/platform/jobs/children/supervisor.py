@@ -52,7 +52,7 @@ class ComputeCall:
 
 @dataclass
 class ChildMessages:
-    """What a child reported since the last look."""
+    """Reports of a child since the last look."""
 
     progress: float | None = None
     message: str | None = None
@@ -85,10 +85,10 @@ class Child(Protocol):
         """As of `poll`, when it was asked last."""
 
     def poll(self) -> int | None:
-        """Its exit code, negative for a signal; None while it runs."""
+        """Return its exit code, negative for a signal; None while it runs."""
 
     def wait(self) -> int:
-        """Its exit code, when it has ended."""
+        """Wait for its end and return its exit code."""
 
     def kill(self) -> None:
         """End it."""
