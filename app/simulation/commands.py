@@ -13,7 +13,7 @@ from app.platform.terminal import ACTOR, AsJson, show
 
 
 def simulate(
-    visits: Annotated[int | None, typer.Option(min=2, max=60, help="Visits of each participant; the preset's when left out.")] = None,
+    visits: Annotated[int | None, typer.Option(min=2, max=60, help="Visits of each participant; the preset's by default.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of everything random in the study.")] = 0,
     participants: Annotated[str, typer.Option(help="Codes of synthetic participants, with commas between them.")] = "P1,P2,P3,P4",
     preset: Annotated[str, typer.Option(help="'quick': for a first look; 'full': about the paper's trial time.")] = "quick",
@@ -40,7 +40,7 @@ def simulate(
 def demo_files(
     folder: Annotated[Path, typer.Argument(help="Where the files go: one for each participant.")],
     participants: Annotated[str, typer.Option(help="Codes with commas between them.")] = "P2,P3,P4",
-    seed: Annotated[int | None, typer.Option(min=0, help="Of what is learned; the demo's own when left out.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of what is learned; the demo's own by default.")] = None,
 ) -> None:
     """Learn the policies of the demo's participants on their earlier visits, and hold the sessions that tested them; takes minutes."""
     from app.simulation.demo.making import make

@@ -1,4 +1,4 @@
-"""What a simulated study consists of: its size, its visit days and what is remembered between runs. Nothing in here touches the service."""
+"""Design of a simulated study: its size, its visit days and its state between runs. Nothing in here touches the service."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ VERSION: Final = 2
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """How large a simulated study is.
+    """Size of a simulated study.
 
     Attributes:
         visits: visits when none are asked for. random_visits: the first ones, which only collect, with the random controller.
@@ -67,18 +67,18 @@ class Design:
     preset: Preset
 
     def expected_sessions(self, visit: int) -> int:
-        """Sessions of a visit's day, as it will be planned."""
+        """Count the sessions of a visit's day, as it will be planned."""
         if visit <= self.preset.random_visits:
             return self.preset.random_sessions + 2  # a cDBS session before them, one without stimulation after
         return 4 * self.preset.policies_per_kind  # n policies, n - 1 cDBS sessions between them, one without stimulation
 
     def fine_tunes(self, visit: int) -> bool:
-        """Whether the job before a visit goes on from the best tested policies: every second one; the first trains from scratch."""
+        """Decide if the job before a visit continues from the best tested policies: every second one; the first trains from scratch."""
         return (visit - self.preset.random_visits) % 2 == 0
 
 
 def design(participants: Sequence[str], visits: int | None, seed: int, preset: str) -> Design:
-    """The study that a command asks for.
+    """Build the study that a command asks for.
 
     Raises:
         Invalid: a participant that is not simulated or named twice, an unknown preset, or fewer visits than two.
@@ -97,13 +97,13 @@ def design(participants: Sequence[str], visits: int | None, seed: int, preset: s
 
 
 def visit_day(begun: dt.date, visits: int, number: int) -> dt.date:
-    """The date of a visit: a month apart, the last of `visits` two weeks before the study was begun."""
+    """Compute the date of a visit: a month apart, the last of `visits` two weeks before the study was begun."""
     return begun - SINCE_LAST_VISIT - (visits - number) * BETWEEN_VISITS
 
 
 @dataclass(frozen=True)
 class Remembered:
-    """What a study that goes on must not change; `first` is the date of the first visit."""
+    """State of a study that its later runs must not change; `first` is the date of the first visit."""
 
     seed: int
     preset: dict[str, Any]
@@ -111,7 +111,7 @@ class Remembered:
 
 
 def remember(path: Path, wanted: Design, today: dt.date) -> Remembered:
-    """The study of this data folder, written down when it is begun.
+    """Read the study of this data folder, or record it when it is begun.
 
     Raises:
         Conflict: another study was begun here.

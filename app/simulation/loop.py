@@ -52,17 +52,17 @@ class Progress(Protocol):
     """Called with how far the loop is."""
 
     def say(self, code: str, what: str) -> None:
-        """What is going on."""
+        """Report the present activity."""
 
     def session_held(self, code: str) -> None:
-        """One more session is in the study."""
+        """Count one more session of the study."""
 
     def job(self, code: str, share: float) -> None:
-        """How far the present job is, 0-1; 1 ends it."""
+        """Report the progress of the present job, 0-1; 1 ends it."""
 
 
 def refuse_foreign(participant: Participant, caller: Caller) -> None:
-    """Raises Conflict for a participant that the simulation did not enrol."""
+    """Raise Conflict for a participant that the simulation did not enrol."""
     enrolled_by = participant.settings[0].created_by
     if enrolled_by != caller.label:
         raise Conflict(
@@ -86,7 +86,7 @@ class ParticipantLoop:
     Args:
         design: the study. remembered: its seed and its first day. caller: the simulated engineer and coordinator, who uploads and drafts.
         signer: the simulated clinician who signs what the other drafted.
-        progress: called with how far the loop is. check_worker: raises when nobody works on jobs any more.
+        progress: called with how far the loop is. check_worker: raises when no worker runs any more.
     """
 
     code: str
@@ -98,7 +98,7 @@ class ParticipantLoop:
     check_worker: Callable[[], None]
 
     def run(self) -> None:
-        """Go on from wherever the study stands.
+        """Continue the study from its present state.
 
         Raises:
             Conflict: the participant exists, and was not enrolled by this simulation. BetaloopError: a job failed.
@@ -142,7 +142,7 @@ class ParticipantLoop:
                 self._hold(db, visit, day, Path(tablet))
 
     def _hold(self, db: Session, visit: Visit, day: dt.date, tablet: Path) -> None:
-        """Hold the sessions of the signed plan that have no recording yet, and confirm all into their slots in one step.
+        """Run the sessions of the signed plan that have no recording yet, and confirm all into their slots in one step.
 
         Raises:
             BetaloopError: a planned session is missing although the day is over, which would be a fault of the simulator.
@@ -164,7 +164,7 @@ class ParticipantLoop:
                 the_day.tremor(db, row.session, row.line.item, row.line.start_minute)
 
     def _learn(self, db: Session, person: Participant, number: int) -> None:
-        """The job before a visit: the one that was begun for it, or a new one; waits for its end."""
+        """Run the job before a visit, the one already begun for it or a new one, and wait for its end."""
         wanted = number - self.design.preset.random_visits
         rows = [job for kind in ("pipeline", NEXT_GENERATION) for job in jobs.of_kind(db, person.id, kind)]
         begun = sorted(
@@ -215,9 +215,9 @@ class ParticipantLoop:
         planning.draft_plan(db, visit, draft.model_copy(update={"total_minutes": max(needed, draft.total_minutes)}), self.caller)
 
     def _chosen(self, db: Session, person: Participant) -> tuple[list[int], list[OverrideIn]]:
-        """The first policies of each kind in the ranking, with one to test with care at most.
+        """Choose the first policies of each kind in the ranking, at most one of them to test with care.
 
-        Unsafe ones fill what would stay empty, with a reason: nobody is harmed here, and an arm without sessions measures nothing.
+        Unsafe ones fill empty places, with a reason: no person is harmed here, and an arm without sessions measures nothing.
         """
         found = current(db, person, self.caller).assessment
         fit = [a for a in found.candidates if a.decided and not a.policy.retired_reason]
@@ -244,7 +244,7 @@ class ParticipantLoop:
         found = slots.compare(db, visit, self.caller)
         if found.missing:
             positions = ", ".join(str(line.item.position) for line in found.missing)
-            raise BetaloopError(f"Visit {visit.number} of {self.code} was held without its planned sessions {positions}.")
+            raise BetaloopError(f"Visit {visit.number} of {self.code} took place without its planned sessions {positions}.")
         if found.waiting:
             slots.confirm(db, visit, self.caller)
             db.commit()

@@ -1,4 +1,4 @@
-"""What a simulated study prints at its end: the paper's table of trial time."""
+"""Report of a simulated study at its end: the paper's table of trial time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from app.study import repository as study
 
 
 def as_table(db: Session, codes: Sequence[str], caller: Caller) -> Table:
-    """Minutes per controller and participant, sessions in brackets."""
+    """Tabulate the minutes per controller and participant, with the number of sessions in brackets."""
     trial = _trial(db, codes, caller)
     table = Table(title="Trial time, minutes (sessions)", caption="Synthetic participants, not fitted to patients.")
     table.add_column("Participant")
@@ -26,7 +26,7 @@ def as_table(db: Session, codes: Sequence[str], caller: Caller) -> Table:
 
 
 def as_dict(db: Session, codes: Sequence[str], caller: Caller) -> dict[str, Any]:
-    """The same for a program."""
+    """Return minutes and sessions per participant and controller, for a program."""
     return {
         row.participant: {t.controller.value: {"minutes": t.minutes, "sessions": t.sessions} for t in row.tested}
         for row in _trial(db, codes, caller).rows

@@ -24,9 +24,9 @@ from app.study import repository as study
 from app.tables.accounts import Role
 
 ACCOUNT = "simulated-clinician@simulation.example"
-"""Enrols, uploads and drafts; nobody can sign in with it, for its password is thrown away."""
+"""Account that enrols, uploads and drafts; no person can sign in with it, for its password is thrown away."""
 SIGNER = "simulated-second-clinician@simulation.example"
-"""Signs what the other account drafted; its password is drawn anew by every run and thrown away after it."""
+"""Account that signs what the other drafted; every run draws a new password and throws it away afterwards."""
 _LOCK = "betaloop simulated study"
 _JOB_UNITS = 5.0
 """A job counts on the bar as this many sessions."""
@@ -63,7 +63,7 @@ def _account() -> Caller:
 
 
 def _signer() -> Signer:
-    """The second person, with a new password for this run."""
+    """Find or add the second person, with a new password for this run."""
     password = secrets.token_urlsafe(32)
     with transaction("simulated study") as db:
         user = accounts_repository.user_by_email(db, SIGNER)
@@ -83,7 +83,7 @@ def _refuse_foreign(design: Design, caller: Caller) -> None:
 
 @contextmanager
 def _alone() -> Iterator[None]:
-    """Hold the database's lock of simulations; it ends with this process."""
+    """Take the database's lock of simulations; it ends with this process."""
     with get_engine().connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
         if not connection.scalar(text("select pg_try_advisory_lock(hashtextextended(:name, 0))"), {"name": _LOCK}):
             raise Conflict("A simulated study is running on this database already.", "Wait for its end, or stop it first.")
@@ -95,7 +95,7 @@ def _alone() -> Iterator[None]:
 
 @contextmanager
 def _worker(slots: int) -> Iterator[Callable[[], None]]:
-    """A worker in a thread of this process; yields a function that raises when it has ended."""
+    """Run a worker in a thread of this process; yield a function that raises when it has ended."""
     stop = threading.Event()
     failure: list[Exception] = []
 
@@ -140,7 +140,7 @@ class _Bars:
         self._progress.stop()
 
     def say(self, code: str, what: str) -> None:
-        """What is going on."""
+        """Show the present activity."""
         if not self._progress.console.is_terminal and self._said.get(code) != what:
             self._progress.console.print(f"{code}, {what}", highlight=False)  # bars need a terminal; a log file gets lines
         self._said[code] = what
@@ -148,11 +148,11 @@ class _Bars:
         self._progress.update(self._tasks[code], what=what)
 
     def session_held(self, code: str) -> None:
-        """One more session is in the study."""
+        """Count one more session of the study."""
         self._advance(code, 1.0)
 
     def job(self, code: str, share: float) -> None:
-        """How far the present job is, 0-1; 1 ends it."""
+        """Show the progress of the present job, 0-1; 1 ends it."""
         self._progress.update(self._tasks[code], completed=self._done[code] + _JOB_UNITS * share)
         if share >= 1.0:
             self._advance(code, _JOB_UNITS)

@@ -53,8 +53,8 @@ class VisitDay:
     """The sessions of one visit.
 
     Args:
-        seed: of the study. first: when the first session begins. tablet: folder of the day's tablet; a new one after a kill, so that a
-            session which was cut is run again from its beginning, with the same numbers. caller: who runs the day.
+        seed: of the study. first: start of the first session. caller: who runs the day. tablet: folder of the day's tablet, new after a
+            kill. A session cut short then runs again from its beginning, with the same numbers.
     """
 
     visit: Visit
@@ -97,13 +97,13 @@ class VisitDay:
         """Enter the tremor of a confirmed session, as the watch gave it; what is known already stays."""
         if session.qoc is not None and session.qoc.value(BY_FIELD["tremor_percent"]) is not None:
             return
-        # what was held before a stop is run again, on a tablet of its own: its time lies before that of the day's
+        # a session done before a stop is run again, on a tablet of its own: its time is before that of the day's
         percent = self._run(db, item, start_minute, self.tablet / f"again-{item.position}").outcomes.qoc.tremor_percent
         values = {"tremor_percent": percent, "sure": ["tremor_percent"], "reason": "as the simulated watch gave it"}
         study.record_qoc(db, session, QocIn.model_validate(values), self.caller)
 
     def _run(self, db: Session, item: PlanItem, start_minute: float, tablet: Path) -> Held:
-        """The session's numbers, the same whenever they are asked for."""
+        """Return the session's results, the same whenever they are asked for."""
         if item.position not in self._held:
             at = self._moment(item, start_minute)
             off = item.controller == Controller.NO_DBS
@@ -116,7 +116,7 @@ class VisitDay:
         return Held((f"{_stem(self.visit, item)}.csv", ran.log), ran.ended, ran.outcomes)
 
     def _switched_off(self, item: PlanItem, at: Moment) -> Held:
-        """A session without stimulation has no bundle: it is recorded by the device alone."""
+        """Record a session without stimulation by the device alone: it has no bundle."""
         simulated = without_stimulation(self.visit.participant, at, round(item.minutes * STEPS_PER_MINUTE))
         file = session_file(_stem(self.visit, item), simulated, at.begins)
         return Held(file, at.begins + dt.timedelta(minutes=item.minutes), simulated.outcomes)
@@ -127,7 +127,7 @@ class VisitDay:
         return Moment(begins=begins, hour=start_minute / 60, visit=self.visit.number, seed=noise, study_seed=self.seed)
 
     def _send(self, db: Session, plan_id: int, entries: list[dict[str, Any]]) -> None:
-        """What the day's page sends; what is there already stays. Commits. Raises BetaloopError for a refused entry."""
+        """Send the entries as the day's page does; existing ones stay. Commits. Raises BetaloopError for a refused entry."""
         results = clinic_day.add_entries(db, self.visit, plan_id, [_ENTRY.validate_python(e) for e in entries], self.caller)
         refused = [f"{r.detail} {r.hint}" for r in results if r.outcome == "refused"]
         if refused:
@@ -136,7 +136,7 @@ class VisitDay:
 
 
 def without_stimulation(participant: Participant, at: Moment, steps: int) -> SimulatedSession:
-    """A session without stimulation, as the stimulator records it."""
+    """Simulate a session without stimulation, as the stimulator records it."""
     return run_session(
         participant.code,
         "no_dbs",
@@ -156,12 +156,12 @@ def _stem(visit: Visit, item: PlanItem) -> str:
 
 
 def _named(of: str, kind: str) -> UUID:
-    """The identifier of an entry, the same when the study goes on after a stop."""
+    """Derive the identifier of an entry, the same when the study goes on after a stop."""
     return uuid5(NAMESPACE_URL, f"betaloop simulated study, {of}, {kind}")
 
 
 def _entries(code: str, item: PlanItem, begins: dt.datetime, ended: dt.datetime, outcomes: Outcomes) -> list[dict[str, Any]]:
-    """What is tapped on the clinic day about one session: its times, rating and grasp test, and no side effects."""
+    """List the entries of the clinic day about one session: its times, rating and grasp test, and no side effects."""
     asked: list[tuple[str, Mapping[str, Any]]] = [
         ("rating", {"value": outcomes.rating}),
         ("grasp", _grasps(ended, outcomes)),
@@ -185,7 +185,7 @@ def _entries(code: str, item: PlanItem, begins: dt.datetime, ended: dt.datetime,
 
 
 def _grasps(ended: dt.datetime, outcomes: Outcomes) -> dict[str, Any]:
-    """The grasp test of the session's last seconds, tapped; typed where too few fists were opened to count."""
+    """Build the grasp test of the session's last seconds: tapped, or typed if fewer than two fists were opened."""
     taps = [round(float(t), 3) for t in outcomes.open_fist_s]
     if len(taps) < 2:
         return {"method": "typed", "hz": outcomes.qoc.grasp_hz}

@@ -1,7 +1,7 @@
-"""A session of the study in silico as a tablet runs it: the bundle of its slot, verified, with a synthetic participant on the other side.
+"""A session of the study in silico as a tablet runs it: the verified bundle of its slot, with a synthetic participant.
 
-All but the participant and the clock is what runs in the clinic: the bundle as it leaves, its verification, the check of day, withdrawal
-and ledger, the loop with its envelope, the line protocol with its device side, and the log.
+Only the participant and the clock differ from the clinic. The bundle, its verification and the check of day, withdrawal and ledger are the
+same. So are the loop with its envelope, the line protocol with its device side, and the log.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _SYMPTOMS = ("brady", "tremor", "overload")
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """When a session begins, and which draws of the day and of the noise it meets.
+    """Start of a session, with the seeds of its day and its noise.
 
     Attributes:
         begins: of the runner; the controller takes over a window later. hour: since the day's first session. visit: number.
@@ -84,7 +84,7 @@ class DayParticipant:
         self.signal = Signal("uV", manifest.beta_source)  # the amplitude itself, whatever the device would make it from
 
     def beta(self, amplitude_ma: float) -> float:
-        """Beta of the next period, in which an amplitude is in force."""
+        """Advance the simulation by one period under an amplitude, mA; return its beta."""
         fraction = amplitude_ma / self._cdbs_ma
         out = self._simulation.advance(np.array([fraction]), moving=self._simulation.period >= self._grasps_from)
         self._trace["amplitude"].append(fraction)
@@ -93,7 +93,7 @@ class DayParticipant:
         return float(out["beta"][0])
 
     def outcomes(self) -> Outcomes:
-        """What is measured at the end, over the session without the window before it."""
+        """Measure the outcomes at the end, over the session without the window before it."""
         traces = [np.array(values[-self._steps :]) for values in self._trace.values()]
         return measure(self._model, self._simulation.counters[0], *traces)
 
@@ -105,7 +105,7 @@ def run_slot_of(db: Session, visit: Visit, position: int, at: Moment, folder: Pa
         folder: the tablet of that day: bundles, logs, and the ledger of what ran.
 
     Raises:
-        BetaloopError: the session may not run, or did not come to its end, which would be a fault of the simulator.
+        BetaloopError: the session may not run, or did not reach its end, which would be a fault of the simulator.
     """
     folder.mkdir(parents=True, exist_ok=True)
     name, content = slots.bundle(db, visit, position, caller, at.begins - TAKEN_BEFORE)

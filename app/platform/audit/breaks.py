@@ -35,9 +35,8 @@ class Break:
     """One break, with what applies to it.
 
     Attributes:
-        position: its place in the chain. event_id: the number of the trail's row.
-        table: the audited table, or that of a wrong trigger. row: the key of a row of that table.
-        columns: those that differ. name: of a trigger, a rule or a function.
+        position: place in the chain. event_id: number of the trail's row. table: the audited one, or that of a wrong trigger.
+        row: the key of a row of that table. columns: those that differ. name: of a trigger, a rule or a function.
     """
 
     kind: BreakKind

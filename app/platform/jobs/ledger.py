@@ -215,8 +215,8 @@ def persist(action: Callable[[], Value], check: Callable[[], None]) -> Value:
 
 
 def _worth_repeating(error: DBAPIError) -> bool:
-    """Decide if a retry may succeed: connection broken or database restarting (class 08, 57P), transactions in conflict (class 40), or
-    no writes for now: read-only before a standby is promoted (25006), disk full (53100).
+    """Decide if a retry may succeed: the connection broke or the database restarts (class 08, 57P), or transactions conflict (class 40).
+    Also if the database takes no writes for now: read-only before a standby is promoted (25006), disk full (53100).
     """
     state = getattr(error.orig, "sqlstate", None)
     waits = state in {"25006", "53100"}

@@ -18,11 +18,7 @@ ENDED = (JobStatus.SUCCEEDED, JobStatus.FAILED, JobStatus.CANCELLED)
 
 
 def get(db: Session, job_id: str) -> Job:
-    """Load a job with its steps.
-
-    Raises:
-        NotFound: there is none.
-    """
+    """Load a job with its steps. Raises NotFound if there is none."""
     job = db.scalar(select(Job).where(Job.id == job_id).options(selectinload(Job.steps)))
     if job is None:
         raise NotFound(f"There is no job {job_id}.")
@@ -30,11 +26,7 @@ def get(db: Session, job_id: str) -> Job:
 
 
 def locked(db: Session, job_id: str) -> Job:
-    """Load a job's current row and lock it against other changes.
-
-    Raises:
-        NotFound: there is none.
-    """
+    """Load a job's current row and lock it against other changes. Raises NotFound if there is none."""
     job = db.scalar(select(Job).where(Job.id == job_id).with_for_update(key_share=True), execution_options={"populate_existing": True})
     if job is None:
         raise NotFound(f"There is no job {job_id}.")

@@ -46,11 +46,7 @@ class JobView:
 
 
 def look(job_id: str) -> JobView:
-    """Read the current state of the job.
-
-    Raises:
-        NotFound: there is none.
-    """
+    """Read the current state of the job. Raises NotFound if there is none."""
     with new_session() as db:
         state = describe(repository.get(db, job_id))
     steps = tuple(StepView(s["key"], s["title"], JobStatus(s["status"]), s["progress"], s["message"]) for s in state["steps"])

@@ -17,7 +17,7 @@ ACCOUNTS: Final = {ADMIN: Role.ADMIN, CLINICIAN: Role.CLINICIAN, ENGINEER: Role.
 
 
 def password(data_dir: Path) -> str:
-    """The password, random and kept in the data folder."""
+    """Return the demo's password, random and kept in the data folder."""
     return written_once(data_dir / "secrets" / "demo-password", lambda: f"beta-{secrets.token_hex(4)}")
 
 

@@ -1,7 +1,7 @@
 """`betaloop demo`: everything on one machine, with a small synthetic study that enters through the public upload path.
 
-Started again, it finds its study and serves it within seconds; interrupted, it goes on: every simulated session has fixed numbers and the
-day on which the demo was begun is kept, so that what was uploaded before is recognised by its bytes.
+Started again, it finds its study and serves it within seconds. Interrupted, it goes on. Simulated sessions have fixed numbers and the day
+of the demo's start is kept, so that earlier uploads are recognised by their bytes.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def run_demo(host: str, port: int) -> None:
 
 @contextmanager
 def _only_demo(folder: Path, url: str) -> Iterator[None]:
-    """Hold the data folder for this demo, as its keeper too. Raises Conflict where another one runs in it."""
+    """Lock the data folder for this demo, also for its keeper. Raises Conflict if another demo runs in it."""
     with (folder / "demo.lock").open("a+") as lock:
         os.set_inheritable(lock.fileno(), True)  # the keeper is this process with another program
         lock.seek(0)
@@ -83,7 +83,7 @@ def _only_demo(folder: Path, url: str) -> Iterator[None]:
 
 
 def _say(line: str) -> None:
-    """A line for the terminal or a log; never wrapped, so that an address or a password stays beside its label."""
+    """Print a line to the terminal or a log; never wrapped, so that an address or a password stays next to its label."""
     console.print(line, soft_wrap=True, highlight=False)
 
 
@@ -98,7 +98,7 @@ def say_welcome(url: str, seconds: float, password: str) -> None:
 
 @contextmanager
 def _children(logs: Path, host: str, port: int) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """The web service and the worker as child processes with log files; both are stopped at the end."""
+    """Run the web service and the worker as child processes with log files; stop both at the end."""
     private_folder(logs)
     commands = {"web": ["serve", "--host", host, "--port", str(port)], "worker": ["worker"]}
     children: list[subprocess.Popen[bytes]] = []

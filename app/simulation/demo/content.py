@@ -1,7 +1,7 @@
-"""What the demo's study holds, in the order in which a clinic would have entered it: visits, sessions, rankings, plans, and what happened.
+"""Content of the demo's study, in the order in which a clinic would enter it: visits, sessions, rankings, plans, and events.
 
-All of it goes through the REST interface. Policies that were learned earlier come in by the service function for them, after their
-snapshot was compared with the sessions that they were learned on.
+All of it goes through the REST interface. Only policies learned earlier are added by their service function, after their snapshot was
+compared with the sessions that they were learned on.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from ml.population import PARTICIPANTS
 from ml.trajectories import ReplayBuffer
 
 METHODS: Final = ("wis",)
-"""Beside the posterior, which ranks: the method that takes the least time; those that model beta are refitted for each controller."""
+"""Methods besides the posterior, which ranks: the fastest one; methods that model beta are refitted for each controller."""
 DRAFTED: Final = "Drafted for the demo."
 
 
 @dataclass
 class People:
-    """Who acts in the demo, each through the REST interface."""
+    """Users of the demo, each acting through the REST interface."""
 
     admin: Door
     engineer: Door
@@ -45,7 +45,7 @@ class People:
 
     @classmethod
     def at(cls, url: str) -> People:
-        """With a token for each, made for this run."""
+        """Make a token for each user, for this run."""
         return cls(*(Door(url, _token(email)) for email in (ADMIN, ENGINEER, CLINICIAN)))
 
 
@@ -70,15 +70,15 @@ class Participant:
 
     @cached_property
     def story(self) -> Story:
-        """What is stored with the package."""
+        """The participant's story, as stored with the package."""
         return read(self.code)
 
     def step(self, name: str, do: Callable[..., None], *given: Any) -> Step:
-        """A step under this participant's name."""
+        """Make a step under this participant's name."""
         return f"{self.code} {name}", partial(do, *given)
 
     def early(self) -> list[Step]:
-        """Enrolment, and the first visits, at which random sessions were recorded."""
+        """List the steps of enrolment and of the first visits, at which random sessions were recorded."""
         steps = [self.step("enrol", self._enrol)]
         for number, visit in self.visits.items():
             steps.append(self.step(f"visit {number}", self._add_visit, number))
@@ -86,7 +86,7 @@ class Participant:
         return steps
 
     def with_policies(self) -> list[Step]:
-        """The visits that tested policies, each from its plan to its confirmed sessions; a ranking comes before what was learned last."""
+        """List the early steps, then those of visits that tested policies, each from its plan to its confirmed sessions."""
         steps = self.early()
         for number in sorted({s.visit for s in self.story.sessions}):
             generation = next(g for g in reversed(self.story.generations) if g.visit <= number)
@@ -98,7 +98,7 @@ class Participant:
         return steps
 
     def learned(self, generation: Generation) -> list[Step]:
-        """Policies that were learned before a visit, and their ranking."""
+        """List the steps that add the policies learned before a visit, and rank them."""
         number = generation.visit
         return [
             self.step(f"visit {number} policies", self._take_over, generation),
@@ -115,14 +115,14 @@ class Participant:
         self.people.admin.post(f"/participants/{self.code}/visits", body, may_exist=True)
 
     def visit_id(self, number: int) -> int:
-        """The number of a visit in addresses."""
+        """Return a visit's id in addresses, asked for once."""
         if number not in self.visit_ids:
             listed = self.people.admin.get(f"/participants/{self.code}/visits?limit=200")["items"]
             self.visit_ids = {v["number"]: v["id"] for v in listed}
         return self.visit_ids[number]
 
     def _simulated(self, session: DemoSession) -> None:
-        """A session of the first visits: its file, its outcomes, and how its amplitudes were drawn."""
+        """Upload a session of the first visits: its file, its outcomes, and how its amplitudes were drawn."""
         name, content = session.file()
         fields = {"participant": self.code, "visit": str(session.visit), "controller": session.controller}
         if session.started_at is not None:
@@ -136,7 +136,7 @@ class Participant:
         self.people.admin.put(f"/sessions/{session_id}/qoc", qoc | {"sure": ["grasp_hz", "rating", "tremor_percent"]})
 
     def _recorded(self, session: RecordedSession) -> None:
-        """A session of a visit with policies, as it was recorded when the files were made."""
+        """Upload a session of a visit with policies, as recorded when the files were made."""
         begins = self.morning(session.visit) + timedelta(minutes=session.start_minute)
         fields = {
             "participant": self.code,
@@ -151,7 +151,7 @@ class Participant:
         self._outcomes(stored["sessions"][0]["id"], session.qoc)
 
     def morning(self, number: int) -> datetime:
-        """When the first session of a visit begins."""
+        """Return the start time of a visit's first session."""
         begins: datetime = self.visits[number].first_session
         return begins
 
@@ -179,7 +179,7 @@ class Participant:
                 add_learned(db, participant, snapshot, buffer, learned, caller)
 
     def learnt_on(self, generation: Generation) -> ReplayBuffer:
-        """The sessions that a generation was learned on."""
+        """Return the sessions that a generation was learned on."""
         sessions = trajectories(self.code) + [
             s.trajectory(100 + k, PARTICIPANTS[self.code].cdbs_amplitude_ma, None) for k, s in enumerate(self.story.sessions)
         ]
@@ -223,12 +223,12 @@ class Participant:
 
 
 def p1(participant: Participant) -> list[Step]:
-    """The first visits alone: its first ranking is computed while somebody looks."""
+    """List the steps of the first visits only: the first ranking is computed while a user watches."""
     return participant.early()
 
 
 def p2(participant: Participant) -> list[Step]:
-    """One visit further: margins locked, and tomorrow's visit planned, signed, with a bundle for each session."""
+    """List the steps up to the next visit: margins locked, the visit planned and signed, with a bundle for each session."""
     number = participant.story.generations[0].visit
     return [
         *participant.early(),
@@ -256,7 +256,7 @@ def _take_bundles(participant: Participant, number: int) -> None:
 
 
 def p3(participant: Participant) -> list[Step]:
-    """Six visits, three of them with policies; an adverse event that was mild."""
+    """List the steps of six visits, three of them with policies, and of a mild adverse event."""
     return [
         *_gated(participant),
         participant.step("adverse event", _adverse_event, participant),
@@ -265,7 +265,7 @@ def p3(participant: Participant) -> list[Step]:
 
 
 def p4(participant: Participant) -> list[Step]:
-    """Six visits, three of them with policies; questions of a monitor about values."""
+    """List the steps of six visits, three of them with policies, and of a monitor's questions about values."""
     return [
         *_gated(participant),
         participant.step("data queries", _data_queries, participant),
@@ -275,7 +275,7 @@ def p4(participant: Participant) -> list[Step]:
 
 
 def _gated(participant: Participant) -> list[Step]:
-    """Visits with policies; a clinician lets their sessions into what later policies learn from, once the first such visit is over."""
+    """List the steps of visits with policies. After the first such visit a clinician admits their sessions to later learning."""
     steps = participant.with_policies()
     first = participant.story.generations[0].visit
     after = 1 + next(k for k, (name, _) in enumerate(steps) if name.endswith(f"visit {first} confirm"))
@@ -327,7 +327,7 @@ def _data_queries(participant: Participant) -> None:
 
 
 def _open_files(participant: Participant) -> None:
-    """What waits for a person: a recording whose controller nobody stated, a table of unknown columns, and a file that cannot be read."""
+    """Upload files that need a person: a recording of an unstated controller, a table of unknown columns, and an unreadable file."""
     door, code = participant.people.admin, participant.code
     last = participant.story.generations[-1].visit + 1
     begins = participant.morning(last) + timedelta(hours=3)
@@ -365,7 +365,7 @@ def load(url: str, state_path: Path, console: Console | None = None) -> None:
 
 
 def _first_ranking(console: Console, url: str, state: State, people: People) -> None:
-    """P1's first ranking with the machine to itself; then the next generations of P3 and P4 in the background."""
+    """Compute P1's first ranking with the machine to itself; then start the next generations of P3 and P4 in the background."""
     first = "P1 first ranking"
     if first not in state.jobs:
         state.started(first, people.engineer.post("/participants/P1/jobs", {"kind": "pipeline", "preset": "quick"})["id"])

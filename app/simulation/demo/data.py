@@ -40,7 +40,7 @@ REPEATS: Final = 3
 
 
 def _day() -> tuple[Slot, ...]:
-    """A policy and its student in turn with cDBS between any two, and no DBS at the end, as a plan lays the day out."""
+    """Lay out a day as a plan does: a policy and its student in turn, cDBS between any two, and no DBS at the end."""
     order: list[tuple[str, int | None]] = []
     for k in range(2 * REPEATS):
         order += [("cdbs", None)] if k else []
@@ -69,10 +69,10 @@ class LearnedPolicy:
 
 @dataclass(frozen=True)
 class Generation:
-    """What was learned before a visit.
+    """Generation of policies, learned before a visit.
 
     Attributes:
-        visit: before which. sessions: that it was learned on, the first ones. policies: new ones that are kept.
+        visit: the visit after it. sessions: number of first sessions that it was learned on. policies: new ones that are kept.
         tested: names in the order of the visit's plan.
     """
 
@@ -97,7 +97,7 @@ class RecordedSession:
     qoc: dict[str, float | None]
 
     def table(self, cdbs_ma: float) -> bytes:
-        """The session's file for an upload: `t_s,beta,amplitude_ma`."""
+        """Write the session's file for an upload: `t_s,beta,amplitude_ma`."""
         lead = self.lead_beta.size
         rows = [f"{_PERIOD_S * (i - lead + 1)},{beta:.4f},{cdbs_ma:.1f}" for i, beta in enumerate(self.lead_beta)]
         rows += [
@@ -106,7 +106,7 @@ class RecordedSession:
         return "\n".join(["t_s,beta [uV],amplitude [mA]", *rows, ""]).encode()
 
     def trajectory(self, session_id: int, cdbs_ma: float, policy_id: int | None) -> SessionTrajectory:
-        """The session as learning reads it."""
+        """Return the session as learning reads it."""
         return SessionTrajectory(
             session_id=session_id,
             visit=self.visit,
@@ -164,7 +164,7 @@ def write(folder: Path, story: Story) -> Path:
 
 
 def read(code: str, folder: Path = FOLDER) -> Story:
-    """A participant's file."""
+    """Read a participant's file."""
     with zipfile.ZipFile(folder / f"{code}.zip") as archive:
         head = json.loads(archive.read(_STORY))
         generations = tuple(
@@ -191,12 +191,12 @@ def _session(archive: zipfile.ZipFile, s: dict[str, Any]) -> RecordedSession:
 
 
 def _planes(values: NDArray[np.uint32]) -> bytes:
-    """The bytes of all values by place: high bytes hardly change and so pack well."""
+    """Group the bytes of all values by place: high bytes hardly change and so compress well."""
     return np.ascontiguousarray(values.view("u1").reshape(-1, 4).T).tobytes()
 
 
 def _short(value: Any) -> Any:
-    """Numbers with six digits: curves are for the eye."""
+    """Round numbers to six digits: curves are for the eye."""
     if isinstance(value, dict):
         return {k: _short(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -1,6 +1,6 @@
 """The loader of the demo's study: a process of its own, which sends everything through the REST interface and ends.
 
-Every step can be repeated: what is there already is recognised, and finished steps are written down beside the data. So a loader that was
+Every step can be repeated: what exists is recognised, and finished steps are recorded next to the data. So a loader that was
 stopped anywhere goes on when the demo is started again.
 """
 
@@ -38,7 +38,7 @@ class LoadFailed(BetaloopError):
 
 @dataclass
 class State:
-    """What has been loaded; on disk after every step, so that a demo that is started again goes on.
+    """Progress of the loading, saved after every step, so that a demo that is started again goes on.
 
     Attributes:
         begun: the day on which the demo was begun, which all visits are dated by. done: names of finished steps. jobs: by name.
@@ -53,7 +53,7 @@ class State:
 
     @classmethod
     def at(cls, path: Path, today: date) -> State:
-        """The state of a data folder, begun today where there is none.
+        """Read the state of a data folder, or begin one today.
 
         Raises:
             LoadFailed: a demo that another version has begun.
@@ -112,11 +112,11 @@ class Door:
         self._client = httpx.Client(base_url=f"{url}/api/v1", headers={"Authorization": f"Bearer {token}"}, timeout=_TIMEOUT_S)
 
     def get(self, path: str) -> Any:
-        """What stands at a path."""
+        """Get the resource at a path."""
         return _checked(self._client.get(path))
 
     def has(self, path: str) -> bool:
-        """Whether something stands at a path."""
+        """Ask if there is a resource at a path."""
         answer = self._client.get(path)
         if answer.status_code == 404:
             return False
@@ -129,16 +129,16 @@ class Door:
         return {} if may_exist and answer.status_code == 409 else _checked(answer)
 
     def put(self, path: str, body: dict[str, Any]) -> Any:
-        """Change what stands at a path."""
+        """Put a new version of the resource at a path."""
         return _checked(self._client.put(path, json=body))
 
     def upload(self, fields: dict[str, str], name: str, content: bytes, *, may_be_unusable: bool = False) -> Any:
-        """Send a file as the upload page does; one that cannot be read is kept for a person to look at, and gives an empty answer."""
+        """Send a file as the upload page does. An unreadable file is kept for a person, and gives an empty answer."""
         answer = self._client.post("/uploads", data=fields, files={"file": (name, content)})
         return {} if may_be_unusable and answer.status_code == 422 else _checked(answer)
 
     def read(self, path: str) -> bytes:
-        """The bytes at a path."""
+        """Read the bytes at a path."""
         answer = self._client.get(path)
         _raise(answer)
         return answer.content
@@ -162,13 +162,13 @@ def _checked(answer: httpx.Response) -> Any:
 
 
 def run_all(state: State, lines: Sequence[Sequence[Step]], told: Callable[[int, int], None]) -> None:
-    """Do what is left of every line of steps, the lines side by side, each in its order.
+    """Do the remaining steps of every line, the lines in parallel, each in its order.
 
     Args:
         told: called with how many steps are done, and how many there are.
 
     Raises:
-        BetaloopError: what the first line that failed failed of; the others end after their present step.
+        BetaloopError: the error of the first line that failed; the others end after their present step.
     """
     total = sum(len(line) for line in lines)
     failed = threading.Event()
@@ -192,7 +192,7 @@ def run_all(state: State, lines: Sequence[Sequence[Step]], told: Callable[[int, 
 
 
 def follow(door: Door, job_id: str) -> Iterator[dict[str, Any]]:
-    """A job as it goes on, until its end."""
+    """Yield the state of a job repeatedly, until its end."""
     while True:
         job: dict[str, Any] = door.get(f"/jobs/{job_id}")
         yield job

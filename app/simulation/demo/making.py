@@ -1,4 +1,4 @@
-"""Making of the demo's files: policies are learned on a participant's earlier visits, and sessions held that test them.
+"""Making of the demo's files: policies are learned on a participant's earlier visits, and simulated sessions test them.
 
 Everything is what the product computes: the training, distillation and gains are the functions that jobs run. The sessions before a
 generation are those that it learns from. A fixed seed gives the same files on the same machine.
@@ -99,7 +99,7 @@ class _Participant:
         return ReplayBuffer(self.settings, tuple(self.trajectories), "uV", "time_domain")
 
     def run(self) -> Story:
-        """All visits in order."""
+        """Run all visits in order."""
         self.trajectories += trajectories(self.code)
         for visit in sorted({*self.size.policy_visits, *self.size.generations}):
             if visit in self.size.generations:
@@ -192,7 +192,7 @@ class _Participant:
         return _Candidate(learned, number, _keep(onnx), None)
 
     def _parents(self, buffer: ReplayBuffer, tests: Tests) -> list[_Candidate]:
-        """Tested full-sized policies to go on from, the highest gain first."""
+        """Choose the tested full-sized policy with the highest gain, to go on from; none before any test."""
         ran = [c for c in self.candidates if c.sessions and c.training_sha256]
         if not ran:
             return []
@@ -204,7 +204,7 @@ class _Participant:
         return gains_over_cdbs(buffer, {c.policy.name: OnnxPolicy(c.policy.onnx, window) for c in ran}, tests=tests)
 
     def _choose(self, everyone: list[_Candidate], gains: Mapping[str, PosteriorGain], visit: int) -> _Candidate:
-        """The full-sized policy that the visit tests: what saves most among those that surely keep the margins, if there are any."""
+        """Choose the full-sized policy to test: the one that saves most among those that surely keep the margins, if there are any."""
         trained = [c for c in everyone if c.policy.kind == "trained"]
         for c in trained:
             g = gains[c.policy.name]
@@ -219,7 +219,7 @@ class _Participant:
         return max(supported, key=lambda c: gains[c.policy.name].expected_saving or -1.0)
 
     def _hold(self, visit: int) -> None:
-        """The sessions of a visit, as its plan has them."""
+        """Simulate the sessions of a visit, as its plan has them."""
         names = self.generations[-1].tested
         model = PARTICIPANTS[self.code]
         for k, slot in enumerate(DAY_WITH_POLICIES):
@@ -257,7 +257,7 @@ class _Participant:
             )
 
     def _tests(self, buffer: ReplayBuffer) -> Tests:
-        """What tested sessions showed so far."""
+        """Collect the results of tested sessions so far."""
         horizon = int(np.median([s.steps for s in self.trajectories]))
         shown = [
             TestSession(None if s.policy_id is None else str(s.policy_id), s.visit, _values(s, self.settings, horizon))
@@ -281,7 +281,7 @@ def make(folder: Path, codes: Sequence[str], say: Say, seed: int | None = None) 
     """Make the files of the demo's participants.
 
     Args:
-        folder: where they go. codes: of which participants. say: called with what was learned and held. seed: in place of the stated ones.
+        folder: where they go. codes: of which participants. say: called with each line of progress. seed: in place of the stated ones.
 
     Raises:
         Invalid: a participant of whom the demo stores nothing.
@@ -299,7 +299,7 @@ def make(folder: Path, codes: Sequence[str], say: Say, seed: int | None = None) 
 
 @contextmanager
 def _scratch() -> Iterator[None]:
-    """A data folder of its own for the files that computations hand to one another."""
+    """Use a temporary data folder for the files that computations hand to one another."""
     before = os.environ.get("BETALOOP_DATA_DIR")
     with tempfile.TemporaryDirectory(prefix="betaloop-demo-") as folder:
         os.environ["BETALOOP_DATA_DIR"] = folder

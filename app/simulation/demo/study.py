@@ -1,4 +1,4 @@
-"""What the demo's synthetic study consists of: participants, visits, sessions and their files. Nothing in here touches the service."""
+"""Design of the demo's synthetic study: participants, visits, sessions and their files. Nothing in here touches the service."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _DEVICE_STARTS_S = 5
 
 
 def device_session(code: str) -> bool:
-    """Whether the participant's sessions arrive as device recordings, whose start must be stated."""
+    """Decide if the participant's sessions arrive as device recordings, whose start must be stated."""
     return code == DEVICE_PARTICIPANT
 
 
@@ -76,7 +76,7 @@ class DemoSession:
         return self.begins if device_session(self.code) else None
 
     def trajectory(self, session_id: int) -> SessionTrajectory:
-        """The session as learning reads it."""
+        """Return the session as learning reads it."""
         ran = self.simulated
         return SessionTrajectory(
             session_id=session_id,
@@ -95,7 +95,7 @@ class DemoSession:
         return session_file(f"{self.code}-visit{self.visit}-session{self.ordinal}", self.simulated, self.begins)
 
     def conditions(self) -> dict[str, Any] | None:
-        """What the design drew for a random session, for the REST interface; None for other sessions."""
+        """Return a random session's drawn design for the REST interface; None for other sessions."""
         if self.design is None:
             return None
         holds = [asdict(d) for d in self.design.decisions]
@@ -103,7 +103,7 @@ class DemoSession:
         return stated | {"design_parameters": {"level": self.design.level, "holds": holds}}
 
     def qoc(self) -> dict[str, Any]:
-        """End-of-session QoCs for the REST interface."""
+        """Return the end-of-session QoCs for the REST interface."""
         qoc = self.simulated.qoc
         return {"grasp_hz": qoc.grasp_hz, "rating": qoc.rating, "tremor_percent": qoc.tremor_percent}
 
@@ -123,12 +123,12 @@ class DemoVisit:
 
     @property
     def first_session(self) -> dt.datetime:
-        """When its first session begins."""
+        """Start time of its first session."""
         return self.begins + _FIRST_SESSION
 
 
 def participant_body(code: str) -> dict[str, Any]:
-    """A participant for the REST interface, with the settings that its model suggests."""
+    """Build a participant for the REST interface, with the settings that its model suggests."""
     model = PARTICIPANTS[code]
     return {
         "code": code,
@@ -145,7 +145,7 @@ def participant_body(code: str) -> dict[str, Any]:
 
 
 def characteristics_body(code: str) -> dict[str, Any]:
-    """A participant's characteristics for the REST interface, as its model has them."""
+    """Build a participant's characteristics for the REST interface, as its model has them."""
     model = PARTICIPANTS[code]
     programme = model.programme
     contacts = [("C" if number == 16 else str(number)) + "+" for number in programme.anodes] + [
@@ -163,7 +163,7 @@ def characteristics_body(code: str) -> dict[str, Any]:
 
 
 def designs(code: str) -> tuple[DesignedSession, ...]:
-    """What the participant's random sessions try: the stratified design of a new participant, over the demo's visits."""
+    """Design the participant's random sessions: the stratified design of a new participant, over the demo's visits."""
     wanted = DesignSettings(
         visits=VISITS[code], sessions=DAY.count("random"), steps=MINUTES["random"] * _STEPS_PER_MINUTE, seed=list(PARTICIPANTS).index(code)
     )
@@ -171,7 +171,7 @@ def designs(code: str) -> tuple[DesignedSession, ...]:
 
 
 def demo_visits(code: str, today: dt.date) -> list[DemoVisit]:
-    """The participant's visits, a month apart; the next one lies `NEXT_VISIT_IN` after `today`."""
+    """List the participant's visits, a month apart; the next one is `NEXT_VISIT_IN` after `today`."""
     visits = []
     designed = iter(designs(code))
     held = VISITS[code] + TESTED_VISITS.get(code, 0)
@@ -194,7 +194,7 @@ def demo_visits(code: str, today: dt.date) -> list[DemoVisit]:
 
 
 def trajectories(code: str) -> list[SessionTrajectory]:
-    """The sessions of the first visits as learning reads them."""
+    """Return the sessions of the first visits as learning reads them."""
     any_day = dt.date(2026, 1, 1)
     sessions = [session for visit in demo_visits(code, any_day) for session in visit.sessions]
     return [session.trajectory(number) for number, session in enumerate(sessions, start=1)]
