@@ -183,8 +183,12 @@ def request_session(db: Annotated[Session, Depends(get_db)]) -> Iterator[Session
         SQLAlchemyError: the commit failed. The sender gets an error, and never the answer of the endpoint.
     """
     yield db
-    if db.info.get(_MAY_HAVE_WRITTEN) or db.new or db.dirty or db.deleted:
-        db.commit()  # after reading alone the answer is right, also where the database has gone meanwhile
+    wrote = db.info.get(_MAY_HAVE_WRITTEN) or db.new or db.dirty or db.deleted
+    try:
+        db.commit()
+    except DBAPIError as error:
+        if wrote or passing(error) is None:
+            raise  # after reading alone the answer is right, also where the database has gone meanwhile
 
 
 _MAY_HAVE_WRITTEN = "may have written"

@@ -93,7 +93,7 @@ def test_an_error_takes_back_what_the_endpoint_changed(service: FastAPI, error: 
     assert studies() == []
 
 
-@pytest.mark.parametrize("statement", ["add", "insert", "text", "savepoint"])
+@pytest.mark.parametrize("statement", ["add", "insert", "text", "savepoint", "connection"])
 def test_a_change_is_noticed_however_it_is_made(service: FastAPI, statement: str) -> None:
     @service.post("/change")
     def change(db: Db) -> None:
@@ -102,6 +102,8 @@ def test_a_change_is_noticed_however_it_is_made(service: FastAPI, statement: str
             add_study(db)
         elif statement == "insert":
             db.execute(Study.__table__.insert().values(code="S2", name="Second"))  # type: ignore[attr-defined]
+        elif statement == "connection":
+            db.connection().execute(text("insert into study (code, name) values ('S2', 'Second')"))
         elif statement == "savepoint":
             with db.begin_nested():
                 add_study(db)

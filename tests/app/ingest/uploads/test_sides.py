@@ -10,6 +10,7 @@ from fastapi.testclient import TestClient
 
 from tests.app.ingest.conftest import device_zip, steady
 from tests.app.ingest.proposals.test_proposals import correct, post
+from tests.app.words import flat
 
 
 @pytest.fixture
@@ -56,7 +57,7 @@ def test_the_page_says_whose_stimulation_is_not_in_its_energy(send: Any, client:
     first, *_, last = send(percept, visit=1).json()["proposals"]
     for one, said in ((first, "left side"), (last, None)):
         post(client, one, "confirm", controller="no_dbs")
-        text = page(client, f"/sessions/{one['session']['id']}")
+        text = flat(page(client, f"/sessions/{one['session']['id']}"))
         assert ("<dt>Stimulated too</dt>" in text) is (said is not None)
         assert said is None or f"<dt>Stimulated too</dt><dd>{said} " in text
     alone = send(("a.zip", device_zip()), visit=1, controller="random").json()["sessions"][0]["id"]
