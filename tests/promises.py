@@ -122,7 +122,7 @@ PROMISES = [
         ("a closed account signs nothing", "_hasher.verify(password, user.password_hash) and user.active)",
          "_hasher.verify(password, user.password_hash))",
          f"{SIGNATURES}::test_a_closed_account_and_the_system_sign_nothing"),
-        ("guessing ends", "    if failed + undecided >= FAILURES_ALLOWED:\n", "    if False:\n",
+        ("guessing ends", ", failed + undecided >= FAILURES_ALLOWED\n", ", False\n",
          f"{ACCOUNTS}::test_five_failures_lock_the_address_and_a_pause_unlocks_it"),
         ("guesses at one moment count", "    repository.lock_address(db, address)\n", "",
          f"{ACCOUNTS}::test_guesses_at_the_same_moment_are_judged_no_more_often_than_allowed"),
