@@ -11,7 +11,7 @@ KEY, QUERIES = "tests/app/planning/plans/test_sealed_key.py", "tests/app/study/d
 TRAIL: list[Promise] = [
     *of(
         "study/deps",
-        ("who looked at results is in the trail", 'elif record_view(db, "results", path):', "elif False:",
+        ("who looked at results is in the trail", '        record_view(db, "results", path)\n', "        pass\n",
          f"{LOOKS}::test_who_looked_at_results_and_who_took_a_file_is_in_the_trail"),
         ("tables of results that are taken are exports", 'record(db, "export", "results", path, {"format": form})', "pass",
          f"{LOOKS}::test_each_table_that_is_taken_is_a_row_and_is_called_an_export"),
