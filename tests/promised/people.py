@@ -34,7 +34,8 @@ PEOPLE: list[Promise] = [
     ),
     *of(
         "accounts/studies/api",
-        ("no token gives a role", '    caller.require_browser()\n    given = service.grant(', "    given = service.grant(", f"{MEMBERS}::test_no_token_gives_or_ends_a_role_and_a_stranger_sees_nobody"),
+        ("no token gives a role", '    caller.require_browser()\n    given = service.grant(', "    given = service.grant(",
+         f"{MEMBERS}::test_no_token_gives_or_ends_a_role_and_a_stranger_sees_nobody"),
     ),
     *of(
         "accounts/permissions",
