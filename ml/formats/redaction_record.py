@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass, field
 from hashlib import sha256
 
-REDACTOR_VERSION = 5
+REDACTOR_VERSION = 6
 PSEUDONYM = re.compile(r"device-[0-9a-f]{16}")
 
 
@@ -18,12 +18,14 @@ class Redaction:
     Attributes:
         removed: identity that was taken out.
         repaired: defects met; the redacted file is whole and no longer shows them.
+        flagged: losses met; the redacted file has a mark in their place.
         ignored: files and rows not carried over.
         unreadable: files of the session that could not be read at all, so could not be redacted.
     """
 
     removed: list[str] = field(default_factory=list)
     repaired: list[str] = field(default_factory=list)
+    flagged: list[str] = field(default_factory=list)
     ignored: list[str] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
 

@@ -65,6 +65,9 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     if logged.rehearsed(placement.control) or differs_from_slot(slot, stated):
         # a log of a bench, or of another session than the sender says, is for a person to look at
         stated = replace(stated, confirm=False)
+    if any(r.details.get("quality", {}).get("amplitude_conflicts") for r in group):
+        # two sources differ about the amplitude: a person looks at both before the session counts
+        stated = replace(stated, confirm=False)
     guess = visit_of_slot(visits, slot, stated.visit) or guess_visit(visits, day, stated.visit)
     session = add_session(db, guess.visit, placement, stated.controller, stated.policy_id, stated.hemisphere, stated.counts)
     guesses.policy_by_log(db, session)

@@ -69,7 +69,12 @@ def known_recordings(row: UploadFile) -> list[int]:
 
 def add_redaction(report: FileReport, redaction: Redaction, notes: Sequence[str]) -> None:
     """Add to a report what cleaning the file found, and what was made of it."""
-    for ours, found in ((report.removed, redaction.removed), (report.repaired, redaction.repaired), (report.ignored, redaction.ignored)):
+    for ours, found in (
+        (report.removed, redaction.removed),
+        (report.repaired, redaction.repaired),
+        (report.flagged, redaction.flagged),
+        (report.ignored, redaction.ignored),
+    ):
         ours.extend(sentence for sentence in found if sentence not in ours)
     report.flagged.extend(wording.unreadable(redaction.unreadable))
     report.understood.extend(notes)

@@ -56,7 +56,8 @@ def stimulation_steps(data: SessionData, events: Sequence[Mapping[str, Any]], or
     trace = data.table.amplitude_trace
     origin = trace.details.get("origin") if trace is not None else None
     logged = [e for e in events if e["kind"] == "stimulation" and "delivered_ma" in e["data"] and e["data"].get("origin", origin) == origin]
-    return _logged_steps(data, logged, origin_s) if logged else _table_steps(data)
+    known = bool(logged) and all(e["data"]["delivered_ma"] is not None for e in logged)
+    return _logged_steps(data, logged, origin_s) if known else _table_steps(data)
 
 
 def in_chart_table(data: SessionData, steps: Sequence[StimulationStep]) -> bool:

@@ -11,15 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.formats.dose import UPPER_PLAUSIBLE_MA, stimulating
 from ml.formats.rcs.packets.streams import Adaptive
 from ml.formats.rcs.packets.time import PacketTimes
-from ml.formats.rcs.settings import ADAPTIVE_BIT, Settings, Therapy
+from ml.formats.rcs.settings import ADAPTIVE_BIT, Settings, Therapy, dose_of
 
 HOLD_INTERVALS = 3.0
 """A delivered amplitude is believed for this many update intervals; after a longer silence it is unknown."""
-
-UPPER_PLAUSIBLE_MA = 25.5
-"""One byte of 0.1 mA; 25.5 means hold, and nothing above can be set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,36 +31,14 @@ class AmplitudeSteps:
     assumed_program: bool
 
 
-def delivered(therapy: Therapy) -> tuple[float, float, float, float]:
-    """Compute the amplitude of the four programs under these settings, mA; NaN where unknown.
-
-    Without settings that say which programs are enabled, the first one is taken to be.
-    """
-    out = [0.0, 0.0, 0.0, 0.0]
-    if therapy.on is False:
-        return (0.0, 0.0, 0.0, 0.0)
-    if therapy.on is None or not therapy.programs:
-        return (np.nan, np.nan, np.nan, np.nan)
-    for p in stimulating(therapy):
-        amplitude = therapy.programs[p].amplitude_ma
-        out[p] = np.nan if amplitude is None or not 0 <= amplitude <= UPPER_PLAUSIBLE_MA else amplitude
-    return (out[0], out[1], out[2], out[3])
-
-
-def stimulating(therapy: Therapy) -> tuple[int, ...]:
-    """List the enabled programs of the active group; the first one where the settings name none."""
-    enabled = [p.enabled for p in therapy.programs]
-    if enabled and all(value is None for value in enabled):
-        return (0,)
-    return tuple(p for p, value in enumerate(enabled) if value)
-
-
 def amplitude_steps(settings: Settings, adaptive: Adaptive | None, times: PacketTimes | None) -> AmplitudeSteps:
     """Build the amplitude timeline of the whole recording."""
     states = settings.therapy.states
     base_t = np.array(settings.therapy.times_ms, dtype=np.float64)
-    base_v = np.array([delivered(state) for state in states], dtype=np.float64).reshape(-1, 4)
-    programs = tuple(sorted({p for state in states for p in stimulating(state)})) or ((0,) if states else ())
+    base_v = np.array([dose_of(state).amplitude_ma for state in states], dtype=np.float64).reshape(-1, 4)
+    programs = tuple(sorted({p for state in states for p in stimulating(state.programs)}))
+    if not programs and any(state != Therapy() for state in states):
+        programs = (0,)
     assumed = any(state.programs and all(p.enabled is None for p in state.programs) for state in states)
     if adaptive is None or times is None:
         return AmplitudeSteps(base_t, base_v, programs, False, assumed)
@@ -73,7 +49,7 @@ def amplitude_steps(settings: Settings, adaptive: Adaptive | None, times: Packet
     t_ms = times.last_ms[order]
     interval_ms = 1000.0 / adaptive.headers.rate_hz[order]
     values = _mask_idle(adaptive.amplitude_ma[order], t_ms, settings)
-    if not states:
+    if not programs:
         programs, assumed = (0,), True
     knots_t, knots_v = _with_adaptive(base_t, base_v, t_ms, interval_ms, values, settings)
     return AmplitudeSteps(knots_t, knots_v, programs, True, assumed)
@@ -88,7 +64,7 @@ def _mask_idle(values: NDArray[np.float64], t_ms: NDArray[np.float64], settings:
         if therapy is not None and therapy.on is False:
             out[i] = 0.0
         elif therapy is not None and therapy.programs:
-            out[i, [p for p in range(4) if p not in stimulating(therapy)]] = 0.0
+            out[i, [p for p in range(4) if p not in stimulating(therapy.programs)]] = 0.0
     return out
 
 
@@ -108,7 +84,8 @@ def _with_adaptive(
         begin, end = t_ms[run[0]] - interval_ms[run[0]], t_ms[run[-1]] + interval_ms[run[-1]]
         covered |= (base_t >= begin) & (base_t < end)
         bits = getattr(settings.sensing.at(float(end)), "sense_bits", None)
-        still_on = run[-1] + 1 < t_ms.size and (bits is None or bits & ADAPTIVE_BIT > 0)
+        last = run[-1] + 1 == t_ms.size
+        still_on = bits & ADAPTIVE_BIT > 0 if bits is not None else not last or settings.adaptive_lost
         before = int(np.searchsorted(base_t, end, side="right")) - 1
         after = np.full(4, np.nan) if still_on or before < 0 else base_v[before]
         pieces_t.append(np.concatenate(([begin], t_ms[run][1:], [end])))

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.rcs.amplitude import AmplitudeSteps, delivered, stimulating
+from ml.formats.dose import stimulating
+from ml.formats.rcs.amplitude import AmplitudeSteps
 from ml.formats.rcs.labels import parse, render
 from ml.formats.rcs.packets.streams import Adaptive
 from ml.formats.rcs.packets.time import PacketTimes
-from ml.formats.rcs.settings import GROUPS, Settings, get, integer, number
+from ml.formats.rcs.settings import GROUPS, Settings, dose_of, get, integer, number
 from ml.formats.rcs.traces import Grid
 from ml.formats.recording import EventLog
 
@@ -27,12 +28,13 @@ def stimulation_events(settings: Settings, grid: Grid) -> list[EventLog]:
     out = []
     for t_ms, state in zip(settings.therapy.times_ms, settings.therapy.states, strict=True):
         programs = []
-        for p in stimulating(state):
+        for p in stimulating(state.programs):
             program = state.programs[p]
             contacts = _contacts(settings, state.group, p)
             set_to = {"amplitude_ma": program.amplitude_ma, "pulse_width_us": program.pulse_width_us, "contacts": contacts}
             programs.append({"program": p, **set_to})
-        total = delivered(state)
+        dose = dose_of(state)
+        total = dose.amplitude_ma
         known = all(np.isfinite(total))
         data: dict[str, Any] = {
             "therapy_on": state.on,
@@ -40,6 +42,7 @@ def stimulation_events(settings: Settings, grid: Grid) -> list[EventLog]:
             "rate_hz": state.rate_hz,
             "programs": programs,
             "delivered_ma": [round(a, 4) for a in total] if known else None,
+            "why": list(dose.why),
             "origin": "StimLog" if settings.stim_log else "DeviceSettings",
         }
         amplitudes = " + ".join("? mA" if p["amplitude_ma"] is None else f"{p['amplitude_ma']:g} mA" for p in programs)

@@ -18,6 +18,7 @@ from ml.formats.rcs.opening import HEAD, STEM_OF, Opening, group, read_opening
 from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
 from ml.formats.rcs.packets.scan import Batch, batch_of, scan
 from ml.formats.rcs.packets.streams import (
+    Adaptive,
     Interval,
     read_accel,
     read_adaptive,
@@ -27,13 +28,16 @@ from ml.formats.rcs.packets.streams import (
     read_time_sync,
 )
 from ml.formats.rcs.recording import Streams, build_recording
-from ml.formats.rcs.settings import Settings, follow
+from ml.formats.rcs.settings import RECORDS_LOST, Lost, Settings, follow, host_ms
 from ml.formats.recording import DecodedFile, FileReport, Problem, RecordingLog, UndecodableFile
 
 T = TypeVar("T")
 MAX_RECORDS = 200_000
 NEEDED = ("DeviceSettings", "StimLog", "RawDataTD", "RawDataPower", "AdaptiveLog", "EventLog")
 """Files whose absence is worth a word."""
+
+TELLING = ("DeviceSettings", "StimLog", "AdaptiveLog")
+"""Files that say which amplitude was delivered: where part of one is lost, that is reported as a loss, not as a repair."""
 
 COUNTED = {"ErrorLog": "errors", "DiagnosticsLog": "diagnostics"}
 KEY_OF = {stem: key for key, stem in STEM_OF.items()}
@@ -160,10 +164,14 @@ def read_streams(session: SessionFiles, files: Files) -> Streams:
     records = {stem: _records(session, files, stem, infos) for stem in ("DeviceSettings", "StimLog", "EventLog")}
     settings = follow(records["DeviceSettings"], records["StimLog"])
     interval_at = _interval_at(settings)
+
+    def adaptive(records: Iterator[Any]) -> Adaptive:
+        return read_adaptive(_without_losses(records, settings), interval_at)
+
     return Streams(
         time_domain=_stream(session, files, "RawDataTD", infos, read_time_domain),
         power=_stream(session, files, "RawDataPower", infos, lambda packets: read_power(packets, interval_at)),
-        adaptive=_stream(session, files, "AdaptiveLog", infos, lambda records: read_adaptive(records, interval_at)),
+        adaptive=_stream(session, files, "AdaptiveLog", infos, adaptive),
         accel=_stream(session, files, "RawDataAccel", infos, read_accel),
         fft=_stream(session, files, "RawDataFFT", infos, lambda packets: read_fft(packets, interval_at)),
         time_sync=_stream(session, files, "TimeSync", infos, read_time_sync),
@@ -174,6 +182,15 @@ def read_streams(session: SessionFiles, files: Files) -> Streams:
     )
 
 
+def _without_losses(records: Iterable[Any], settings: Settings) -> Iterator[Any]:
+    """Yield the records of the adaptive log; the settings note where some are lost."""
+    for record in records:
+        if isinstance(record, Lost):
+            settings.adaptive_lost = True
+        else:
+            yield record
+
+
 def _interval_at(settings: Settings) -> Interval:
     def interval_at(pc_ms: float) -> float | None:
         state = settings.sensing.at(pc_ms if pc_ms == pc_ms else -1.0)
@@ -182,21 +199,35 @@ def _interval_at(settings: Settings) -> Interval:
     return interval_at
 
 
-def _elements(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]]) -> Iterator[Any]:
-    """Yield the records of one file, or its packets, in runs where they are plain; its report is complete when the iterator is
-    exhausted."""
+def _elements(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]], notes: JsonNotes | None = None) -> Iterator[Any]:
+    """Yield the records of one file, or its packets, in runs where they are plain, and a `Lost` where a log lacks some.
+
+    The file's report is complete when the iterator is exhausted.
+    """
     report = session.report(stem)
     notes = JsonNotes()
     wanted = KEY_OF.get(stem)
     try:
         with files.open(session.members[stem]) as stream:
+            damaged = 0
             for element, _ in read_elements(stream, notes, scan if wanted else None):
-                yield element
+                if notes.damaged > damaged and stem in TELLING:
+                    yield Lost()
+                damaged = notes.damaged
+                if isinstance(element, dict) and element.get(RECORDS_LOST):
+                    notes.elements -= 1
+                    yield Lost(host_ms(element))
+                else:
+                    yield element
     except UndecodableFile as error:
         session.reports[stem] = FileReport(report.name, problem=Problem(error.what, report.name, error.hint))
+        if stem in TELLING:
+            yield Lost()
         return
+    if stem in TELLING and (notes.cut or notes.damaged > damaged):
+        yield Lost(notes.cut_ms)
     infos.extend(notes.record_infos[:1])
-    report.repaired.extend(notes.defects)
+    (report.flagged if stem in TELLING and (notes.cut or notes.damaged) else report.repaired).extend(notes.defects)
     if notes.stream_key is not None and notes.stream_key != wanted:
         report.flagged.append(f"holds {notes.stream_key}, not what its name says")
     if notes.elements == 0:
@@ -237,12 +268,13 @@ def _batches(elements: Iterable[Any]) -> Iterator[Batch]:
 
 
 def _records(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]]) -> list[Any]:
-    """Read the records of a record file, reduced to the parts that are used."""
+    """Read the records of a record file, reduced to the parts that are used; a missing stimulation log is a loss of all of it."""
     if stem not in session.members:
-        return []
+        return [Lost()] if stem == "StimLog" else []
     out: list[Any] = []
     for record in _elements(session, files, stem, infos):
         if not isinstance(record, dict):
+            out += [record] if isinstance(record, Lost) else []
             continue
         if stem == "DeviceSettings":
             record = {
@@ -250,12 +282,19 @@ def _records(session: SessionFiles, files: Files, stem: str, infos: list[dict[st
             } | leads_only(record)
         if len(out) == MAX_RECORDS:
             session.report(stem).flagged.append(f"more than {MAX_RECORDS} records; the rest was left out")
+            out.append(Lost())
             break
         out.append(record)
     return out
 
 
-def _stream(session: SessionFiles, files: Files, stem: str, infos: list[dict[str, Any]], read: Callable[[Iterator[Any]], T]) -> T | None:
+def _stream(
+    session: SessionFiles,
+    files: Files,
+    stem: str,
+    infos: list[dict[str, Any]],
+    read: Callable[[Iterator[Any]], T],
+) -> T | None:
     """Read a stream file by `read`; None where the file is missing."""
     if stem not in session.members:
         return None

@@ -23,7 +23,7 @@ KEYS = frozenset(
         Ld0DetectionStatus Ld0Status Ld1 Ld1DetectionStatus Ld1Status LoopRecordMarkerEchoStreamEnabled
         MaxStackDueToOorUnreliable ModuleType OOR OorData PacketGenTime PacketRxUnixTime PhysicalLayer PorHasOccurred
         PowerDomainData PowerDomainStreamEnabled PreviousAdaptiveState PulseWidthInMicroseconds RateInHz ReadFlashMirror
-        RecordInfo RejectCode RlpApiVersion RlpAppVersion RlpNotepadSectorNum RlpNotepadSectorStart SampleRate SenseState
+        RecordInfo RecordsLost RejectCode RlpApiVersion RlpAppVersion RlpNotepadSectorNum RlpNotepadSectorStart SampleRate SenseState
         SensingConfig SensingStatus SequenceError SequenceNumber SessionId SessionInitWarnings StateEntryCount StateTime
         StatusChange1 StimFlags StimRateInHz StreamState StreamsEnabled SubjectInfoSectorNum SubjectInfoSectorStart
         TelemetryModuleInfo TelmMode TelmRatio TestPacketNum TheLinkStatus TherapyConfigGroup0 TherapyConfigGroup1

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.beta import LARGEST_UV
+from ml.formats.dose import Dose
 from ml.formats.options import DecodeOptions
 from ml.formats.rcs.amplitude import AmplitudeSteps, amplitude_steps
 from ml.formats.rcs.beta import Stretch, beta_traces, impossible_samples, time_domain_samples, time_domain_spectra, time_domain_stretches
@@ -21,12 +22,15 @@ from ml.formats.rcs.packets.headers import PacketHeaders
 from ml.formats.rcs.packets.streams import Accel, Adaptive, Fft, Power, TimeDomain, TimeSync
 from ml.formats.rcs.packets.time import PacketTimes, RecordingTimes, reconstruct_all
 from ml.formats.rcs.quality import STEMS, describe_clock, describe_quality
-from ml.formats.rcs.settings import GROUPS, Settings, get, integer, number
+from ml.formats.rcs.settings import GROUPS, Settings, Therapy, dose_of, get, integer, number
 from ml.formats.rcs.traces import Grid, accel_traces, amplitude_traces, fft_results, power_traces
 from ml.formats.recording import FileReport, Hemisphere, RecordingLog, SpectrumLog, TraceLog, fingerprint
 
 MAX_ROWS = 100_000
 """Rows a recording may have (55 h of 2 s steps): clocks that span more are wrong."""
+
+MAX_CONFLICTS = 10
+"""As many contradictions between two sources are reported one by one."""
 
 PRIMARY = ("time_domain", "power", "adaptive")
 """Streams that say what was recorded; the others matter for identity only where none of these is there."""
@@ -88,6 +92,10 @@ def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) 
     quality = describe_quality(streams.data(), times, settings, streams.counts, report)
     if timeline.streams:
         quality["clock"] = describe_clock(timeline, start_ms, report)
+    quality["amplitude_conflicts"] = [
+        {"t_s": round((t - start_ms) / 1000.0, 3), "log_ma": _milliamps(log), "settings_ma": _milliamps(read)}
+        for t, log, read in settings.conflicts
+    ]
     quality["valid_fraction"] = {f"{t.stream} {t.channel}": round(float(t.valid.mean()), 4) for t in traces if t.valid.size}
     quality["spike_packets"] = {t.channel: t.details["spike_packets"] for t in traces if t.details.get("spike_packets")}
     device_clock = bool(main) and all(times[name].device_clock for name in main)
@@ -187,7 +195,26 @@ def _traces(
         report("StimLog").flagged.append("no enabled program known: the recording has no amplitude trace")
     if steps.assumed_program:
         report("StimLog").flagged.append("no settings say which programs are enabled: program 0 is taken to be the one that stimulates")
+    _tell_dose(settings, grid, report)
     return traces + amplitude, spectra
+
+
+def _tell_dose(settings: Settings, grid: Grid, report: ReportOf) -> None:
+    """Report where and why the delivered amplitude is unknown, or differs from the one that was set."""
+    about = report("StimLog" if settings.stim_log else "DeviceSettings").flagged
+    if settings.lost:
+        about.append("records are lost: the amplitude is unknown from the last one before the loss until a source states it again")
+    for said in dict.fromkeys(why for state in settings.therapy.states if state != Therapy() for why in dose_of(state).why):
+        about.append(said)
+    for t_ms, log, read in settings.conflicts[:MAX_CONFLICTS]:
+        at = (t_ms - grid.start_ms) / 1000.0
+        about.append(f"at {at:.1f} s StimLog says {_milliamps(log)} and DeviceSettings {_milliamps(read)}: the amplitude is unknown there")
+    if (more := len(settings.conflicts) - MAX_CONFLICTS) > 0:
+        about.append(f"StimLog and DeviceSettings differ at {more} further moments")
+
+
+def _milliamps(dose: Dose) -> str:
+    return " + ".join(f"{dose.amplitude_ma[p]:g} mA" for p in dose.programs) or "0 mA"
 
 
 def _limits(settings: Settings) -> dict[str, Any]:

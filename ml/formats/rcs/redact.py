@@ -12,18 +12,20 @@ import re
 import zipfile
 from collections import Counter
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from ml.formats.archive import ZipFiles, hint_of, told
 from ml.formats.options import ArchiveLimits
-from ml.formats.rcs.folder import SessionFiles, find_sessions
+from ml.formats.rcs.folder import TELLING, SessionFiles, find_sessions
 from ml.formats.rcs.keys import KEYS
 from ml.formats.rcs.labels import NO_LABEL, parse, render
 from ml.formats.rcs.leads import clean_leads
 from ml.formats.rcs.opening import NAMED
 from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
 from ml.formats.rcs.packets.scan import Batch, scan
+from ml.formats.rcs.settings import RECORDS_LOST
 from ml.formats.recording import FileReport, UndecodableFile
 from ml.formats.redaction_record import PSEUDONYM, Redaction, pseudonym
 from ml.formats.source import Source
@@ -82,7 +84,7 @@ def redact_rcs_zip(source: Source, target: Path, key: bytes, limits: ArchiveLimi
         members = sorted(_plan(sessions, files, scrub, taken))
         with zipfile.ZipFile(target, "w") as archive:
             for name, stem, label, origin in members:
-                _write_member(archive, name, f"{label}{stem}.json", files, origin, scrub, done)
+                _write_member(archive, (name, stem, label), files, origin, scrub, done)
         if len(done.unreadable) == len(members):
             what = "every file of the RC+S session is empty or cannot be read"
             raise UndecodableFile(what, "archive", "Zip the session's Device folder again, from where it was recorded.")
@@ -131,31 +133,42 @@ def _first_info(files: ZipFiles, name: str) -> dict[str, Any] | None:
     return notes.record_infos[0] if notes.record_infos else None
 
 
-def _write_member(archive: zipfile.ZipFile, name: str, shown: str, files: ZipFiles, origin: str, scrub: _Scrubber, done: Redaction) -> None:
-    """Copy one file's elements, scrubbed; a file without a readable start is ignored and named."""
+def _write_member(
+    archive: zipfile.ZipFile, names: tuple[str, str, str], files: ZipFiles, origin: str, scrub: _Scrubber, done: Redaction
+) -> None:
+    """Copy one file's elements, scrubbed; a file without a readable start is ignored and named.
+
+    A log of what was delivered keeps a mark where records are lost: without one its last record would seem to hold.
+    """
+    name, stem, label = names
+    shown = f"{label}{stem}.json"
     notes = JsonNotes()
     info = zipfile.ZipInfo(name, EPOCH)
     info.compress_type = zipfile.ZIP_DEFLATED
     info._compresslevel = DEFLATE_LEVEL  # type: ignore[attr-defined, unused-ignore]  # no public name before Python 3.13
     info.create_system, info.external_attr = 3, 0o100600 << 16
+    marked = stem in TELLING
     try:
         with files.open(origin) as stream:
             elements = read_elements(stream, notes, scan)
             first = next(elements, None)
             if first is None and notes.defects and not notes.record_infos:
                 done.unreadable.append(f"{shown}: {notes.defects[0]}")
+                if marked:
+                    archive.writestr(info, f"[{_mark(None)}]")
                 return
             with archive.open(info, "w", force_zip64=True) as out:
-                _write_elements(out, first, elements, notes, scrub)
+                _write_elements(out, first, elements, notes, scrub, marked)
     except UndecodableFile as error:
         done.unreadable.append(f"{shown}: {error.what}")
         return
     scrub.fields_left_out(notes.unread_fields)
-    done.repaired.extend(f"{shown}: {defect}" for defect in notes.defects)
+    told = done.flagged if marked and (notes.cut or notes.damaged) else done.repaired
+    told.extend(f"{shown}: {defect}" for defect in notes.defects)
 
 
 def _write_elements(
-    out: IO[bytes], first: tuple[Any, str] | None, rest: Iterator[tuple[Any, str]], notes: JsonNotes, scrub: _Scrubber
+    out: IO[bytes], first: tuple[Any, str] | None, rest: Iterator[tuple[Any, str]], notes: JsonNotes, scrub: _Scrubber, marked: bool
 ) -> None:
     key = notes.stream_key
     if key is not None:
@@ -163,11 +176,22 @@ def _write_elements(
         out.write(f'[{{"RecordInfo":{head},"{key}":['.encode())
     else:
         out.write(b"[")
-    if first is not None:
-        out.write(scrub.text(*first).encode())
-    for value, text in rest:
-        out.write(b"," + scrub.text(value, text).encode())
+    damaged, comma = 0, b""
+    for value, text in chain([first] if first is not None else [], rest):
+        if marked and notes.damaged > damaged:
+            out.write(comma + _mark(None).encode())
+            comma = b","
+        damaged = notes.damaged
+        out.write(comma + scrub.text(value, text).encode())
+        comma = b","
+    if marked and (notes.cut or notes.damaged > damaged):
+        out.write(comma + _mark(notes.cut_ms).encode())
     out.write(b"]}]" if key is not None else b"]")
+
+
+def _mark(at_ms: float | None) -> str:
+    """Write the record in the place of lost ones."""
+    return _dump({"RecordInfo": {} if at_ms is None else {"HostUnixTime": int(at_ms)}, RECORDS_LOST: True})
 
 
 def _dump(value: Any) -> str:

@@ -5,17 +5,30 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.formats.dose import Cycle, Dose, Program, delivered_dose
+from ml.formats.vouching import Vouching
+
 RATE_HZ = {0: 250.0, 1: 500.0, 2: 1000.0}
 FFT_SIZE = {0: 64, 1: 256, 3: 1024}
 ADAPTIVE_BIT = 128
 GROUPS = "ABCD"
+PROGRAMS = 4
+RECORDS_LOST = "RecordsLost"
+"""Key of the record that a redacted log has in the place of lost ones, with their PC time where it is known."""
+
 SENSING_SECTIONS = frozenset({"SensingConfig", "SenseState"})
+ON_OF_STATUS: dict[int | None, bool] = {0: False, 1: True}
+"""Therapy off and on. With any other status (lead test, transitions) what is delivered is unknown. Source: format notes, A.5."""
+
+CYCLE_UNIT_S: dict[int | None, float] = {2: 1.0}
+"""Length of a unit of cycle times, s. Codes 0 and 1 occur too. Their unit is in no source read so far, hence unknown."""
+
 THERAPY_SECTIONS = frozenset({"GeneralData", "therapyStatusData"})
 """Sections that sensing and stimulation are read from, in addition to the therapy groups; a record without them changes neither."""
 
@@ -73,15 +86,6 @@ class Band:
 
 
 @dataclass(frozen=True, slots=True)
-class Program:
-    """One stimulation program as set."""
-
-    enabled: bool | None
-    amplitude_ma: float | None
-    pulse_width_us: float | None
-
-
-@dataclass(frozen=True, slots=True)
 class Sensing:
     """Sensing in force: contact pairs per time-domain key, FFT interval, bands."""
 
@@ -95,12 +99,13 @@ class Sensing:
 
 @dataclass(frozen=True, slots=True)
 class Therapy:
-    """Stimulation in force: status, active group and its four programs."""
+    """Stimulation in force: status, active group and its four programs, and whether it cycles."""
 
     on: bool | None = None
     group: int | None = None
     rate_hz: float | None = None
     programs: tuple[Program, ...] = ()
+    cycle: Cycle | None = field(default=None, repr=False)
 
 
 @dataclass(slots=True)
@@ -170,28 +175,50 @@ def _band(config: Any, index: int, rate_hz: float | None, size: int | None) -> B
     return Band(index // 2, index, max(0.0, (start - 0.5) * width), (stop + 0.5) * width)
 
 
-def therapy_of(state: dict[str, Any], stim: dict[str, Any] | None) -> Therapy:
-    """Read stimulation as set: from the stimulation log's state where there is one, enabled programs always from the settings."""
-    status = merge(get(state, "GeneralData", "therapyStatusData") or {}, get(stim, "therapyStatusData") or {})
+def therapy_of(state: dict[str, Any], stim: dict[str, Any] | None, lost: bool = False) -> Therapy:
+    """Read stimulation as set: from the stimulation log's state where there is one, enabled programs always from the settings.
+
+    With `lost` records of the log are missing: status and amplitudes are those that it stated since, and no older ones of the settings.
+    """
+    told = {} if lost else get(state, "GeneralData", "therapyStatusData") or {}
+    status = merge(told, get(stim, "therapyStatusData") or {})
     group = integer(get(status, "activeGroup"))
-    on = integer(get(status, "therapyStatus"))
+    on = ON_OF_STATUS.get(integer(get(status, "therapyStatus")))
     if group is None or not 0 <= group <= 3:
-        return Therapy(on=None if on is None else on == 1)
+        return Therapy(on=on)
     settings, log = get(state, f"TherapyConfigGroup{group}"), get(stim, f"TherapyConfigGroup{group}")
     programs = []
     for p in range(4):
         enabled = integer(get(settings, "programs", p, "isEnabled"))
         amplitude = number(get(log, f"program{p}", "AmplitudeInMilliamps"))
         width = number(get(log, f"program{p}", "PulseWidthInMicroseconds"))
-        programs.append(
-            Program(
-                None if enabled is None else enabled == 0,
-                number(get(settings, "programs", p, "amplitudeInMilliamps")) if amplitude is None else amplitude,
-                number(get(settings, "programs", p, "pulseWidthInMicroseconds")) if width is None else width,
-            )
-        )
+        if amplitude is None and not lost:
+            amplitude = number(get(settings, "programs", p, "amplitudeInMilliamps"))
+        if width is None:
+            width = number(get(settings, "programs", p, "pulseWidthInMicroseconds"))
+        programs.append(Program(None if enabled is None else enabled == 0, amplitude, width, _limits(state, group, p)))
     rate = number(get(log, "RateInHz"))
-    return Therapy(None if on is None else on == 1, group, number(get(settings, "rateInHz")) if rate is None else rate, tuple(programs))
+    return Therapy(on, group, number(get(settings, "rateInHz")) if rate is None else rate, tuple(programs), _cycle(settings))
+
+
+def _limits(state: dict[str, Any], group: int, program: int) -> tuple[float, float] | None:
+    """Read the clinician's amplitude limits of a program, mA."""
+    low, high = (number(get(state, f"AmplitudeLimitsGroup{group}", f"prog{program}{end}InMilliamps")) for end in ("Lower", "Upper"))
+    return None if low is None or high is None else (low, high)
+
+
+def _cycle(group: Any) -> Cycle | None:
+    """Read the cycling of a therapy group; None where it is continuous."""
+    if not get(group, "cyclingEnabled"):
+        return None
+    on, off = (get(group, name) for name in ("cycleOnTime", "cycleOffTime"))
+    return Cycle(_cycle_s(on), _cycle_s(off))
+
+
+def _cycle_s(time: Any) -> float | None:
+    """Read one length of a cycle, s; None for an unknown unit."""
+    length, unit = number(get(time, "time")), CYCLE_UNIT_S.get(integer(get(time, "units")))
+    return None if length is None or unit is None else length * unit
 
 
 def host_ms(record: Any) -> float | None:
@@ -200,15 +227,29 @@ def host_ms(record: Any) -> float | None:
     return time_ms if time_ms is not None and 0 < time_ms < 2.5e14 else None
 
 
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """Place in a log where records are missing: it vouches for nothing from `from_ms` (PC clock) on; from its last record on where None."""
+
+    from_ms: float | None = None
+
+
 @dataclass(slots=True)
 class Settings:
-    """Everything the settings and the stimulation log say, over time."""
+    """Everything the settings and the stimulation log say, over time.
+
+    `lost`: whether records about stimulation are missing. `adaptive_lost`: the same of the adaptive log.
+    `conflicts`: where both say different things, as (PC ms, amplitudes of the log, those of the settings) in mA.
+    """
 
     sensing: Timeline[Sensing]
     therapy: Timeline[Therapy]
     merged: dict[str, Any]
     stim_log: bool
     record_times_ms: list[float] = field(default_factory=list)
+    lost: bool = False
+    adaptive_lost: bool = False
+    conflicts: list[Conflict] = field(default_factory=list)
 
     def at_times(self, of_pc_ms: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Settings:
         """Move the settings' PC times onto a recording's timeline."""
@@ -219,46 +260,98 @@ class Settings:
 
         sensing = Timeline(moved(self.sensing.times_ms), self.sensing.states)
         therapy = Timeline(moved(self.therapy.times_ms), self.therapy.states)
-        return Settings(sensing, therapy, self.merged, self.stim_log, moved(self.record_times_ms))
+        conflicts = [(t, c[1], c[2]) for t, c in zip(moved([c[0] for c in self.conflicts]), self.conflicts, strict=True)]
+        return replace(self, sensing=sensing, therapy=therapy, record_times_ms=moved(self.record_times_ms), conflicts=conflicts)
+
+
+Conflict = tuple[float, Dose, Dose]
+"""PC time in ms, dose by the stimulation log, dose by the settings."""
 
 
 def follow(settings: Iterable[Any], stim: Iterable[Any]) -> Settings:
     """Merge both delta logs in the order of the PC clock.
 
+    The stimulation log says what was delivered. Where records of it are lost, the settings vouch for the moments at which they were read.
+
     Args:
         settings: records of DeviceSettings.json in file order.
-        stim: records of StimLog.json in file order.
+        stim: records of StimLog.json in file order; a `Lost` where some are missing.
     """
+    settings, stim = list(settings), list(stim)
     out = Settings(Timeline(), Timeline(), {}, False)
-    moves = [(t, 0, i, r) for i, r in enumerate(settings) if (t := host_ms(r)) is not None]
-    moves += [(t, 1, i, r) for i, r in enumerate(stim) if (t := host_ms(r)) is not None]
-    out.record_times_ms = sorted(move[0] for move in moves)
+    times = [t for record in (*settings, *stim) if not isinstance(record, Lost) and (t := host_ms(record)) is not None]
+    moves = _moves(settings, 0, min(times, default=0.0)) + _moves(stim, 1, min(times, default=0.0))
+    moves.sort(key=lambda move: move[:3])
+    out.record_times_ms = sorted(times)
+    vouching = Vouching(dose_of, Therapy())
     logged: dict[str, Any] | None = None
-    for time_ms, origin, _, record in sorted(moves, key=lambda move: move[:3]):
+    since: dict[str, Any] = {}
+    lost = False
+    for time_ms, origin, _, record in moves:
+        if isinstance(record, Lost):
+            if origin == 1:
+                vouching.log += [(time_ms, state) for state in out.therapy.states[-1:]]
+                logged, since, lost = {}, {}, True
+                out.therapy.add(time_ms, Therapy())
+            continue
         delta = {key: value for key, value in record.items() if key != "RecordInfo"}
         if origin == 0:
-            out.merged = merge(out.merged, delta)
+            out.merged, since = merge(out.merged, delta), merge(since, delta)
             if not out.sensing.states or not delta.keys().isdisjoint(SENSING_SECTIONS):
                 out.sensing.add(time_ms, sensing_of(out.merged))
+            if any(key.startswith("TherapyConfigGroup") for key in delta):
+                vouching.readings.append((time_ms, therapy_of(since, None)))
         else:
             logged = merge(logged or {}, delta)
-        if logged is not None and (not out.therapy.states or _tells_therapy(delta)):
-            out.therapy.add(time_ms, therapy_of(out.merged, logged))
-    out.stim_log = logged is not None
+        if logged is not None and (not out.therapy.states or tells_therapy(delta)):
+            out.therapy.add(time_ms, therapy_of(out.merged, logged, lost))
+            if origin == 1:
+                vouching.log.append((time_ms, out.therapy.states[-1]))
+    out.stim_log, out.lost = bool(logged), lost or (logged is None and any(isinstance(move[3], Lost) for move in moves))
     if logged is None:
         _therapy_from_settings(out, moves)
+    else:
+        course, out.conflicts = vouching.combine(out.therapy.times_ms, out.therapy.states)
+        out.therapy = Timeline()
+        for time_ms, state in course:
+            out.therapy.add(time_ms, state)
     return out
 
 
-def _tells_therapy(delta: dict[str, Any]) -> bool:
+def dose_of(therapy: Therapy) -> Dose:
+    """Compute the dose under these settings.
+
+    Without settings that say which programs are enabled, the first one is taken to be.
+    """
+    dose = delivered_dose(therapy.on, therapy.programs, therapy.cycle)
+    return dose if len(dose.amplitude_ma) == PROGRAMS else replace(dose, amplitude_ma=dose.amplitude_ma[:1] * PROGRAMS)
+
+
+def _moves(records: Iterable[Any], origin: int, first_ms: float) -> list[tuple[float, int, int, Any]]:
+    """List records with their PC time in ms, the number of their log and their place in it; those without a time are excluded."""
+    out: list[tuple[float, int, int, Any]] = []
+    latest = first_ms
+    for i, record in enumerate(records):
+        time_ms = (latest if record.from_ms is None else max(record.from_ms, latest)) if isinstance(record, Lost) else host_ms(record)
+        if time_ms is not None:
+            out.append((time_ms, origin, i, record))
+            latest = max(latest, time_ms)
+    return out
+
+
+def tells_therapy(delta: dict[str, Any]) -> bool:
     return any(key in THERAPY_SECTIONS or key.startswith("TherapyConfigGroup") for key in delta)
 
 
 def _therapy_from_settings(out: Settings, moves: list[tuple[float, int, int, Any]]) -> None:
     """Read stimulation from the settings' own therapy groups, where there is no stimulation log."""
     state: dict[str, Any] = {}
-    for time_ms, _, _, record in sorted(moves, key=lambda move: move[:3]):
+    for time_ms, _, _, record in moves:
+        if isinstance(record, Lost):
+            state = {}
+            out.therapy.add(time_ms, Therapy())
+            continue
         delta = {key: value for key, value in record.items() if key != "RecordInfo"}
         state = merge(state, delta)
-        if not out.therapy.states or _tells_therapy(delta):
+        if not out.therapy.states or tells_therapy(delta):
             out.therapy.add(time_ms, therapy_of(state, None))

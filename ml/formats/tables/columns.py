@@ -43,6 +43,12 @@ LEAST_FRACTION = 0.05
 """Below this fraction rounding alone moves the ratio."""
 LONGEST_TABLE_S = 7 * 86_400.0
 """No session's table reaches further from the session's start, before it or after it."""
+LATEST_FIRST_S = 3600.0
+"""No session begins an hour before its first row."""
+
+LONGEST_SESSION_S = 86_400.0
+"""No session of a visit lasts longer than a day."""
+
 _UNIX_SPAN_S = (datetime(1990, 1, 1, tzinfo=UTC).timestamp(), datetime(2200, 1, 1, tzinfo=UTC).timestamp())
 _UNIX_UNITS = (("seconds", 1.0), ("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
 LOG_KIND_LINE = "# betaloop controller log, version 1, period 2 s"
@@ -85,6 +91,7 @@ def check_reach(t_s: NDArray[np.float64], columns: Columns) -> None:
     """
     far = np.flatnonzero(np.abs(t_s) > LONGEST_TABLE_S)
     if far.size == 0:
+        _check_start(t_s, columns)
         return
     row, hint = int(far[0]), "Give t_s in seconds from the session's start, one session per table: rows before the start are negative."
     written = float(columns.values["t_s"][row])
@@ -97,6 +104,22 @@ def check_reach(t_s: NDArray[np.float64], columns: Columns) -> None:
             raise columns.error(what, "t_s", hint, row)
     what = f"{t_s[row]:.9g} s lies more than a week from the session's start, t_s 0"
     raise columns.error(what, "t_s", hint, row)
+
+
+def _check_start(t_s: NDArray[np.float64], columns: Columns) -> None:
+    """Raise where the first row comes so late, or rows are so rare, that the times are likely of another clock or unit."""
+    if t_s[0] > LATEST_FIRST_S:
+        hours, minutes = divmod(round(float(t_s[0]) / 60), 60)
+        what = f"the first row lies {t_s[0] / 3600:.3g} h after the session's start, t_s 0"
+        hint = (
+            "Give t_s in seconds from the session's start. If these are seconds of the day, subtract the time of day at which the session "
+            f"started (the first row would be at {hours:02d}:{minutes:02d})."
+        )
+        raise columns.error(what, "t_s", hint, 0)
+    if t_s[-1] - max(0.0, float(t_s[0])) > LONGEST_SESSION_S:
+        what = f"the session would last {(t_s[-1] - max(0.0, float(t_s[0]))) / 3600:.3g} h"
+        hint = "Give t_s in seconds, one session per table. If these are milliseconds, name the column t_ms."
+        raise columns.error(what, "t_s", hint, t_s.size - 1)
 
 
 def match_columns(headers: Sequence[str]) -> tuple[dict[str, int], dict[str, str | None], list[str], list[str]]:

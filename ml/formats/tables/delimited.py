@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 
 from ml.formats.recording import UndecodableFile
 from ml.formats.source import Source
-from ml.formats.tables.numbers import TIME_COLUMNS, TIME_UNITS, NotANumber, column_name, known_unit, parse_number, shown
+from ml.formats.tables.numbers import TIME_COLUMNS, TIME_UNITS, Grouping, NotANumber, column_name, known_unit, parse_number, shown
 
 MOSTLY = 0.9
 """Share of the letters of a table that are Latin."""
 
+MARKS = {".": "point", ",": "comma"}
 MOST_TITLES = 20
 """Lines that may come above the header."""
 
@@ -79,6 +80,16 @@ class TextTable:
             UndecodableFile: a cell holds text; names its line.
         """
         known = f"column {role}" if role else f"column number {column + 1}"
+        grouping = Grouping(decimal)
+        grouping.feed(row[column] for row in self.rows)
+        if grouping.ambiguous(self.delimiter) and grouping.marked is not None:
+            cell, line = self.rows[grouping.marked][column].strip(), self.lines[grouping.marked]
+            plain = cell.replace(decimal, "")
+            either = f"{shown(cell)} may mean {plain} or {cell.replace(',', '.')}"
+            what = f"{either}: every {MARKS[decimal]} in the column has exactly three digits behind it"
+            hint = f"Write {plain} without a thousands separator, or {cell}0 with another number of decimals."
+            stored = "a number may have a thousands separator or three decimals"
+            raise UndecodableFile(what, f"line {line}, column {self.headers[column].strip()}", hint, stored, f"line {line}, {known}")
         cells = ((row[column], line) for row, line in zip(self.rows, self.lines, strict=True))
         return np.array([self._number(cell, decimal, line, column, known) for cell, line in cells], dtype=np.float64)
 

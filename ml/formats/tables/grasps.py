@@ -25,10 +25,10 @@ LEAST_FRAMES = 20
 """So many intervals, nearly all under the shortest plausible one, are the frames of a hand tracker."""
 
 COUNTERS = frozenset({"", "n", "i", "index", "number", "grasp", "count", "unnamed:_0"})
-EVENTS = frozenset({"event", "state", "phase", "gesture"})
+EVENTS = frozenset({"event", "events", "state", "status", "phase", "gesture", "hand_state", "action"})
 """Names of a column that says what happened at a time."""
-OPENED = frozenset({"open", "opened", "open_fist", "open fist", "open_hand", "open hand"})
-CLOSED = frozenset({"close", "closed", "closed_fist", "closed fist", "closed_hand", "closed hand", "fist"})
+OPENED = frozenset({"open", "opening", "opened", "open_fist", "open fist", "open_hand", "open hand"})
+CLOSED = frozenset({"close", "closing", "closed", "closed_fist", "closed fist", "closed_hand", "closed hand", "fist"})
 HANDS: dict[str, Hemisphere] = {"l": "left", "left": "left", "r": "right", "right": "right"}
 
 

@@ -24,6 +24,17 @@ ROUND_RATE = 0.002
 MAX_JITTER = 0.5
 """Samples may be this share of their distance away from an even clock; more is no evenly sampled signal."""
 
+DOUBLE = 2.5
+LEAST_DOUBLES = 12
+EVENLY = 0.5
+"""Steps of two grains repeat evenly where their distances vary by less than this share; lost samples vary by about their mean."""
+
+COARSE_SPREAD = 1.25
+"""An even clock rounded to grains lies within one of them, and a little more for the last digit."""
+
+NO_CLOCK = 10.0
+"""Times that stray this many steps from an even clock are uneven, or have lost samples; it is not that they are coarse."""
+
 MIN_ROWS = 8
 LARGEST_RATE_HZ = 100_000.0
 MOST_SAMPLES = 64_000_000
@@ -109,6 +120,9 @@ def _rate(t_s: NDArray[np.float64], columns: Columns, report: FileReport) -> tup
     # the median suffers from rounded times, the mean does not
     usual = float(steps[inside].mean())
     inside = steps <= GAP * usual
+    if (even := _coarse_clock(t_s, usual, columns)) is not None:
+        usual, inside = even
+        report.flagged.append(f"the times are coarse: the rate is that of all {t_s.size} samples between the first and the last time")
     rate = 1.0 / usual
     if abs(rate - round(rate)) <= ROUND_RATE * rate and round(rate) > 0:
         rate = float(round(rate))
@@ -117,7 +131,7 @@ def _rate(t_s: NDArray[np.float64], columns: Columns, report: FileReport) -> tup
         what = f"the times say {rate:.3g} samples a second" + (f" and {bridged:.3g} samples in all" if rate <= LARGEST_RATE_HZ else "")
         raise columns.error(what, "t_s", "Give the times in seconds, one row per sample.")
     uneven = np.abs(steps - usual) > MAX_JITTER * usual
-    off = inside & uneven
+    off = inside & uneven & (even is None)
     if off.sum() > 0.01 * steps.size:
         i = int(np.flatnonzero(off)[0]) + 1
         what = f"times are not evenly spaced: {steps[i - 1]:g} s here, {usual:g} s on average"
@@ -128,9 +142,39 @@ def _rate(t_s: NDArray[np.float64], columns: Columns, report: FileReport) -> tup
         share = 100 * missing / (missing + t_s.size)
         report.flagged.append(f"{cuts.size} gap{'s' if cuts.size > 1 else ''} in the times: {missing} samples ({share:.1f} %) are missing")
     jitter = float(np.max(np.abs(steps[inside] - usual), initial=0.0))
-    if jitter > 0.1 * usual:
+    if even is None and jitter > 0.1 * usual:
         report.flagged.append(f"the times jitter by up to {1000 * jitter:.3g} ms around an even clock of {rate:g} Hz")
     return rate, cuts
+
+
+def _coarse_clock(t_s: NDArray[np.float64], usual: float, columns: Columns) -> tuple[float, NDArray[np.bool_]] | None:
+    """Find the sampling interval in s where times are no finer than it, and the steps without a gap, [n - 1]; None for finer times.
+
+    Times in single precision step by one grain or by two, in turns that repeat. Lost samples come at random. So where steps of two grains
+    repeat evenly, no sample is lost: the interval is (last - first) / (n - 1).
+
+    Raises:
+        UndecodableFile: the even clock behind the grains does not fit all times, or gives no whole rate.
+    """
+    steps = np.diff(t_s)
+    double = np.flatnonzero((steps > GAP * usual) & (steps < DOUBLE * usual))
+    between = np.diff(double)
+    if double.size < LEAST_DOUBLES or double.size < ROUND_RATE * steps.size or between.std() > EVENLY * between.mean():
+        return None
+    inside = steps < DOUBLE * usual
+    edges = np.concatenate(([0], np.flatnonzero(~inside) + 1, [t_s.size]))
+    counts = np.diff(edges) - 1
+    interval = float((t_s[edges[1:] - 1] - t_s[edges[:-1]]).sum() / counts.sum())
+    pairs = zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+    spread = max(float(np.ptp(t_s[a:b] - interval * np.arange(b - a))) for a, b in pairs)
+    rate = 1.0 / interval
+    if spread > NO_CLOCK * usual:
+        return None
+    if spread > COARSE_SPREAD * usual or abs(rate - round(rate)) > ROUND_RATE * rate:
+        what = f"the times are too coarse: they step by {1000 * usual:.3g} ms, which does not tell the rate nor whether a sample is missing"
+        hint = "Write the times with more digits, such as seconds from the session's start with six decimals, not in single precision."
+        raise columns.error(what, "t_s", hint, int(double[0]) + 1)
+    return interval, inside
 
 
 def _stretches(t_s: NDArray[np.float64], lfp: NDArray[np.float64], rate: float, cuts: NDArray[np.int64]) -> list[Stretch]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from datetime import UTC, datetime
 
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "inf", "+inf", "-inf", "infinity", "+infinity", "-infinity"})
@@ -63,6 +64,46 @@ def parse_number(cell: str, decimal: str = ".") -> float | None:
         raise NotANumber(text)
     value = float(text.replace(",", "."))
     return value if value not in (float("inf"), float("-inf")) else None
+
+
+class Grouping:
+    """Search for thousands separators in one column: whether its mark may separate thousands as well as decimals.
+
+    A mark is decimal for sure where another number than three of digits follows it, or a 0 or more than three digits precede it. It is
+    decimal, too, where another cell has four digits without one.
+    """
+
+    def __init__(self, mark: str) -> None:
+        self._mark = mark
+        self.decimal = False
+        self.plain = False
+        self.marked: int | None = None
+        self._rows = 0
+
+    def feed(self, cells: Iterable[str]) -> None:
+        """Look at further cells of the column, as far as it is not decided."""
+        for cell in () if self.decimal else cells:
+            text = cell.strip().lstrip("+-")
+            whole, mark, rest = text.partition(self._mark)
+            if mark:
+                self.decimal = not (len(rest) == 3 and rest.isdigit() and whole.isdigit() and 1 <= len(whole) <= 3 and whole[0] != "0")
+                self.marked = self._rows if self.marked is None else self.marked
+            elif text.isdigit():
+                self.decimal = len(text) > 3
+                self.plain = True
+            self._rows += 1
+            if self.decimal:
+                return
+
+    def ambiguous(self, delimiter: str) -> bool:
+        """Decide whether the mark may separate thousands, in a table whose cells are separated by `delimiter`.
+
+        Next to whole numbers without a mark it may. Without any it may in the tables of the other locale: points in semicolon tables,
+        quoted commas in comma tables.
+        """
+        if self.decimal or self.marked is None:
+            return False
+        return self.plain or (delimiter, self._mark) in ((";", "."), (",", ","))
 
 
 def iso_time(cell: str) -> float | None:

@@ -13,6 +13,8 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.formats.tables.numbers import Grouping
+
 LINES_AT_ONCE = 16_384
 LONGEST_LINE = 10_000
 _NUMBER = r"(?:[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[nN]a[nN])?"
@@ -33,18 +35,23 @@ def read_plain(
     other = f'[^"\n{re.escape(delimiter)}]*'
     plain = re.compile(re.escape(delimiter).join(_NUMBER if i in used else other for i in range(width)) + r"\n?")
     blocks: dict[int, list[NDArray[np.float64]]] = {i: [] for i in used}
+    groupings = {i: Grouping(".") for i in used}
     rows = 0
     while block := list(islice(lines, LINES_AT_ONCE)):
         rows += len(block)
         if rows > max_rows or max(map(len, block)) > LONGEST_LINE or not all(map(plain.fullmatch, block)):
             return None
         cells = delimiter.join(block).replace("\n", "").split(delimiter)
+        for i, grouping in groupings.items():
+            grouping.feed(cells[i::width])
         numbers = {i: _floats(cells[i::width]) for i in used}
         # a row without any number may be a blank line, which is no row
         if np.all([np.isnan(x) for x in numbers.values()], axis=0).any():
             return None
         for i, column in numbers.items():
             blocks[i].append(column)
+    if any(grouping.ambiguous(delimiter) for grouping in groupings.values()):
+        return None
     return {i: np.concatenate(column) if column else np.empty(0) for i, column in blocks.items()}
 
 

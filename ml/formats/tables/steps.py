@@ -27,6 +27,10 @@ from ml.formats.tables.numbers import shown, unit_name
 GRID_TOLERANCE = 0.01
 """A time may lie this share of the period off the grid: clocks written with two decimals."""
 
+LEAST_SHARE = 0.1
+FEWEST_ROWS = 3
+"""A table of so many rows that has fewer than this share of its steps is of another unit or period."""
+
 LARGEST_BETA = 1e9
 """No amplifier gives such a beta in any unit: an error of the writer, such as a fill value."""
 
@@ -92,6 +96,11 @@ def _grid(t_s: NDArray[np.float64], columns: Columns, options: DecodeOptions) ->
         i = int(uneven[0])
         what = f"{spacing[i]:g} s between two rows where the period is {period:g} s"
         raise columns.error(what, "t_s", f"Write one row every {period:g} s, or set the participant's period.", i + 1)
+    if t_s.size >= FEWEST_ROWS and t_s.size < LEAST_SHARE * (steps[-1] - steps[0] + 1):
+        share = 100.0 * (1.0 - t_s.size / (steps[-1] - steps[0] + 1))
+        what = f"{share:.1f} % of the steps of {period:g} s have no row: rows follow each other after {np.median(spacing):g} s"
+        hint = f"Write one row every {period:g} s. If the times are milliseconds, name the column t_ms; else set the participant's period."
+        raise columns.error(what, "t_s", hint, 1)
     off = np.flatnonzero(np.abs(t_s - steps * period) > GRID_TOLERANCE * period)
     if off.size:
         i = int(off[0])

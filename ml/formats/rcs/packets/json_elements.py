@@ -41,6 +41,9 @@ _INF = re.compile(r"(?<=[\[:,\s])([+-]?)(?:INF|Inf|inf)(?=[\],}\s])")
 _SPACE = re.compile(r"[\s,\ufeff\x00]*")
 _COLON = re.compile(r"\s*:\s*")
 _OPEN = re.compile(r'"(' + "|".join(STREAM_KEYS) + r')"\s*:\s*\[')
+_HEAD_MS = re.compile(r'\{\s*"RecordInfo"\s*:\s*\{[^{}]{0,500}?"HostUnixTime"\s*:\s*([0-9]{1,15})\s*[,}]')
+"""Head of a record with its whole PC time."""
+
 _NEXT = {"packets": re.compile(r'\{\s*"Header"'), "records": re.compile(r'\{\s*"RecordInfo"')}
 
 
@@ -50,6 +53,8 @@ class JsonNotes:
 
     Attributes:
         unread_fields: fields of stream objects other than `RecordInfo` and the packets; they are stepped over.
+        cut: the end of the file is missing, so that nothing is known of what followed.
+        cut_ms: PC time of the cut record, ms, where its head is whole.
     """
 
     defects: list[str] = field(default_factory=list)
@@ -58,6 +63,8 @@ class JsonNotes:
     record_infos: list[dict[str, Any]] = field(default_factory=list)
     damaged: int = 0
     unread_fields: int = 0
+    cut: bool = False
+    cut_ms: float | None = None
 
 
 class _Text:
@@ -81,6 +88,7 @@ class _Text:
             raw = self._stream.read(CHUNK)
         except READ_ERRORS:
             self._notes.defects.append("the compressed data are damaged; everything before the damage was read")
+            self._notes.cut = True
             raw = b""
         self.ended = not raw
         fresh = self._decoder.decode(raw, final=self.ended)
@@ -129,11 +137,13 @@ def read_elements(stream: IO[bytes], notes: JsonNotes, scanner: Scanner | None =
     first = window.skip_space()
     if first == "":
         notes.defects.append("the file is empty")
+        notes.cut = True
         return
     if first == "[":
         window.at += 1
     elif first != "{":
         notes.defects.append("the text does not begin like a JSON list")
+        notes.cut = True
         return
     closed = False
     while True:
@@ -148,6 +158,7 @@ def read_elements(stream: IO[bytes], notes: JsonNotes, scanner: Scanner | None =
             closed = window.skip_space() == "]" or closed
         break
     if first == "[" and not closed:
+        notes.cut = True
         _note(notes, "the end of the file is missing; every complete part before it was kept")
 
 
@@ -218,6 +229,7 @@ def _read_list(
         if mark == "]":
             return True
         if mark == "":
+            notes.cut = True
             if kind == "packets":
                 _note(notes, "the end of the file is missing; every complete part before it was kept")
             return False
@@ -285,9 +297,11 @@ def _deeper(value: Any, levels: int) -> bool:
 
 def _resync(window: _Text, notes: JsonNotes, kind: str) -> bool:
     """Find the next packet or record after a damaged one; False when there is none."""
+    begin = _HEAD_MS.match(window.text, window.at)
     window.at += 1
     notes.damaged += 1
     if notes.damaged > MAX_DAMAGED:
+        notes.cut = True
         _note(notes, f"more than {MAX_DAMAGED} damaged {kind}; the rest of the file was left out")
         return False
     while True:
@@ -298,6 +312,7 @@ def _resync(window: _Text, notes: JsonNotes, kind: str) -> bool:
             return True
         window.at = max(window.at, len(window.text) - 64)
         if not window.more():
+            notes.cut, notes.cut_ms = True, float(begin[1]) if begin else None
             _note(notes, f"the last {kind[:-1]} is cut; every complete {kind[:-1]} before it was kept")
             window.at = len(window.text)
             return False

@@ -314,4 +314,4 @@ def test_a_stimulation_log_without_its_closing_bracket_keeps_its_six_records(rec
     decoded = decode_rcs(tmp_path, DecodeOptions())
     about = report(decoded, "StimLog.json")
     assert "6 records" in about.understood
-    assert any("end of the file is missing" in text for text in about.repaired)
+    assert any("end of the file is missing" in text for text in about.flagged)

@@ -191,3 +191,21 @@ def test_a_plain_table_of_lfp_is_read_in_blocks(write, monkeypatch):
     monkeypatch.setattr("ml.formats.tables.columns.read_delimited", lambda *_: pytest.fail("read cell by cell"))
     decoded = decode(write(lfp_csv()))
     assert trace(decoded, "beta").valid.all()
+
+
+@pytest.mark.parametrize("rate", [200, 220, 250])
+def test_times_no_finer_than_a_sample_give_the_true_rate_or_are_refused(write, rate):
+    """Single precision after nine o'clock, in seconds of the day: steps of 1/256 s."""
+    t = np.round((np.arange(30 * rate) + 1) / rate * 256) / 256
+    text = "t_s,lfp [uV]\n" + "".join(f"{a:.6f},{np.sin(k):.3f}\n" for k, a in enumerate(t))
+    decoded = decode(write(text))
+    assert decoded.recordings[0].settings["rate_hz"] == rate
+    assert not any("missing" in text for text in decoded.reports[0].flagged)
+
+
+@pytest.mark.parametrize("rate", [200, 250, 256])
+def test_times_in_whole_milliseconds_give_the_true_rate_without_gaps(write, rate):
+    text = "t_ms,lfp [uV]\n" + "".join(f"{round(1000 * (k + 1) / rate)},{np.sin(k):.3f}\n" for k in range(20 * rate))
+    decoded = decode(write(text))
+    assert decoded.recordings[0].settings["rate_hz"] == rate
+    assert not any("missing" in text for text in decoded.reports[0].flagged)

@@ -325,3 +325,50 @@ def test_no_bytes_whatever_raise_anything_but_a_clear_error(tmp_path_factory, co
     except UndecodableFile as error:
         said = error.what and error.where and error.hint
     assert found or said
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t_s;beta;amplitude_ma\n2;956;1\n4;1.054;1\n6;1.100;1\n",
+        "t_s,beta,amplitude_ma\n2,956,1\n4,1.054,1\n",
+        "t_s;beta;amplitude (uA)\n2;0.5;1.500\n4;0.6;1.500\n",
+        't_s,beta,amplitude_ma\n2,"1,234",1\n4,"1,300",1\n',
+        "t_s;beta;amplitude_ma\n2;956;1\n4;1,054;1\n",
+        "t_s;beta;amplitude_ma\n2;1'234;1\n",
+        "t_s;beta;amplitude_ma\n2;1 234;1\n",
+    ],
+)
+def test_a_number_that_may_have_a_thousands_separator_is_refused(write, text):
+    with pytest.raises(UndecodableFile, match=r"line [23], column"):
+        decode(write(text))
+
+
+@pytest.mark.parametrize(
+    ("text", "beta"),
+    [
+        ("t_s,beta,amplitude_ma\n2,1.266,1\n4,1.054,1\n", [1.266, 1.054]),
+        ("t_s;beta;amplitude_ma\n2;0.266;1\n4;1.054;1\n", [0.266, 1.054]),
+        ("t_s;beta;amplitude_ma\n2;1.2;1\n4;1.054;1\n", [1.2, 1.054]),
+        ("t_s;beta;amplitude_ma\n2;1,266;1\n4;1,054;1\n", [1.266, 1.054]),
+    ],
+)
+def test_a_number_that_is_decimal_for_sure_is_read(write, text, beta):
+    np.testing.assert_allclose(trace(decode(write(text)), "beta").values, beta, rtol=1e-6)
+
+
+def rows(times):
+    return HEADER + "".join(f"{t:g},1.5,0.5\n" for t in times)
+
+
+@pytest.mark.parametrize(
+    ("times", "mend"),
+    [
+        (np.arange(32_402, 32_522, 2), "seconds of the day"),
+        (np.arange(2000, 122_000, 2000), "t_ms"),
+        (np.arange(2, 100_000, 2), "would last"),
+    ],
+)
+def test_times_of_another_clock_or_unit_are_refused(write, times, mend):
+    with pytest.raises(UndecodableFile, match=mend):
+        decode(write(rows(times)))

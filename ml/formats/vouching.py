@@ -1,0 +1,92 @@
+"""Two sources of one course in time: a log of changes, and readings of what was set at single moments. Neither is believed beyond what it
+says."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Generic, TypeVar
+
+from ml.formats.dose import LIMIT_TOLERANCE_MA, Dose
+
+T = TypeVar("T")
+LAG_MS = 2000.0
+"""A reading may follow the change that it shows, or precede the log's record of it, by so much. A real recording has 1.1 s at most."""
+
+
+@dataclass(slots=True)
+class Vouching(Generic[T]):
+    """Collected statements, in ms of one clock.
+
+    Attributes:
+        dose_of: dose of a state, with NaN where unknown. unknown: state of which nothing is known.
+        log: moments at which the log stated the state in force. readings: the same of the other source, each in order of time.
+    """
+
+    dose_of: Callable[[T], Dose]
+    unknown: T
+    log: list[tuple[float, T]] = field(default_factory=list)
+    readings: list[tuple[float, T]] = field(default_factory=list)
+
+    def combine(self, times_ms: Sequence[float], states: Sequence[T]) -> tuple[list[tuple[float, T]], list[tuple[float, Dose, Dose]]]:
+        """Combine both sources.
+
+        Where the log is unknown, two consecutive statements that agree vouch for the time between them; with others it stays unknown. A
+        reading that contradicts the log makes the state unknown, from the statement before it to the next one that agrees with the log.
+
+        Args:
+            times_ms: from which the log's states hold, [n], ascending. states: of the log, [n].
+
+        Returns:
+            States with the times from which they hold; contradictions as (time, dose by the log, dose by the reading).
+        """
+        read = [(t, s) for t, s in self.readings if _known(self.dose_of(s)) and times_ms and t >= times_ms[0] - LAG_MS]
+        agreed, against = [], []
+        for t, state in read:
+            first, last = (max(0, bisect_right(times_ms, t + by) - 1) for by in (-LAG_MS, LAG_MS))
+            near = [self.dose_of(s) for s in states[first : last + 1]]
+            if not all(map(_known, near)) or any(_same(dose, self.dose_of(state)) for dose in near):
+                agreed.append((t, state))
+            else:
+                against.append((t, self.dose_of(states[max(0, bisect_right(times_ms, t) - 1)]), self.dose_of(state)))
+        points = sorted([*self.log, *agreed], key=lambda point: point[0])
+        out = list(zip(times_ms, states, strict=True))
+        for (begin, a), (end, b) in pairwise(points):
+            dose, other = self.dose_of(a), self.dose_of(b)
+            if end > begin and _known(dose) and _known(other) and _same(dose, other):
+                out = self._fill(out, begin, end, a)
+        for t, _, _ in against:
+            begin = max((p for p, _ in points if p <= t), default=times_ms[0])
+            end = min((p for p, _ in points if p > t), default=math.inf)
+            out = _replace(out, begin, end, self.unknown)
+        return out, against
+
+    def _fill(self, course: list[tuple[float, T]], begin: float, end: float, state: T) -> list[tuple[float, T]]:
+        """Put a state where the course is unknown between two times."""
+        bounds = [*(t for t, _ in course[1:]), math.inf]
+        for (t, was), stop in zip(list(course), bounds, strict=True):
+            if was == self.unknown and t < end and stop > begin:
+                course = _replace(course, max(t, begin), min(stop, end), state)
+        return course
+
+
+def _replace(course: list[tuple[float, T]], begin: float, end: float, state: T) -> list[tuple[float, T]]:
+    """Put a state over part of a course."""
+    after = [s for t, s in course if t <= end][-1:]
+    kept = [(t, s) for t, s in course if t < begin]
+    tail = [(t, s) for t, s in course if t > end]
+    return [*kept, (begin, state), *([(end, after[0])] if after and math.isfinite(end) else []), *tail]
+
+
+def _known(dose: Dose) -> bool:
+    return all(math.isfinite(a) for a in dose.amplitude_ma)
+
+
+def _same(one: Dose, other: Dose) -> bool:
+    """Decide whether two known doses are equal to the resolution of the devices."""
+    return len(one.amplitude_ma) == len(other.amplitude_ma) and all(
+        abs(a - b) < LIMIT_TOLERANCE_MA for a, b in zip(one.amplitude_ma, other.amplitude_ma, strict=True)
+    )
