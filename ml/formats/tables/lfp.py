@@ -33,7 +33,7 @@ COARSE_SPREAD = 1.25
 """An even clock rounded to grains lies within one of them, and a little more for the last digit."""
 
 NO_CLOCK = 10.0
-"""Times that stray this many steps from an even clock are uneven, or have lost samples; it is not that they are coarse."""
+"""Times that stray this many steps from an even clock are uneven, or lack samples. They are not coarse."""
 
 MIN_ROWS = 8
 LARGEST_RATE_HZ = 100_000.0
@@ -151,7 +151,7 @@ def _coarse_clock(t_s: NDArray[np.float64], usual: float, columns: Columns) -> t
     """Find the sampling interval in s where times are no finer than it, and the steps without a gap, [n - 1]; None for finer times.
 
     Times in single precision step by one grain or by two, in turns that repeat. Lost samples come at random. So where steps of two grains
-    repeat evenly, no sample is lost: the interval is (last - first) / (n - 1).
+    repeat evenly, none is missing: the interval is (last - first) / (n - 1).
 
     Raises:
         UndecodableFile: the even clock behind the grains does not fit all times, or gives no whole rate.
