@@ -30,7 +30,7 @@ EVENLY = 0.5
 """Steps of two grains repeat evenly where their distances vary by less than this share; lost samples vary by about their mean."""
 
 COARSE_SPREAD = 1.25
-"""An even clock rounded to grains lies within one of them, and a little more for the last digit."""
+"""An even clock rounded to grains strays by one of them, and a little more for the last digit."""
 
 NO_CLOCK = 10.0
 """Times that stray this many steps from an even clock are uneven, or lack samples. They are not coarse."""
