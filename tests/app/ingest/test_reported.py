@@ -32,7 +32,7 @@ def test_a_cut_stimulation_log_is_believed_to_its_end_and_no_further(client: Tes
     np.testing.assert_allclose(values[:29], 1.0)
     np.testing.assert_allclose(values[31:59], 1.5)
     assert np.isnan(values[62:]).all()
-    assert any("the amplitude is unknown" in text for report in answer.json()["report"]["files"] for text in report["flagged"])
+    assert any("the amplitude is unknown" in text for report in answer.json()["report"] for text in report["flagged"])
 
 
 def test_cycling_therapy_is_told_and_its_amplitude_is_unknown(client: TestClient, recordings: Path) -> None:
