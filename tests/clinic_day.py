@@ -46,9 +46,9 @@ class ClinicDay:
 
 
 @pytest.fixture
-def clinic_day(client: TestClient, enrolled: str, sign_plan: Callable[..., Any]) -> ClinicDay:
+def clinic_day(client: TestClient, participant_code: str, sign_plan: Callable[..., Any]) -> ClinicDay:
     """Visit 2 of P1 with an approved plan."""
-    visit = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 2, "date": "2099-11-22"}).json()["id"]
+    visit = client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 2, "date": "2099-11-22"}).json()["id"]
     drafted = client.post(f"/api/v1/visits/{visit}/plan", json={"policy_ids": [], "random_sessions": 2, "seed": 1})
     assert drafted.status_code == 201, drafted.text
     approved = sign_plan(visit)

@@ -190,7 +190,7 @@ Template = tuple[str, Path]
 
 @dataclass(frozen=True)
 class Begun:
-    """What a test that asks for `enrolled` begins with: an administrator and a participant, made once.
+    """What a test that asks for `participant_code` begins with: an administrator and a participant, made once.
 
     Attributes:
         token: of the administrator.
@@ -202,7 +202,7 @@ class Begun:
 
 @pytest.fixture(scope="session")
 def begun_once(server: EmbeddedPostgres, application, tmp_path_factory: pytest.TempPathFactory) -> Begun:  # type: ignore[no-untyped-def]
-    """The administrator of `client`, and the participant of `enrolled`."""
+    """The administrator of `client`, and the participant of `participant_code`."""
     data = tmp_path_factory.mktemp("begun") / "data"
     data.mkdir()
     with pytest.MonkeyPatch.context() as patch, own_database(server, data, patch, "betaloop", keep="begun"):
@@ -214,7 +214,7 @@ def begun_once(server: EmbeddedPostgres, application, tmp_path_factory: pytest.T
 @pytest.fixture
 def begun(request: pytest.FixtureRequest) -> Begun | None:
     """What the test begins with; None where it does not ask for a participant, or only in its course."""
-    return request.getfixturevalue("begun_once") if "enrolled" in request.fixturenames else None
+    return request.getfixturevalue("begun_once") if "participant_code" in request.fixturenames else None
 
 
 @pytest.fixture
@@ -347,7 +347,7 @@ def _enrol(client: TestClient) -> None:
 
 
 @pytest.fixture
-def enrolled(client: TestClient, begun: Begun | None) -> str:
+def participant_code(client: TestClient, begun: Begun | None) -> str:
     """Code of a participant with a cDBS amplitude and a threshold, and a visit 1."""
     if begun is None:
         _enrol(client)

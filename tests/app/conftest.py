@@ -135,7 +135,7 @@ def begin_with(
 
 
 @pytest.fixture
-def upload(client: TestClient, enrolled: str, rng: np.random.Generator) -> Upload:
+def upload(client: TestClient, participant_code: str, rng: np.random.Generator) -> Upload:
     """Upload a session of P1 and enter its QoCs; returns its id."""
 
     def send(
@@ -150,7 +150,7 @@ def upload(client: TestClient, enrolled: str, rng: np.random.Generator) -> Uploa
         amplitude = rng.uniform(0.3, 1.0, steps) if controller == "random" else np.full(steps, level)
         answer = client.post(
             "/api/v1/uploads",
-            data={"participant": enrolled, "visit": visit, "controller": controller, **fields},
+            data={"participant": participant_code, "visit": visit, "controller": controller, **fields},
             files={"file": (f"{controller}-{rng.integers(10**9)}.csv", table(amplitude, rng, lead), "text/csv")},
         )
         assert answer.status_code == 201, answer.text

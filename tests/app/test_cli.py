@@ -67,8 +67,8 @@ def betaloop(monkeypatch: pytest.MonkeyPatch) -> Iterator[Betaloop]:
 
 
 @pytest.fixture
-def study(fresh_database: str, enrolled: str) -> str:
-    return enrolled
+def study(fresh_database: str, participant_code: str) -> str:
+    return participant_code
 
 
 @pytest.mark.parametrize("command", COMMANDS)

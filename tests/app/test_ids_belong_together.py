@@ -52,7 +52,7 @@ def routes_with_two_ids(app: Any) -> set[tuple[str, str]]:
     return found
 
 
-def studied(client: TestClient, code: str, seed: int, sign_plan: Callable[..., Any]) -> Ids:
+def study_world(client: TestClient, code: str, seed: int, sign_plan: Callable[..., Any]) -> Ids:
     """A participant with one object of every sort; their ids."""
     api, home = "/api/v1", f"/api/v1/participants/{code}"
     settings = {"xi_beta": 1.0, "cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"}
@@ -110,7 +110,7 @@ def clinician(client_as: Callable[[str], TestClient]) -> TestClient:
 
 @pytest.fixture
 def both(client: TestClient, clinician: TestClient, sign_plan: Callable[..., Any]) -> tuple[Ids, Ids]:
-    return studied(client, "P1", 1, sign_plan), studied(client, "P2", 2, sign_plan)
+    return study_world(client, "P1", 1, sign_plan), study_world(client, "P2", 2, sign_plan)
 
 
 def test_every_route_with_two_ids_refuses_another_participants(

@@ -102,9 +102,9 @@ CHECKS = (
 )
 
 
-def test_the_interface_keeps_to_its_own_description(service_app: Any, client: TestClient, enrolled: str) -> None:
+def test_the_interface_keeps_to_its_own_description(service_app: Any, client: TestClient, participant_code: str) -> None:
     """Generated input, good and bad: no server error, and every answer fits the OpenAPI document."""
-    fields = {"participant": enrolled, "visit": "1", "controller": "random"}
+    fields = {"participant": participant_code, "visit": "1", "controller": "random"}
     assert client.post("/api/v1/uploads", data=fields, files={"file": ("s.csv", TABLE)}).status_code == 201
     schema = schemathesis.openapi.from_asgi("/api/v1/openapi.json", service_app, headers=dict(client.headers))
     tried = 0

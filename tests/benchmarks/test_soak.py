@@ -32,11 +32,11 @@ class Installed:
 
 
 def test_what_was_acknowledged_and_is_not_there_is_found(
-    fresh_database: str, client: Any, enrolled: str, monkeypatch: pytest.MonkeyPatch
+    fresh_database: str, client: Any, participant_code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     writers = importlib.import_module("installed.writers")
-    stated = {"participant": enrolled, "visit": "1", "controller": "random"}
+    stated = {"participant": participant_code, "visit": "1", "controller": "random"}
     sent = client.post("/api/v1/uploads", data=stated, files={"file": ("s.csv", writers.table(np.random.default_rng(1)))}).json()
     session = sent["sessions"][0]["id"]
     assert client.put(f"/api/v1/sessions/{session}/qoc", json={"grasp_hz": 2.0}).status_code == 200

@@ -191,11 +191,11 @@ def table() -> bytes:
 
 
 @pytest.fixture
-def studied(client: TestClient, enrolled: str, table: bytes) -> list[int]:
+def study_world(client: TestClient, participant_code: str, table: bytes) -> list[int]:
     """Participant P1 with two sessions of cDBS and one of the random controller; their numbers."""
     ids = []
     for i, controller in enumerate(["cdbs", "random", "cdbs"]):
-        data = {"participant": enrolled, "visit": "1", "controller": controller}
+        data = {"participant": participant_code, "visit": "1", "controller": controller}
         # another beta in one row makes another recording
         content = table + f"\n{82},{1 + i},0.5".encode()
         answer = client.post("/api/v1/uploads", data=data, files={"file": (f"{i}.csv", content)})

@@ -72,19 +72,19 @@ SHEET = 703
 """Pixels that are printed of a sheet of A4, between the margins of print.css."""
 
 
-def test_on_paper_nothing_runs_past_its_card(window: Callable, studied: list[int], monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[type-arg]
+def test_on_paper_nothing_runs_past_its_card(window: Callable, study_world: list[int], monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[type-arg]
     monkeypatch.setattr(get_settings(), "development", True)
     watched = window(SHEET, 900, "light")
     watched.signed_in()
     watched.page.emulate_media(media="print")
     found: list[str] = []
     for name, path in PAGES.items():
-        watched.open(path.format(session=studied[0]))
+        watched.open(path.format(session=study_world[0]))
         found += [f"{name}: {what}" for what in watched.on_paper()]
     assert found == []
 
 
-def test_on_paper_settings_and_margins_have_their_values(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+def test_on_paper_settings_and_margins_have_their_values(window: Callable, study_world: list[int]) -> None:  # type: ignore[type-arg]
     watched = window(SHEET, 900, "light")
     watched.signed_in()
     watched.page.emulate_media(media="print")
@@ -102,13 +102,13 @@ WINDOWS = pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (1280, 
 @WINDOWS
 def test_no_page_breaks_a_rule_of_accessibility_or_moves(
     window: Callable,
-    studied: list[int],
+    study_world: list[int],
     monkeypatch: pytest.MonkeyPatch,
     width: int,
     scheme: str,  # type: ignore[type-arg]
 ) -> None:
     monkeypatch.setattr(get_settings(), "development", True)
-    addresses = {name: path.format(session=studied[0]) for name, path in PAGES.items()}
+    addresses = {name: path.format(session=study_world[0]) for name, path in PAGES.items()}
     assert looked_at(window(width, 900, scheme), addresses) == []
 
 
@@ -186,8 +186,8 @@ def looked_at(watched: Any, addresses: dict[str, str], for_the_tour: bool = Fals
 
 
 @pytest.fixture
-def policies(client: TestClient, studied: list[int]) -> list[int]:
-    """Ids of four policies made elsewhere, for the participant whom `studied` made."""
+def policies(client: TestClient, study_world: list[int]) -> list[int]:
+    """Ids of four policies made elsewhere, for the participant whom `study_world` made."""
     return made_elsewhere(client, DOSES)
 
 

@@ -19,16 +19,16 @@ ZOOM = "([id, range]) => window.Plotly.relayout(document.querySelector(`#${id} .
 
 
 @pytest.fixture
-def sampled(client: TestClient, enrolled: str) -> int:
+def sampled(client: TestClient, participant_code: str) -> int:
     """A session of 30 s with raw samples at 250 Hz."""
-    stated = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+    stated = {"participant": participant_code, "visit": "1", "controller": "cdbs"}
     sent = client.post("/api/v1/uploads", data=stated, files={"file": ("lfp.csv", lfp_table()[0])})
     assert sent.status_code == 201, sent.text
     return int(sent.json()["sessions"][0]["id"])
 
 
-def test_the_home_page_gets_the_energy_saved_once_it_stands(window: Callable, enrolled: str, db: Session) -> None:  # type: ignore[type-arg]
-    adder(db, enrolled)("rl", fraction=0.5)
+def test_the_home_page_gets_the_energy_saved_once_it_stands(window: Callable, participant_code: str, db: Session) -> None:  # type: ignore[type-arg]
+    adder(db, participant_code)("rl", fraction=0.5)
     watched = window()
     watched.signed_in()
     watched.open("/")
@@ -37,8 +37,8 @@ def test_the_home_page_gets_the_energy_saved_once_it_stands(window: Callable, en
     assert watched.errors == []
 
 
-def test_a_dot_of_the_months_and_a_row_of_their_table_open_the_session(window: Callable, enrolled: str, db: Session) -> None:  # type: ignore[type-arg]
-    session = adder(db, enrolled)("cdbs", grasp=2.0)
+def test_a_dot_of_the_months_and_a_row_of_their_table_open_the_session(window: Callable, participant_code: str, db: Session) -> None:  # type: ignore[type-arg]
+    session = adder(db, participant_code)("cdbs", grasp=2.0)
     watched = window()
     watched.signed_in()
     watched.open("/participants/P1")

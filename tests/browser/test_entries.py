@@ -24,7 +24,7 @@ OTHER = "second@clinic.example"
 
 
 @pytest.fixture
-def tab(window: Callable[..., Watched], studied: list[int]) -> Watched:
+def tab(window: Callable[..., Watched], study_world: list[int]) -> Watched:
     """A tab in which the administrator has signed in."""
     watched = window()
     watched.signed_in()
@@ -39,7 +39,7 @@ def session_of(client: TestClient) -> str:
     return f"/sessions/{answer.json()['sessions'][0]['id']}"
 
 
-def test_entries_come_back_by_form_and_record_until_they_are_saved(tab: Watched, studied: list[int], client: TestClient) -> None:
+def test_entries_come_back_by_form_and_record_until_they_are_saved(tab: Watched, study_world: list[int], client: TestClient) -> None:
     page, path = tab.page, session_of(client)
     tab.open(path)
     page.fill("[name=grasp_hz]", "2.4")
@@ -47,7 +47,7 @@ def test_entries_come_back_by_form_and_record_until_they_are_saved(tab: Watched,
     page.reload()
     expect(page.locator(BACK)).to_contain_text("is not saved yet")
     assert (page.input_value("[name=grasp_hz]"), page.input_value("[name=rating]")) == ("2.4", "7")
-    tab.open(f"/sessions/{studied[1]}")
+    tab.open(f"/sessions/{study_world[1]}")
     assert page.input_value("[name=grasp_hz]") == "3"
     assert page.locator(BACK).count() == 0
     tab.open(path)

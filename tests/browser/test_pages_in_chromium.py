@@ -26,7 +26,7 @@ SMALL_TARGETS = """() => [...document.querySelectorAll('a, button, input:not([ty
   .map(([e, box]) => `${e.tagName} "${e.textContent.trim().slice(0, 30)}" ${Math.round(box.width)}x${Math.round(box.height)}`)"""
 
 
-def test_from_sign_in_to_a_participants_charts(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+def test_from_sign_in_to_a_participants_charts(window: Callable, study_world: list[int]) -> None:  # type: ignore[type-arg]
     watched = window()
     watched.sign_in()
     watched.page.click("article.participant h3 a")
@@ -36,7 +36,7 @@ def test_from_sign_in_to_a_participants_charts(window: Callable, studied: list[i
     assert watched.foreign == []
 
 
-def test_a_slash_leads_to_the_search_unless_somebody_types(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+def test_a_slash_leads_to_the_search_unless_somebody_types(window: Callable, study_world: list[int]) -> None:  # type: ignore[type-arg]
     watched = window()
     watched.signed_in()
     watched.open("/participants/P1/visits/new")
@@ -52,9 +52,9 @@ def test_a_slash_leads_to_the_search_unless_somebody_types(window: Callable, stu
     assert watched.errors == []
 
 
-def test_the_time_left_of_a_job_moves_with_its_bar(window: Callable, enrolled: str, db: Session) -> None:  # type: ignore[type-arg]
+def test_the_time_left_of_a_job_moves_with_its_bar(window: Callable, participant_code: str, db: Session) -> None:  # type: ignore[type-arg]
     begun = datetime.now(UTC) - timedelta(seconds=590)
-    owner = db.query(Participant).filter_by(code=enrolled).one().id
+    owner = db.query(Participant).filter_by(code=participant_code).one().id
     step = JobStep(key="train/0", title="Train policy 1 (DDPG)", position=0, status=JobStatus.RUNNING, progress=0.5, started_at=begun)
     job = Job(
         id="4f00aaaa-0000-4000-8000-000000000000", participant_id=owner, kind="train", status=JobStatus.RUNNING, progress=0.5, params={},
@@ -76,10 +76,10 @@ def test_the_time_left_of_a_job_moves_with_its_bar(window: Callable, enrolled: s
     assert watched.errors == []
 
 
-def test_no_chart_offers_to_send_data_elsewhere(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+def test_no_chart_offers_to_send_data_elsewhere(window: Callable, study_world: list[int]) -> None:  # type: ignore[type-arg]
     watched = window()
     watched.signed_in()
-    watched.open(f"/sessions/{studied[0]}")
+    watched.open(f"/sessions/{study_world[0]}")
     assert watched.charts_drawn() >= 1
     titles = [b.get_attribute("data-title") or "" for b in watched.page.query_selector_all(".modebar-btn")]
     assert titles, "the chart's own buttons are expected, e.g. download as a picture"
@@ -99,21 +99,21 @@ BUTTONS_OVER = """() => [...document.querySelectorAll("figure[data-drawn=yes]")]
 })"""
 
 
-def test_the_buttons_of_a_chart_cover_neither_its_data_nor_on_a_tablet_its_title(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+def test_the_buttons_of_a_chart_cover_neither_its_data_nor_on_a_tablet_its_title(window: Callable, study_world: list[int]) -> None:  # type: ignore[type-arg]
     for width in (768, 1280):
         watched = window(width, 1024)
         watched.signed_in()
-        for path in (f"/sessions/{studied[0]}", "/participants/P1", "/participants/P1/analyses/paper"):
+        for path in (f"/sessions/{study_world[0]}", "/participants/P1", "/participants/P1/analyses/paper"):
             watched.open(path)
             assert watched.charts_drawn() >= 1
             covered = watched.page.evaluate(BUTTONS_OVER)
             assert [c for c in covered if width == 768 or c.endswith("data")] == [], (width, path)
 
 
-def test_the_session_chart_breaks_its_line_at_missing_beta(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+def test_the_session_chart_breaks_its_line_at_missing_beta(window: Callable, study_world: list[int]) -> None:  # type: ignore[type-arg]
     watched = window()
     watched.signed_in()
-    watched.open(f"/sessions/{studied[0]}")
+    watched.open(f"/sessions/{study_world[0]}")
     watched.charts_drawn()
     first = watched.page.query_selector("#control .scatterlayer .trace")
     assert len(first.query_selector_all("path.js-line")) == 2
@@ -122,10 +122,10 @@ def test_the_session_chart_breaks_its_line_at_missing_beta(window: Callable, stu
     assert "Amplitude (mA)" in text
 
 
-def test_the_theme_is_chosen_kept_and_redraws_the_charts(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+def test_the_theme_is_chosen_kept_and_redraws_the_charts(window: Callable, study_world: list[int]) -> None:  # type: ignore[type-arg]
     watched = window(scheme="light")
     watched.signed_in()
-    watched.open(f"/sessions/{studied[0]}")
+    watched.open(f"/sessions/{study_world[0]}")
     watched.charts_drawn()
     light = watched.page.evaluate(COLOURS)
     watched.page.click("[data-theme-toggle]")
@@ -134,11 +134,11 @@ def test_the_theme_is_chosen_kept_and_redraws_the_charts(window: Callable, studi
     expect(watched.page.locator("html")).to_have_attribute("data-theme", "dark")
 
 
-def test_paper_takes_every_chart_in_the_light_colours(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+def test_paper_takes_every_chart_in_the_light_colours(window: Callable, study_world: list[int]) -> None:  # type: ignore[type-arg]
     """Also charts that nobody scrolled to, and from a page in the dark theme."""
     watched = window(1280, 400, "dark")
     watched.signed_in()
-    watched.open(f"/sessions/{studied[0]}")
+    watched.open(f"/sessions/{study_world[0]}")
     charts = len(watched.page.query_selector_all("figure[data-chart]"))
     watched.page.wait_for_function("() => window.Plotly")
     watched.page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
@@ -150,10 +150,10 @@ def test_paper_takes_every_chart_in_the_light_colours(window: Callable, studied:
     assert watched.errors == []
 
 
-def test_targets_are_large_enough_for_a_finger_on_a_tablet(window: Callable, studied: list[int]) -> None:  # type: ignore[type-arg]
+def test_targets_are_large_enough_for_a_finger_on_a_tablet(window: Callable, study_world: list[int]) -> None:  # type: ignore[type-arg]
     watched = window(820, 1180)
     watched.signed_in()
-    paths = ["/", "/participants/P1", "/participants/P1/visits", "/visits/1", f"/sessions/{studied[0]}", "/participants/P1/settings"]
+    paths = ["/", "/participants/P1", "/participants/P1/visits", "/visits/1", f"/sessions/{study_world[0]}", "/participants/P1/settings"]
     for path in [*paths, "/participants/P1/upload", "/participants/new", "/account", "/accounts"]:
         watched.open(path)
         for scheme in ("light", "dark"):
@@ -164,10 +164,12 @@ def test_targets_are_large_enough_for_a_finger_on_a_tablet(window: Callable, stu
     assert watched.errors == []
 
 
-def test_files_dropped_on_the_upload_page_become_sessions(window: Callable, enrolled: str, client: TestClient, table: bytes) -> None:  # type: ignore[type-arg]
+def test_files_dropped_on_the_upload_page_become_sessions(
+    window: Callable, participant_code: str, client: TestClient, table: bytes
+) -> None:  # type: ignore[type-arg]
     watched = window()
     watched.signed_in()
-    watched.open(f"/participants/{enrolled}/upload?visit=1")
+    watched.open(f"/participants/{participant_code}/upload?visit=1")
     watched.page.select_option("[name=controller]", "cdbs")
     files = [["good.csv", table.decode()], ["bad <b>.csv", "a,b\n1,2\n"], ["again.csv", table.decode()]]
     transfer = watched.page.evaluate_handle(
@@ -191,11 +193,11 @@ def test_files_dropped_on_the_upload_page_become_sessions(window: Callable, enro
 
 
 def test_a_refused_upload_says_so_at_the_field_and_keeps_the_files(
-    window: Callable, enrolled: str, client: TestClient, table: bytes
+    window: Callable, participant_code: str, client: TestClient, table: bytes
 ) -> None:  # type: ignore[type-arg]
     watched = window()
     watched.signed_in()
-    watched.open(f"/participants/{enrolled}/upload?visit=1")
+    watched.open(f"/participants/{participant_code}/upload?visit=1")
     page = watched.page
     page.select_option("[name=controller]", "rl")
     page.fill("[name=policy]", "nobody")
@@ -224,10 +226,10 @@ def test_a_refused_upload_says_so_at_the_field_and_keeps_the_files(
     assert client.get("/api/v1/visits/1/sessions").json()["total"] == 1
 
 
-def test_a_table_alone_whose_columns_nobody_knows_leads_to_its_mapping(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
+def test_a_table_alone_whose_columns_nobody_knows_leads_to_its_mapping(window: Callable, participant_code: str) -> None:  # type: ignore[type-arg]
     watched = window(768, 1024)
     watched.signed_in()
-    watched.open(f"/participants/{enrolled}/upload?visit=1")
+    watched.open(f"/participants/{participant_code}/upload?visit=1")
     rows = "".join(f"{2 * k};{1 + k % 5};2.0\n" for k in range(1, 12)).encode()
     watched.page.set_input_files("input[type=file]", {"name": "t.csv", "mimeType": "text/csv", "buffer": b"Zeit;Signal;Strom\n" + rows})
     watched.page.click("button.primary")
@@ -235,10 +237,12 @@ def test_a_table_alone_whose_columns_nobody_knows_leads_to_its_mapping(window: C
     expect(watched.page.locator("h1")).to_have_text("What the columns are")
 
 
-def test_tables_of_unknown_columns_alone_lead_to_their_mappings_and_each_says_what_is_wrong(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
+def test_tables_of_unknown_columns_alone_lead_to_their_mappings_and_each_says_what_is_wrong(
+    window: Callable, participant_code: str
+) -> None:  # type: ignore[type-arg]
     watched = window()
     watched.signed_in()
-    watched.open(f"/participants/{enrolled}/upload?visit=1")
+    watched.open(f"/participants/{participant_code}/upload?visit=1")
     transfer = watched.page.evaluate_handle(
         "() => { const t = new DataTransfer(); for (const [n, x] of [['one.csv', 'a,b\\n1,2\\n3,4\\n'], ['two.csv', 'c,d\\n1,2\\n3,4\\n']])"
         " t.items.add(new File([x], n)); return t; }"
@@ -254,7 +258,7 @@ def test_tables_of_unknown_columns_alone_lead_to_their_mappings_and_each_says_wh
     expect(watched.page.locator("select[name=role_1]")).to_be_visible()
 
 
-def test_what_cannot_be_taken_back_asks_first(window: Callable, enrolled: str) -> None:  # type: ignore[type-arg]
+def test_what_cannot_be_taken_back_asks_first(window: Callable, participant_code: str) -> None:  # type: ignore[type-arg]
     watched = window()
     watched.signed_in()
     watched.open("/account")
@@ -272,8 +276,8 @@ def test_what_cannot_be_taken_back_asks_first(window: Callable, enrolled: str) -
     expect(row.locator(".badge")).to_have_text("revoked")
 
 
-def test_tables_sort_numbers_as_numbers_with_missing_ones_last(window: Callable, studied: list[int], client: TestClient) -> None:  # type: ignore[type-arg]
-    client.put(f"/api/v1/sessions/{studied[1]}/qoc", json={"grasp_hz": None, "reason": "taken back"})
+def test_tables_sort_numbers_as_numbers_with_missing_ones_last(window: Callable, study_world: list[int], client: TestClient) -> None:  # type: ignore[type-arg]
+    client.put(f"/api/v1/sessions/{study_world[1]}/qoc", json={"grasp_hz": None, "reason": "taken back"})
     watched = window()
     watched.signed_in()
     watched.open("/visits/1")

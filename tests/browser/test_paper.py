@@ -31,10 +31,10 @@ def printed(window: Callable[..., Watched]) -> Watched:
 
 
 def test_a_printed_report_names_every_file_and_what_was_read_of_it(
-    client: TestClient, enrolled: str, table: bytes, printed: Watched
+    client: TestClient, participant_code: str, table: bytes, printed: Watched
 ) -> None:
     files = [("file", ("good.csv", table)), ("file", ("bad.csv", b"x,y\n1,2")), ("file", ("device.zip", rcs_zip()))]
-    answer = client.post("/api/v1/uploads", data={"participant": enrolled, "visit": "1", "controller": "cdbs"}, files=files)
+    answer = client.post("/api/v1/uploads", data={"participant": participant_code, "visit": "1", "controller": "cdbs"}, files=files)
     printed.open(f"/uploads/{answer.json()['id']}")
     assert printed.on_paper() == []
     names = printed.page.locator("details.file > summary > b")
@@ -45,8 +45,8 @@ def test_a_printed_report_names_every_file_and_what_was_read_of_it(
     assert printed.page.evaluate(UNCUT)
 
 
-def test_a_printed_home_has_as_many_visits_as_it_counts(client: TestClient, enrolled: str, printed: Watched) -> None:
-    codes = [enrolled, *(f"Q{k}" for k in range(SOON + 1))]
+def test_a_printed_home_has_as_many_visits_as_it_counts(client: TestClient, participant_code: str, printed: Watched) -> None:
+    codes = [participant_code, *(f"Q{k}" for k in range(SOON + 1))]
     for code in codes[1:]:
         assert client.post("/api/v1/participants", json={"code": code}).status_code == 201
     for k, code in enumerate(codes):
@@ -61,8 +61,8 @@ def test_a_printed_home_has_as_many_visits_as_it_counts(client: TestClient, enro
     assert not printed.page.evaluate("() => document.querySelector('#later-visits').open"), "the page is as it was"
 
 
-def test_samples_that_have_not_come_are_told_on_paper(client: TestClient, enrolled: str, printed: Watched) -> None:
-    data = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+def test_samples_that_have_not_come_are_told_on_paper(client: TestClient, participant_code: str, printed: Watched) -> None:
+    data = {"participant": participant_code, "visit": "1", "controller": "cdbs"}
     session = client.post("/api/v1/uploads", data=data, files={"file": ("tour.csv", tour.samples())}).json()["sessions"][0]["id"]
     printed.page.emulate_media(media="screen")
     printed.page.set_viewport_size({"width": SHEET, "height": 200})

@@ -25,8 +25,8 @@ Judge = Callable[..., int]
 
 
 @pytest.fixture
-def policies(client: TestClient, studied: list[int]) -> list[int]:
-    """Ids of the policies of `DOSES`, for the participant whom `studied` made."""
+def policies(client: TestClient, study_world: list[int]) -> list[int]:
+    """Ids of the policies of `DOSES`, for the participant whom `study_world` made."""
     return made_elsewhere(client, DOSES)
 
 
@@ -83,10 +83,10 @@ def test_where_nothing_is_worth_a_visit_the_first_screen_says_what_to_do_instead
     assert "Not advised: no policy is barred, and none is recommended." in words
 
 
-def test_a_comparison_is_moved_along_its_session(window: Callable, policies: list[int], studied: list[int]) -> None:  # type: ignore[type-arg]
+def test_a_comparison_is_moved_along_its_session(window: Callable, policies: list[int], study_world: list[int]) -> None:  # type: ignore[type-arg]
     watched = window(1280, SCREEN)
     watched.signed_in()
-    watched.open(f"/participants/P1/compare?session={studied[0]}&policy={policies[0]}&policy={policies[5]}")
+    watched.open(f"/participants/P1/compare?session={study_world[0]}&policy={policies[0]}&policy={policies[5]}")
     page = watched.page
     slider, time, cells = page.locator("#f-at"), page.locator("[data-scrub-time]"), page.locator("[data-scrub-cell]")
     expect(time).to_have_text("0 min 00 s")

@@ -100,25 +100,25 @@ def people(client: TestClient) -> None:
 
 
 @pytest.fixture
-def ranked(client: TestClient, enrolled: str, worker: None, ended: Callable[..., dict[str, Any]]) -> list[int]:
+def ranked(client: TestClient, participant_code: str, worker: None, ended: Callable[..., dict[str, Any]]) -> list[int]:
     """P1 after a visit of random and cDBS sessions, with two policies trained from it, and ranked; numbers of the trained ones."""
     settings = {"design": "stratified", "cdbs_amplitude_ma": 3.0, "xi_beta": 1.0, "beta_unit": "uV", "beta_source": "table"}
-    assert client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": settings}).status_code == 200
+    assert client.put(f"/api/v1/participants/{participant_code}/settings", json={"settings": settings}).status_code == 200
     # two quickly trained policies are no good ones: with the widest margins the engineer may plan them without a clinician's word
     margins = {"grasp_share": 0.5, "rating_points": 5, "tremor_points": 50, "unsafe_beyond": 0.9, "nearly_off_share": 0.9}
-    stated = client.put(f"/api/v1/participants/{enrolled}/margins", json={"margins": margins, "reason": "for this test"})
+    stated = client.put(f"/api/v1/participants/{participant_code}/margins", json={"margins": margins, "reason": "for this test"})
     assert stated.status_code == 200, stated.text
     for k, controller in enumerate(("random", "cdbs", "random", "random", "cdbs", "random")):
         held = run_session("P1", controller, seed=k, steps=30 * MINUTES, hour=0.4 * k)  # type: ignore[arg-type]
-        of = {"participant": enrolled, "visit": "1", "controller": controller}
+        of = {"participant": participant_code, "visit": "1", "controller": controller}
         sent = client.post("/api/v1/uploads", data=of, files={"file": (f"{k}.csv", session_table_csv(held))})
         assert sent.status_code == 201, sent.text
         qoc = {"grasp_hz": held.qoc.grasp_hz, "rating": held.rating, "tremor_percent": held.qoc.tremor_percent}
         client.put(f"/api/v1/sessions/{sent.json()['sessions'][0]['id']}/qoc", json=qoc)
-    job = client.post(f"/api/v1/participants/{enrolled}/jobs", json={"kind": "pipeline", "count": 2, **SMALL})
+    job = client.post(f"/api/v1/participants/{participant_code}/jobs", json={"kind": "pipeline", "count": 2, **SMALL})
     done = ended(job.json()["id"], 400)
     assert done["status"] == "succeeded", done
-    found = client.get(f"/api/v1/participants/{enrolled}/ranking").json()["policies"]
+    found = client.get(f"/api/v1/participants/{participant_code}/ranking").json()["policies"]
     trained = [p for p in found if p["kind"] in ("trained", "distilled") and p["decision"] != "unsafe"]
     trained.sort(key=lambda p: p["decision"] == "test_with_care")  # of which a visit takes one
     assert len(trained) >= 2, [(p["name"], p["decision"], p["decision_reasons"]) for p in found]
@@ -143,7 +143,7 @@ def test_a_clinic_day_from_the_signed_plan_to_the_next_generation(
     chromium: Any,
     address: str,
     client: TestClient,
-    enrolled: str,
+    participant_code: str,
     ranked: list[int],
     ended: Callable[..., dict[str, Any]],
     tmp_path: Path,
@@ -151,7 +151,7 @@ def test_a_clinic_day_from_the_signed_plan_to_the_next_generation(
     now = datetime.now(UTC)
     if (now + timedelta(hours=1)).date() != now.date():
         pytest.skip("the sessions of this day would run into the next one, on which no bundle of today runs")
-    visit = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 2, "date": now.date().isoformat()}).json()["id"]
+    visit = client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 2, "date": now.date().isoformat()}).json()["id"]
 
     # the engineer drafts, and moves a session with the mouse
     engineer = window(1280, 900)
@@ -290,11 +290,13 @@ def test_a_clinic_day_from_the_signed_plan_to_the_next_generation(
     engineer.page.goto(f"{address}/jobs/{number}")
     engineer.page.wait_for_selector("text=Succeeded")
     shot(engineer, "9-generation-done")
-    kinds = [p["kind"] for p in client.get(f"/api/v1/participants/{enrolled}/policies?limit=200").json()["items"] if p["id"] in made]
+    kinds = [
+        p["kind"] for p in client.get(f"/api/v1/participants/{participant_code}/policies?limit=200").json()["items"] if p["id"] in made
+    ]
     assert {"trained", "distilled"} <= set(kinds), kinds
-    found = client.get(f"/api/v1/participants/{enrolled}/ranking").json()
+    found = client.get(f"/api/v1/participants/{participant_code}/ranking").json()
     assert made <= {p["policy_id"] for p in found["policies"]}, "every policy of the generation was judged"
-    engineer.open(f"/participants/{enrolled}/next-generation")
+    engineer.open(f"/participants/{participant_code}/next-generation")
     assert "The next generation is trained" in engineer.page.content()
     engineer.page.click("text=its ranking")
     engineer.page.wait_for_selector("h1")

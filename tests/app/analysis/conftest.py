@@ -23,9 +23,9 @@ AddSession = Callable[..., int]
 
 
 @pytest.fixture
-def add_session(db: Session, enrolled: str) -> AddSession:
+def add_session(db: Session, participant_code: str) -> AddSession:
     """Add a session of 300 s to a visit of P1: constant beta and amplitude fraction, QoCs; None leaves a thing out. Returns its id."""
-    return adder(db, enrolled)
+    return adder(db, participant_code)
 
 
 def adder(db: Session, code: str) -> AddSession:

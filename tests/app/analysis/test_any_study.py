@@ -128,7 +128,7 @@ def problems(client: TestClient, expected: dict[str, int]) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_any_study_gets_sentences(client: TestClient, db: Session, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_study_gets_sentences(client: TestClient, db: Session, participant_code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     numbers = count(1)
     really = db.commit
     assert {"/analyses", "/api/v1/analyses?format=svg", "/participants/CODE/analyses/models/rl", "/trial-time"} <= set(addresses())

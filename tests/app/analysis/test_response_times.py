@@ -18,12 +18,12 @@ CONTROLLERS = ("cdbs", "rl", "cdbs", "distilled")
 
 
 @pytest.fixture
-def four_of_200(client: TestClient, db: Session, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def four_of_200(client: TestClient, db: Session, participant_code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twenty visits of ten sessions of 10 minutes each, in one transaction."""
     rng = np.random.default_rng(0)
     monkeypatch.setattr(db, "commit", db.flush)
-    for code in (enrolled, "P2", "P3", "P4"):
-        if code != enrolled:
+    for code in (participant_code, "P2", "P3", "P4"):
+        if code != participant_code:
             settings = {"cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"}
             assert client.post("/api/v1/participants", json={"code": code, "settings": settings}).status_code == 201
         add = adder(db, code)

@@ -21,7 +21,7 @@ PAGES = ("/", "/participants/P1", "/participants/P1/ranking")
 
 
 @pytest.fixture
-def pipeline(client: TestClient, enrolled: str, upload: Callable[..., int]) -> str:
+def pipeline(client: TestClient, participant_code: str, upload: Callable[..., int]) -> str:
     """A pipeline that was started a minute ago."""
     for controller in ("random", "cdbs"):
         upload(controller)

@@ -53,17 +53,17 @@ Send = Callable[..., Any]
 
 
 @pytest.fixture
-def send(client: TestClient, enrolled: str) -> Send:
+def send(client: TestClient, participant_code: str) -> Send:
     """Upload named files of P1 as one upload; fields are those of the form."""
 
     def post(*files: tuple[str, bytes], by: TestClient = client, **fields: Any) -> Any:
-        data = {"participant": enrolled} | {k: str(v) for k, v in fields.items() if v is not None}
+        data = {"participant": participant_code} | {k: str(v) for k, v in fields.items() if v is not None}
         return by.post("/api/v1/uploads", data=data, files=[("file", f) for f in files])
 
     return post
 
 
 @pytest.fixture
-def proposals(client: TestClient, enrolled: str) -> Callable[[], list[dict[str, Any]]]:
+def proposals(client: TestClient, participant_code: str) -> Callable[[], list[dict[str, Any]]]:
     """The proposals of P1 as the interface lists them."""
-    return lambda: list(client.get(f"/api/v1/participants/{enrolled}/proposals").json())
+    return lambda: list(client.get(f"/api/v1/participants/{participant_code}/proposals").json())

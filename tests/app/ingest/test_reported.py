@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-pytestmark = pytest.mark.usefixtures("enrolled")
+pytestmark = pytest.mark.usefixtures("participant_code")
 
 
 def upload(client: TestClient, recordings: Path, name: str) -> Any:

@@ -123,7 +123,7 @@ def test_days_are_those_of_utc_and_both_are_within(client: TestClient, db: Sessi
     [{"begin": "yesterday"}, {"begin": "2026-02-02", "end": "2026-02-01"}, {"action": "jumps"}, {"words": " ".join("abcdefghi")},
      {"words": "x" * 201}],
 )  # fmt: skip
-def test_what_cannot_be_looked_for_is_said_at_the_form(client: TestClient, enrolled: str, filters: dict[str, str]) -> None:
+def test_what_cannot_be_looked_for_is_said_at_the_form(client: TestClient, participant_code: str, filters: dict[str, str]) -> None:
     page = client.get(f"/audit?{urlencode(filters)}", headers=PAGE)
     assert page.status_code == 422
     assert 'name="words"' in page.text, "with the form, to correct it"

@@ -29,12 +29,12 @@ def drawn(db: Session, code: str, today: dt.date = LATER) -> Chart:
     return chart
 
 
-def test_every_session_is_a_dot_of_its_own_that_leads_to_it(client: TestClient, db: Session, enrolled: str) -> None:
-    add = adder(db, enrolled)
+def test_every_session_is_a_dot_of_its_own_that_leads_to_it(client: TestClient, db: Session, participant_code: str) -> None:
+    add = adder(db, participant_code)
     ids = [add(name, grasp=2.0, visit=visit, medication_h=1.5) for visit in (1, 2) for name in ("cdbs", "rl", "cdbs")]
     add("cdbs", visit=2, excluded="fell asleep")
     assert client.put("/api/v1/participants/P1/settings", json={"settings": {"xi_beta": 1.2}, "reason": "lower"}).status_code == 200
-    chart = drawn(db, enrolled)
+    chart = drawn(db, participant_code)
     visits, _ = repository.visits(db, 1, 100, 0)
     panels = {t["name"]: t for t in chart.figure["data"] if "customdata" in t}
     assert set(panels) == {"Beta", "Energy", "Grasp", "Last dose", "Amplitude"}
@@ -51,14 +51,14 @@ def test_every_session_is_a_dot_of_its_own_that_leads_to_it(client: TestClient, 
     assert [sorted(grasp["x"][3 * k : 3 * k + 3])[1] for k in (0, 1)] == axis["tickvals"]
 
 
-def test_every_dated_visit_is_marked_also_without_a_session_and_the_next_one_told_apart(db: Session, enrolled: str) -> None:
-    add = adder(db, enrolled)
+def test_every_dated_visit_is_marked_also_without_a_session_and_the_next_one_told_apart(db: Session, participant_code: str) -> None:
+    add = adder(db, participant_code)
     add("cdbs", grasp=2.0, visit=1)
     add("cdbs", visit=2, excluded="fell asleep")
     planned = Visit(participant_id=1, number=7, date=dt.date(2026, 8, 3))
     db.add_all([planned, Visit(participant_id=1, number=8, date=dt.date(2026, 9, 7)), Visit(participant_id=1, number=9)])
     db.commit()
-    chart = drawn(db, enrolled)
+    chart = drawn(db, participant_code)
     layout = chart.figure["layout"]
     assert [text.split("<br>")[0] for text in layout["xaxis"]["ticktext"]] == ["visit 1", "visit 2", "visit 7", "visit 8"]
     lines = {line["x0"][:10]: line["line"]["color"] for line in layout["shapes"]}
@@ -75,17 +75,17 @@ def test_every_dated_visit_is_marked_also_without_a_session_and_the_next_one_tol
         ["2026-08-03 (next visit)", Link(7, f"/visits/{planned.id}")],
         ["2026-09-07", Link(8, f"/visits/{planned.id + 1}")],
     ]
-    assert not any("next visit" in a["text"] for a in drawn(db, enrolled, dt.date(2026, 12, 1)).figure["layout"]["annotations"])
+    assert not any("next visit" in a["text"] for a in drawn(db, participant_code, dt.date(2026, 12, 1)).figure["layout"]["annotations"])
 
 
-def test_dated_visits_are_shown_before_any_session_counts(client: TestClient, db: Session, enrolled: str) -> None:
-    participant = participant_by_code(db, enrolled, SYSTEM)
+def test_dated_visits_are_shown_before_any_session_counts(client: TestClient, db: Session, participant_code: str) -> None:
+    participant = participant_by_code(db, participant_code, SYSTEM)
     assert story_chart(evidence(db, participant, SYSTEM), [Visit(participant_id=1, number=1)], participant.settings, LATER) is None
     db.add_all([Visit(participant_id=1, number=k, date=dt.date(2026, 6 + k, 3)) for k in (2, 3)])
     db.commit()
     db.expire_all()
-    adder(db, enrolled)("cdbs", visit=2, excluded="fell asleep")
-    chart = drawn(db, enrolled)
+    adder(db, participant_code)("cdbs", visit=2, excluded="fell asleep")
+    chart = drawn(db, participant_code)
     layout = chart.figure["layout"]
     assert [text.split("<br>")[0] for text in layout["xaxis"]["ticktext"]] == ["visit 1", "visit 2", "visit 3"]
     assert [a["text"] for a in layout["annotations"]] == ["next visit: 2"]
@@ -94,14 +94,14 @@ def test_dated_visits_are_shown_before_any_session_counts(client: TestClient, db
     assert 'id="story"' in client.get("/participants/P1").text
 
 
-def test_sessions_without_any_value_keep_their_visits_on_the_axis(db: Session, enrolled: str) -> None:
-    adder(db, enrolled)("cdbs", visit=2, beta=None, fraction=None)
-    chart = drawn(db, enrolled)
+def test_sessions_without_any_value_keep_their_visits_on_the_axis(db: Session, participant_code: str) -> None:
+    adder(db, participant_code)("cdbs", visit=2, beta=None, fraction=None)
+    chart = drawn(db, participant_code)
     assert not any("customdata" in trace for trace in chart.figure["data"])
     assert [text.split("<br>")[0] for text in chart.figure["layout"]["xaxis"]["ticktext"]] == ["visit 1", "visit 2"]
 
 
-def test_the_table_of_the_months_leads_to_sessions_without_a_mouse(client: TestClient, db: Session, enrolled: str) -> None:
-    session = adder(db, enrolled)("cdbs", grasp=2.0)
+def test_the_table_of_the_months_leads_to_sessions_without_a_mouse(client: TestClient, db: Session, participant_code: str) -> None:
+    session = adder(db, participant_code)("cdbs", grasp=2.0)
     story = client.get("/participants/P1").text.split('id="story"')[1].split("</figure>")[0]
     assert f'<td class="num"><a href="/sessions/{session}">{session}</a></td>' in story

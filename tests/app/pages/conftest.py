@@ -63,10 +63,10 @@ def table() -> bytes:
 
 
 @pytest.fixture
-def session_id(client: TestClient, enrolled: str, table: bytes) -> int:
+def session_id(client: TestClient, participant_code: str, table: bytes) -> int:
     """A session of participant P1, visit 1, uploaded through the REST interface."""
     answer = client.post(
-        "/api/v1/uploads", data={"participant": enrolled, "visit": "1", "controller": "cdbs"}, files={"file": ("one.csv", table)}
+        "/api/v1/uploads", data={"participant": participant_code, "visit": "1", "controller": "cdbs"}, files={"file": ("one.csv", table)}
     )
     assert answer.status_code == 201, answer.text
     return int(answer.json()["sessions"][0]["id"])

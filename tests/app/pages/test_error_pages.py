@@ -43,7 +43,7 @@ def test_a_page_names_what_is_wrong_with_an_address_in_words(browser: TestClient
     assert "\u201cx\u201d cannot be taken for offset: a whole number belongs there." in browser.get("/audit?offset=x").text
 
 
-def test_an_expired_sign_in_gives_back_every_entry_and_takes_it_after_signing_in(browser: TestClient, enrolled: str) -> None:
+def test_an_expired_sign_in_gives_back_every_entry_and_takes_it_after_signing_in(browser: TestClient, participant_code: str) -> None:
     entered = {"number": "2", "date": "2026-03-30", "note": "slept <badly> & late"}
     live = browser.cookies[COOKIE]
     browser.cookies.set(COOKIE, "ended")
@@ -63,7 +63,7 @@ def again(page: str) -> str:
     return re.findall(r'<form method="post" action="([^"]*)"[^>]*data-again', page)[0]
 
 
-def test_what_an_expired_sign_in_gives_back_is_sent_again_by_its_writer_alone(browser: TestClient, enrolled: str) -> None:
+def test_what_an_expired_sign_in_gives_back_is_sent_again_by_its_writer_alone(browser: TestClient, participant_code: str) -> None:
     entered = {"number": "2", "date": "2026-03-30", "note": "slept badly"}
     with transaction("test") as db:
         accounts.add_user(db, "second@clinic.example", Role.CLINICIAN, SECOND)
@@ -113,7 +113,7 @@ def test_a_password_is_not_given_back(browser: TestClient) -> None:
     assert "secret" not in refused.text
 
 
-def test_a_form_that_is_too_large_is_refused_on_a_page(browser: TestClient, enrolled: str) -> None:
+def test_a_form_that_is_too_large_is_refused_on_a_page(browser: TestClient, participant_code: str) -> None:
     refused = browser.post("/participants/P1/visits", data={"note": "x" * (2 << 20)})
     assert refused.status_code == 413
     assert refused.headers["content-type"].startswith("text/html")

@@ -13,11 +13,11 @@ TEMPLATES = Path(__file__).resolve().parents[3] / "app" / "templates"
 
 
 def test_a_session_that_cannot_be_read_says_why_and_nothing_else(
-    browser: TestClient, client: TestClient, enrolled: str, table: bytes
+    browser: TestClient, client: TestClient, participant_code: str, table: bytes
 ) -> None:
     sides = [{"hemisphere": side, "amplitude_ma": 3.0} for side in ("left", "right")]
-    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 2, "cdbs_amplitudes": sides}).status_code == 201
-    upload = {"participant": enrolled, "visit": "2", "controller": "cdbs"}
+    assert client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 2, "cdbs_amplitudes": sides}).status_code == 201
+    upload = {"participant": participant_code, "visit": "2", "controller": "cdbs"}
     answer = client.post("/api/v1/uploads", data=upload, files={"file": ("a.csv", table)})
     page = unescape(browser.get(f"/sessions/{answer.json()['sessions'][0]['id']}").text)
     assert "No hemisphere is named" in page
@@ -59,9 +59,9 @@ def test_the_upload_form_leaves_the_visit_to_the_files_unless_a_link_named_one(b
 
 
 def test_unit_and_source_of_a_tables_beta_are_stated_on_the_upload_page(
-    browser: TestClient, client: TestClient, enrolled: str, table: bytes
+    browser: TestClient, client: TestClient, participant_code: str, table: bytes
 ) -> None:
-    url = f"/participants/{enrolled}/upload"
+    url = f"/participants/{participant_code}/upload"
     page = browser.get(url).text
     options = re.search(r'<select id="f-beta_source".*?</select>', page, re.S)
     assert options

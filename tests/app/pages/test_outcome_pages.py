@@ -15,9 +15,9 @@ START = datetime(2026, 3, 2, 9, 0, tzinfo=UTC)
 
 
 @pytest.fixture
-def timed_session(client: TestClient, enrolled: str, table: bytes) -> int:
+def timed_session(client: TestClient, participant_code: str, table: bytes) -> int:
     """A session of 80 s from 09:00 UTC on, of the right hemisphere."""
-    fields = {"participant": enrolled, "visit": "1", "controller": "cdbs", "started_at": START.isoformat(), "hemisphere": "right"}
+    fields = {"participant": participant_code, "visit": "1", "controller": "cdbs", "started_at": START.isoformat(), "hemisphere": "right"}
     answer = client.post("/api/v1/uploads", data=fields, files={"file": ("one.csv", table)})
     assert answer.status_code == 201, answer.text
     return int(answer.json()["sessions"][0]["id"])
@@ -127,9 +127,11 @@ def test_an_old_visit_form_leaves_alone_what_another_tab_corrected(browser: Test
     assert (told["note"], told["cdbs_amplitudes"]) == ("new", [{"hemisphere": "right", "program": 1, "amplitude_ma": 2.5}])
 
 
-def test_a_visit_is_corrected_through_the_rest_interface_and_amplitudes_are_replaced_as_a_list(client: TestClient, enrolled: str) -> None:
+def test_a_visit_is_corrected_through_the_rest_interface_and_amplitudes_are_replaced_as_a_list(
+    client: TestClient, participant_code: str
+) -> None:
     both = [{"hemisphere": side, "program": 0, "amplitude_ma": 3.0} for side in ("left", "right")]
-    visit = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 2, "cdbs_amplitudes": both}).json()["id"]
+    visit = client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 2, "cdbs_amplitudes": both}).json()["id"]
     change = {"date": "2026-04-01", "cdbs_amplitudes": [both[0] | {"amplitude_ma": 2.0}], "reason": "right side is off"}
     told = client.patch(f"/api/v1/visits/{visit}", json=change).json()
     assert (told["date"], told["cdbs_amplitudes"]) == ("2026-04-01", [{"hemisphere": "left", "program": 0, "amplitude_ma": 2.0}])
@@ -139,12 +141,12 @@ def test_a_visit_is_corrected_through_the_rest_interface_and_amplitudes_are_repl
 
 
 def test_a_proposed_session_is_named_as_such_and_counts_nowhere(
-    browser: TestClient, client: TestClient, enrolled: str, table: bytes, session_id: int
+    browser: TestClient, client: TestClient, participant_code: str, table: bytes, session_id: int
 ) -> None:
     visit = client.get(f"/api/v1/sessions/{session_id}").json()["visit_id"]
     before = browser.get(f"/visits/{visit}").text
-    suggested = client.get(f"/participants/{enrolled}/settings", headers={"Accept": "text/html"}).text
-    fields = {"participant": enrolled, "visit": "1"}
+    suggested = client.get(f"/participants/{participant_code}/settings", headers={"Accept": "text/html"}).text
+    fields = {"participant": participant_code, "visit": "1"}
     answer = client.post("/api/v1/uploads", data=fields, files={"file": ("two.csv", table.replace(b",2.00,", b",9.00,"))})
     [proposal] = answer.json()["proposals"]
     number = proposal["session"]["id"]
@@ -153,8 +155,8 @@ def test_a_proposed_session_is_named_as_such_and_counts_nowhere(
     assert "1 proposed session to confirm" in page
     assert f'href="/proposals/{number}"' in page
     assert f'href="/sessions/{number}"' not in page
-    assert "1 proposed session to confirm" in browser.get(f"/participants/{enrolled}/visits").text
-    again = client.get(f"/participants/{enrolled}/settings", headers={"Accept": "text/html"}).text
+    assert "1 proposed session to confirm" in browser.get(f"/participants/{participant_code}/visits").text
+    again = client.get(f"/participants/{participant_code}/settings", headers={"Accept": "text/html"}).text
     found = [re.search(r"Use [\d.]+", p) for p in (suggested, again)]
     assert [m and m[0] for m in found] == [found[0] and found[0][0]] * 2
     assert browser.get(f"/sessions/{number}").headers["location"] == f"/proposals/{number}"

@@ -18,11 +18,11 @@ URL = "/participants/P1/proposals"
 
 
 @pytest.fixture
-def propose(client: TestClient, enrolled: str) -> Callable[..., list[int]]:
+def propose(client: TestClient, participant_code: str) -> Callable[..., list[int]]:
     """Upload files without a controller; numbers of the proposals."""
 
     def send(*files: tuple[str, bytes], **fields: str) -> list[int]:
-        answer = client.post("/api/v1/uploads", data={"participant": enrolled, **fields}, files=[("file", f) for f in files])
+        answer = client.post("/api/v1/uploads", data={"participant": participant_code, **fields}, files=[("file", f) for f in files])
         assert answer.status_code == 201, answer.text
         return [p["session"]["id"] for p in answer.json()["proposals"]]
 
@@ -211,10 +211,10 @@ def test_a_waiting_grasp_file_is_attached_on_the_page(browser: TestClient, clien
 
 
 def test_several_files_on_the_upload_page_are_one_upload_whose_proposals_are_offered(
-    browser: TestClient, client: TestClient, enrolled: str
+    browser: TestClient, client: TestClient, participant_code: str
 ) -> None:
     files = [("file", ("right.zip", device_zip(("random",), "P1"))), ("file", ("left.zip", device_zip(("random",), "P2", minute=0.2)))]
-    page = browser.post(f"/participants/{enrolled}/upload", data={}, files=files)
+    page = browser.post(f"/participants/{participant_code}/upload", data={}, files=files)
     assert page.status_code == 200
     assert "1 to confirm" in page.text
     (proposal,) = client.get("/api/v1/participants/P1/proposals").json()
@@ -222,10 +222,10 @@ def test_several_files_on_the_upload_page_are_one_upload_whose_proposals_are_off
     assert "1 to confirm" in browser.get("/uploads/1").text
 
 
-def test_the_quarantine_page_reviews_and_decides(browser: TestClient, client: TestClient, enrolled: str) -> None:
+def test_the_quarantine_page_reviews_and_decides(browser: TestClient, client: TestClient, participant_code: str) -> None:
     secret = b"\0\1 Jane Example" * 40
-    client.post("/api/v1/uploads", data={"participant": enrolled}, files=[("file", ("x.bin", secret))])
-    url, action = f"/participants/{enrolled}/quarantine", "/uploaded-files/1/decision"
+    client.post("/api/v1/uploads", data={"participant": participant_code}, files=[("file", ("x.bin", secret))])
+    url, action = f"/participants/{participant_code}/quarantine", "/uploaded-files/1/decision"
     assert "no format this service reads" in browser.get(url).text
     assert "Release as it is" not in browser.get(url).text.split('<p class="muted">')[0]
     without = browser.post(action, data={"do": "discard", "reason": " "})

@@ -46,8 +46,8 @@ def qoc_tab(browser: TestClient, client: TestClient, session_id: int) -> Callabl
 
 
 @pytest.fixture
-def settings_tab(browser: TestClient, enrolled: str) -> Callable[[], Tab]:
-    return lambda: Tab(browser, f"/participants/{enrolled}/settings", f"/participants/{enrolled}/settings")
+def settings_tab(browser: TestClient, participant_code: str) -> Callable[[], Tab]:
+    return lambda: Tab(browser, f"/participants/{participant_code}/settings", f"/participants/{participant_code}/settings")
 
 
 def stored_qoc(client: TestClient, session_id: int) -> tuple[object, ...]:
@@ -133,10 +133,10 @@ def test_two_values_for_one_setting_are_a_conflict_that_keeps_what_was_typed(
 
 
 def test_settings_saved_untouched_make_no_version_and_keep_every_digit(
-    client: TestClient, enrolled: str, settings_tab: Callable[[], Tab]
+    client: TestClient, participant_code: str, settings_tab: Callable[[], Tab]
 ) -> None:
     change = {"settings": {"xi_beta": 1.23456789012, "beta_unit": "device units"}}
-    assert client.put(f"/api/v1/participants/{enrolled}/settings", json=change).status_code == 200
+    assert client.put(f"/api/v1/participants/{participant_code}/settings", json=change).status_code == 200
     tab = settings_tab()
     assert tab.fields["xi_beta"] == "1.23456789"
     assert tab.send().headers["location"].endswith("done=same")

@@ -25,7 +25,7 @@ def test_every_page_of_a_participant_answers_before_and_after_the_first_session(
 
 
 @pytest.mark.parametrize("path", ["/", "/account", "/accounts", "/audit", "/participants/new"])
-def test_every_page_of_the_study_answers(path: str, browser: TestClient, enrolled: str) -> None:
+def test_every_page_of_the_study_answers(path: str, browser: TestClient, participant_code: str) -> None:
     assert browser.get(path).status_code == 200
 
 
@@ -64,14 +64,14 @@ def test_a_refused_form_comes_back_as_it_was_typed_and_names_the_field(browser: 
     assert client.get("/api/v1/participants/P7").status_code == 404
 
 
-def test_settings_change_by_form_makes_a_version_with_its_reason(browser: TestClient, client: TestClient, enrolled: str) -> None:
-    url = f"/participants/{enrolled}/settings"
+def test_settings_change_by_form_makes_a_version_with_its_reason(browser: TestClient, client: TestClient, participant_code: str) -> None:
+    url = f"/participants/{participant_code}/settings"
     assert browser.post(url, data={"gamma": "0.9", "reason": "shorter <sight>"}).headers["location"].endswith("done=changed")
     page = unescape(browser.get(url).text)
     assert "Discount γ: 0.99 → <b>0.9</b>" in page
     assert "shorter <sight>" not in browser.get(url).text
     assert browser.post(url, data={"gamma": "0.9"}).headers["location"].endswith("done=same")
-    assert client.get(f"/api/v1/participants/{enrolled}").json()["settings"]["version"] == 2
+    assert client.get(f"/api/v1/participants/{participant_code}").json()["settings"]["version"] == 2
     assert browser.post(url, data={"beta_low_hz": "40"}).status_code == 422
 
 
@@ -89,19 +89,19 @@ def test_a_missing_threshold_is_suggested_and_taken_with_one_button(browser: Tes
     assert client.get("/api/v1/participants/P2").json()["settings"]["xi_beta"] == 2.5
 
 
-def test_a_visit_is_added_by_form_with_the_amplitude_of_each_side(browser: TestClient, client: TestClient, enrolled: str) -> None:
-    assert 'value="2"' in browser.get(f"/participants/{enrolled}/visits/new").text
+def test_a_visit_is_added_by_form_with_the_amplitude_of_each_side(browser: TestClient, client: TestClient, participant_code: str) -> None:
+    assert 'value="2"' in browser.get(f"/participants/{participant_code}/visits/new").text
     fields = {"number": "2", "date": "2026-04-01", "note": "<script>alert(1)</script>", "cdbs_left": "2.5", "cdbs_right": ""}
-    done = browser.post(f"/participants/{enrolled}/visits", data=fields)
+    done = browser.post(f"/participants/{participant_code}/visits", data=fields)
     assert done.status_code == 303
     page = browser.get(done.headers["location"]).text
     assert "left 2.5 mA" in page
     assert "<script>alert(1)" not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
-    again = browser.post(f"/participants/{enrolled}/visits", data=fields)
+    again = browser.post(f"/participants/{participant_code}/visits", data=fields)
     assert again.status_code == 409
     assert "already has a visit 2" in again.text
-    assert browser.post(f"/participants/{enrolled}/visits", data={"number": "0"}).status_code == 422
+    assert browser.post(f"/participants/{participant_code}/visits", data={"number": "0"}).status_code == 422
 
 
 def figures(page: str) -> list[dict[str, dict[str, object]]]:
@@ -206,8 +206,13 @@ def test_a_viewer_reads_everything_and_finds_no_form_to_write_with(
     assert client.get("/api/v1/participants/P1").json()["settings"]["version"] == 1
 
 
-def test_the_upload_form_takes_files_and_reports_on_each(browser: TestClient, client: TestClient, enrolled: str, table: bytes) -> None:
-    url, fields = f"/participants/{enrolled}/upload", {"visit": "1", "controller": "cdbs", "policy": "", "started_at": "", "hemisphere": ""}
+def test_the_upload_form_takes_files_and_reports_on_each(
+    browser: TestClient, client: TestClient, participant_code: str, table: bytes
+) -> None:
+    url, fields = (
+        f"/participants/{participant_code}/upload",
+        {"visit": "1", "controller": "cdbs", "policy": "", "started_at": "", "hemisphere": ""},
+    )
     files = [("file", ("good.csv", table)), ("file", ("<b>bad.csv", b"a,b\n1,2\n"))]
     page = browser.post(url, data=fields, files=files)
     assert page.status_code == 200

@@ -46,7 +46,7 @@ def test_the_next_visit_waits_for_what_others_wait_for_and_says_who_acts(
 
 
 def test_the_next_visits_are_those_of_the_whole_study_whatever_page_of_participants_is_shown(
-    browser: TestClient, enrolled: str, db: Session
+    browser: TestClient, participant_code: str, db: Session
 ) -> None:
     """Of 60 participants, 50 to a page: those of the second page are seen first."""
     today = datetime.now(UTC).date()
@@ -107,11 +107,11 @@ def test_a_search_finds_nothing_beyond_the_callers_sites(sign_in: Callable[[str]
         assert "Nothing is called" in viewer.get("/search", params={"q": words}).text
 
 
-def test_all_jobs_stand_in_one_page_with_their_participant(browser: TestClient, enrolled: str, db: Session) -> None:
+def test_all_jobs_stand_in_one_page_with_their_participant(browser: TestClient, participant_code: str, db: Session) -> None:
     _job(db, JobStatus.RUNNING)
     page = browser.get("/jobs").text
     assert "Running and waiting" in page
-    assert f'<a href="/participants/{enrolled}/jobs">' in flat(page)
+    assert f'<a href="/participants/{participant_code}/jobs">' in flat(page)
     assert 'action="/jobs/4f00aaaa-0000-4000-8000-000000000000/cancel"' in page
     assert 'data-confirm-yes="Stop the job" data-confirm-no="Let it run"' in page
     # a running job at 99.6 % is not done
@@ -120,7 +120,7 @@ def test_all_jobs_stand_in_one_page_with_their_participant(browser: TestClient, 
 
 
 def test_jobs_at_work_stand_before_those_that_wait_in_the_order_in_which_they_begin(
-    browser: TestClient, enrolled: str, db: Session
+    browser: TestClient, participant_code: str, db: Session
 ) -> None:
     waits = [_job(db, JobStatus.QUEUED, k) for k in (1, 2)]
     works = _job(db, JobStatus.RUNNING, 3)
@@ -138,12 +138,12 @@ def test_jobs_at_work_stand_before_those_that_wait_in_the_order_in_which_they_be
 
 
 def test_a_job_is_stopped_from_the_list_by_those_who_may_and_says_so(
-    browser: TestClient, sign_in: Callable[[str], TestClient], enrolled: str, db: Session
+    browser: TestClient, sign_in: Callable[[str], TestClient], participant_code: str, db: Session
 ) -> None:
     job = _job(db, JobStatus.RUNNING)
     job.cancel_requested_at = datetime.now(UTC)
     db.commit()
-    for path in ("/jobs", f"/participants/{enrolled}/jobs", f"/jobs/{job.id}"):
+    for path in ("/jobs", f"/participants/{participant_code}/jobs", f"/jobs/{job.id}"):
         page = browser.get(path).text
         assert "stopping</span>" in page, path
         assert "/cancel" not in page, path
@@ -153,14 +153,14 @@ def test_a_job_is_stopped_from_the_list_by_those_who_may_and_says_so(
     assert browser.post(f"/jobs/{job.id}/cancel").status_code == 303
     page = browser.get("/jobs").text
     assert "cancelled</span>" in page
-    assert f'Start one for <a href="/participants/{enrolled}/jobs">' in page
+    assert f'Start one for <a href="/participants/{participant_code}/jobs">' in page
 
 
 def test_the_page_of_energy_saved_has_the_number_that_the_home_page_takes_and_each_participants(
-    browser: TestClient, db: Session, enrolled: str
+    browser: TestClient, db: Session, participant_code: str
 ) -> None:
     assert "No learned controller has run" in browser.get("/energy-saved").text
-    add = adder(db, enrolled)
+    add = adder(db, participant_code)
     add("rl", fraction=0.5, duration_s=600.0)
     add("distilled", fraction=0.8, duration_s=300.0)
     add("cdbs")
@@ -182,7 +182,7 @@ def test_energy_saved_is_weighted_by_minutes() -> None:
     assert overall([]) is None
 
 
-def test_today_says_that_it_is_the_demo_there_alone(browser: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_today_says_that_it_is_the_demo_there_alone(browser: TestClient, participant_code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "This is the demo" not in browser.get("/").text
     monkeypatch.setenv("BETALOOP_DEMO", "true")
     get_settings.cache_clear()

@@ -49,7 +49,7 @@ def test_the_quick_preset_runs_its_own_methods_and_named_ones_are_run_once(clien
     assert named["params"]["methods"] == ["dual_dice", "wis"]
 
 
-def test_no_job_starts_without_a_usable_session(client: TestClient, enrolled: str) -> None:
+def test_no_job_starts_without_a_usable_session(client: TestClient, participant_code: str) -> None:
     answer = client.post(JOBS, json={"kind": "train"})
     assert answer.status_code == 422
     assert "no session that policies can learn from" in answer.json()["detail"]

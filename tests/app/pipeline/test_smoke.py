@@ -28,13 +28,13 @@ SMALL = {"preset": "quick", "count": 1, "updates": 60, "distil_updates": 60, "me
 @pytest.mark.usefixtures("worker")
 def test_from_a_recording_to_a_signed_controller_and_back_to_its_recording(
     client: TestClient,
-    enrolled: str,
+    participant_code: str,
     upload: Callable[..., int],
     ended: Callable[..., dict[str, Any]],
     sign_plan: Callable[..., Any],
     tmp_path: Path,
 ) -> None:
-    of_participant = f"/api/v1/participants/{enrolled}"
+    of_participant = f"/api/v1/participants/{participant_code}"
     assert client.put(f"{of_participant}/settings", json={"settings": SETTINGS}).status_code == 200
     stated = client.put(f"{of_participant}/margins", json={"margins": WIDE, "reason": "for this test"})
     assert stated.status_code == 200, stated.text
@@ -58,11 +58,11 @@ def test_from_a_recording_to_a_signed_controller_and_back_to_its_recording(
     assert taken.status_code == 200, taken.text
     bundle.write_bytes(taken.content)
     key = client.get("/api/v1/bundle-key").text.strip()
-    task = Task(key=key, log=log, participant=enrolled, ledger=tmp_path / "ledger")
+    task = Task(key=key, log=log, participant=participant_code, ledger=tmp_path / "ledger")
     ran = control(bundle, "simulated:P1:4", Wish(), task)
     assert ran["policy"] > 100, "decisions of the policy's own"
 
-    sent = client.post("/api/v1/uploads", data={"participant": enrolled}, files={"file": ("log.csv", log.read_bytes())})
+    sent = client.post("/api/v1/uploads", data={"participant": participant_code}, files={"file": ("log.csv", log.read_bytes())})
     assert sent.status_code == 201, sent.text
     row = next(r for r in client.get(f"/api/v1/visits/{visit}/slots").json()["rows"] if r["position"] == position)
     trace = client.get(f"/api/v1/sessions/{row['session_id']}/trace").json()

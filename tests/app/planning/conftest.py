@@ -110,9 +110,9 @@ def _estimate(value: float, energy: float, supported: bool = True) -> dict[str, 
 
 
 @pytest.fixture
-def studied(db: Session, enrolled: str) -> Studied:
+def study_world(db: Session, participant_code: str) -> Studied:
     """P1 after a visit, with four ranked policies (one of them not supported by the data), a retired one and one made elsewhere."""
-    participant = participant_by_code(db, enrolled, SYSTEM)
+    participant = participant_by_code(db, participant_code, SYSTEM)
     held = participant.visits[0]
     for ordinal in (1, 2):
         _hold(db, participant, held, ordinal)
@@ -142,7 +142,7 @@ def studied(db: Session, enrolled: str) -> Studied:
 
 
 @pytest.fixture
-def external(db: Session, studied: Studied) -> int:
+def external(db: Session, study_world: Studied) -> int:
     """Id of a policy made elsewhere, which no ranking holds."""
     row = _policy(db, participant_by_code(db, "P1", SYSTEM), None, "β-Regler „Łódź“", "external")
     db.commit()

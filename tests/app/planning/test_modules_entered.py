@@ -47,7 +47,7 @@ def test_a_call_enters_no_more_modules(
     client: TestClient,
     caller: TestClient,
     db: Session,
-    studied: Any,
+    study_world: Any,
     sign_plan: Callable[..., Any],
     rng: np.random.Generator,
     monkeypatch: pytest.MonkeyPatch,
@@ -67,15 +67,15 @@ def test_a_call_enters_no_more_modules(
     for name in ("ranking page", "ranking page, cached"):
         with modules_entered() as calls[name]:
             assert "rl-01" in caller.get("/participants/P1/ranking", headers=PAGE).text
-    db.execute(text("update visit set date = :day where id = :id"), {"day": datetime.now(UTC).date(), "id": studied.visit})
+    db.execute(text("update visit set date = :day where id = :id"), {"day": datetime.now(UTC).date(), "id": study_world.visit})
     db.commit()
     draft = {"policy_ids": [p["id"] for p in policies], "seed": 7, "min_ma": 0.5, "random_sessions": 1, "minutes_per_session": 5}
-    assert client.post(f"/api/v1/visits/{studied.visit}/plan", json=draft).status_code == 201
+    assert client.post(f"/api/v1/visits/{study_world.visit}/plan", json=draft).status_code == 201
     with modules_entered() as calls["sign a plan"]:
-        signed = sign_plan(studied.visit)
+        signed = sign_plan(study_world.visit)
     assert signed.status_code == 200, signed.text
     with modules_entered() as calls["bundle"]:
-        bundle = caller.get(f"/api/v1/visits/{studied.visit}/plan/sessions/1/bundle")
+        bundle = caller.get(f"/api/v1/visits/{study_world.visit}/plan/sessions/1/bundle")
     assert bundle.status_code == 200, bundle.text
     assert "app.planning.bundles.slots" in calls["bundle"]
     assert "ml.formats.tables.steps" in calls["upload to trace"], "a child decodes, and is traced"

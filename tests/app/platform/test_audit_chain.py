@@ -20,10 +20,10 @@ Sql = Callable[[str], None]
 
 
 @pytest.fixture
-def trail(client: TestClient, enrolled: str) -> None:
+def trail(client: TestClient, participant_code: str) -> None:
     """Some rows, and a seal over them."""
     for number in (1, 2):
-        assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": number + 10}).status_code == 201
+        assert client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": number + 10}).status_code == 201
     with transaction("test") as db:
         seal(db)
 
@@ -175,17 +175,17 @@ def actions(entity: str) -> list[tuple[str, str, str]]:
         return [tuple(r) for r in rows]  # type: ignore[misc]
 
 
-def test_what_leaves_and_who_looked_is_in_the_trail(client: TestClient, enrolled: str) -> None:
+def test_what_leaves_and_who_looked_is_in_the_trail(client: TestClient, participant_code: str) -> None:
     for _ in range(2):
-        assert client.get(f"/participants/{enrolled}/analyses").status_code == 200
-    for nothing in ("NOBODY/analyses", f"{enrolled}/analyses/models/nothing"):
+        assert client.get(f"/participants/{participant_code}/analyses").status_code == 200
+    for nothing in ("NOBODY/analyses", f"{participant_code}/analyses/models/nothing"):
         assert client.get(f"/participants/{nothing}").status_code == 404
-    assert client.get(f"/participants/{enrolled}/export.zip").status_code == 200
+    assert client.get(f"/participants/{participant_code}/export.zip").status_code == 200
     me = "admin@clinic.example"
-    assert actions("results") == [(me, "view", f"/participants/{enrolled}/analyses")], "a reload is one view"
+    assert actions("results") == [(me, "view", f"/participants/{participant_code}/analyses")], "a reload is one view"
     said = client.get("/audit").text
-    assert f"looked at the results of {enrolled}: analyses" in said
-    assert f"exported the record of {enrolled}" in said
+    assert f"looked at the results of {participant_code}: analyses" in said
+    assert f"exported the record of {participant_code}" in said
     assert [(a, what) for a, what, _ in actions("participant") if what == "export"] == [(me, "export")]
 
 

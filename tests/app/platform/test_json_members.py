@@ -29,10 +29,10 @@ def test_a_doubled_member_is_found_where_it_stands(body: bytes, place: tuple[str
 
 
 @pytest.mark.parametrize("pieces", [1, 3])
-def test_a_doubled_member_is_refused_and_nothing_is_stored(client: TestClient, enrolled: str, pieces: int) -> None:
+def test_a_doubled_member_is_refused_and_nothing_is_stored(client: TestClient, participant_code: str, pieces: int) -> None:
     body = b'{"number": 2, "date": "2026-03-30", "number": 3}'
     step = -(-len(body) // pieces)
-    path = f"/api/v1/participants/{enrolled}/visits"
+    path = f"/api/v1/participants/{participant_code}/visits"
     parts = (body[i : i + step] for i in range(0, len(body), step))
     refused = client.post(path, content=parts if pieces > 1 else body, headers=JSON)
     assert refused.status_code == 422, refused.text

@@ -96,7 +96,7 @@ def test_an_owner_who_is_named_as_the_service_keeps_the_rights_that_the_trail_ne
     assert owner_db.scalar(text("select count(*) from audit_event where entity = 'study' and after ->> 'code' = 'S2'")) == 1
 
 
-def test_the_service_has_the_rights_it_needs_and_no_other(client: TestClient, enrolled: str, db: Session) -> None:
+def test_the_service_has_the_rights_it_needs_and_no_other(client: TestClient, participant_code: str, db: Session) -> None:
     rows = db.execute(
         text(
             "select n.nspname, c.relname, array_agg(a.privilege_type) from pg_class c join pg_namespace n on n.oid = c.relnamespace,"

@@ -131,7 +131,7 @@ def test_a_simulated_study_that_is_killed_goes_on_with_nothing_lost_and_nothing_
         assert table[Controller.NO_DBS] == (2, 10)
 
 
-def test_a_participant_that_people_enrolled_is_left_alone(enrolled, db):
+def test_a_participant_that_people_enrolled_is_left_alone(participant_code, db):
     with pytest.raises(Conflict, match="P1 was enrolled by"):
         simulate(design(["P1"], 2, 0, "quick"), slots=1)
     assert db.scalar(select(func.count()).select_from(StudySession)) == 0

@@ -19,7 +19,7 @@ PAGE = {"Accept": "text/html"}
 BROKEN = "Signature broken: the margins of version 1 were changed"
 
 
-def test_a_lock_is_signed_over_its_values(client: TestClient, enrolled: str, db: Session) -> None:
+def test_a_lock_is_signed_over_its_values(client: TestClient, participant_code: str, db: Session) -> None:
     form = {"version": "1", "lock_reason": "protocol 3.2", "password": PASSWORD}
     assert client.post("/participants/P1/margins/lock", data=form, headers=PAGE, follow_redirects=False).status_code == 303
     (locked,) = client.get(LOCKS).json()
@@ -31,7 +31,7 @@ def test_a_lock_is_signed_over_its_values(client: TestClient, enrolled: str, db:
     assert (locked["signature"]["sha256"] in page, BROKEN in page) == (True, False)
 
 
-def test_a_wrong_password_locks_nothing(client: TestClient, enrolled: str, db: Session) -> None:
+def test_a_wrong_password_locks_nothing(client: TestClient, participant_code: str, db: Session) -> None:
     assert client.post(LOCKS, json={"version": 1, "reason": "protocol"}).status_code == 422
     assert client.post(LOCKS, json={"version": 1, "reason": "protocol", "password": "a wrong guess"}).status_code == 403
     form = {"version": "1", "lock_reason": "protocol 3.2", "password": "a wrong guess"}
@@ -50,7 +50,7 @@ def test_a_wrong_password_locks_nothing(client: TestClient, enrolled: str, db: S
         "update margins_lock set created_by = 'somebody else'",
     ],
 )
-def test_any_change_breaks_it_visibly(client: TestClient, enrolled: str, owner_db: Session, change: str) -> None:
+def test_any_change_breaks_it_visibly(client: TestClient, participant_code: str, owner_db: Session, change: str) -> None:
     assert client.post(LOCKS, json={"version": 1, "reason": "protocol", "password": PASSWORD}).status_code == 201
     table = change.split()[1]
     owner_db.execute(text(f"alter table {table} disable trigger user"))  # what the owner can do, and no service
@@ -60,14 +60,14 @@ def test_any_change_breaks_it_visibly(client: TestClient, enrolled: str, owner_d
     assert BROKEN in client.get("/participants/P1/margins", headers=PAGE).text
 
 
-def test_new_margins_break_no_earlier_lock(client: TestClient, enrolled: str) -> None:
+def test_new_margins_break_no_earlier_lock(client: TestClient, participant_code: str) -> None:
     client.post(LOCKS, json={"version": 1, "reason": "protocol", "password": PASSWORD})
     client.put("/api/v1/participants/P1/margins", json={"margins": {"tremor_points": 5}, "reason": "she fears tremor most"})
     client.post(LOCKS, json={"version": 2, "reason": "amended", "password": PASSWORD})
     assert [lock["signature_state"] for lock in client.get(LOCKS).json()] == ["stands", "stands"]
 
 
-def test_locks_of_earlier_versions_say_that_they_have_none(client: TestClient, enrolled: str, owner_db: Session) -> None:
+def test_locks_of_earlier_versions_say_that_they_have_none(client: TestClient, participant_code: str, owner_db: Session) -> None:
     owner_db.execute(
         text(
             "insert into margins_lock (participant_id, margins_version_id, reason, created_by)"
@@ -81,7 +81,7 @@ def test_locks_of_earlier_versions_say_that_they_have_none(client: TestClient, e
 
 @pytest.mark.parametrize("side", ["signature", "trail", "both"])
 def test_a_signature_that_was_rewritten_with_its_values_does_not_stand(
-    client: TestClient, enrolled: str, owner_db: Session, side: str
+    client: TestClient, participant_code: str, owner_db: Session, side: str
 ) -> None:
     """Whoever owns the tables changes the margins and what was signed; the entry of the audit trail tells of another signature."""
     assert client.post(LOCKS, json={"version": 1, "reason": "protocol", "password": PASSWORD}).status_code == 201
@@ -104,7 +104,9 @@ def test_a_signature_that_was_rewritten_with_its_values_does_not_stand(
         assert not verify(db).whole
 
 
-def test_signatures_and_their_entries_are_read_in_one_query(client: TestClient, enrolled: str, db: Session, statements: list[str]) -> None:
+def test_signatures_and_their_entries_are_read_in_one_query(
+    client: TestClient, participant_code: str, db: Session, statements: list[str]
+) -> None:
     for number in (1, 2, 3):
         client.post(LOCKS, json={"version": number, "reason": "protocol", "password": PASSWORD})
         client.put("/api/v1/participants/P1/margins", json={"margins": {"tremor_points": number}, "reason": "amended"})

@@ -24,14 +24,14 @@ DEFAULTS = {
 }  # fmt: skip
 
 
-def test_a_new_participant_has_the_stated_defaults(client: TestClient, enrolled: str) -> None:
+def test_a_new_participant_has_the_stated_defaults(client: TestClient, participant_code: str) -> None:
     (only,) = client.get(PATH).json()
     assert {name: only[name] for name in DEFAULTS} == DEFAULTS
     assert (only["version"], only["reason"]) == (1, None)
     assert Margins() == Margins(0.1, 1.0, 10.0)
 
 
-def test_a_change_is_a_new_version_and_leaves_the_old_one(client: TestClient, enrolled: str, db: Session) -> None:
+def test_a_change_is_a_new_version_and_leaves_the_old_one(client: TestClient, participant_code: str, db: Session) -> None:
     sent = {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}
     assert client.put(PATH, json=sent).json()["version"] == 2
     assert client.put(PATH, json=sent).json()["version"] == 2, "the same again makes no version"
@@ -46,14 +46,14 @@ def test_a_change_is_a_new_version_and_leaves_the_old_one(client: TestClient, en
         db.execute(text("update margins_version set tremor_points = 50"))
 
 
-def test_a_change_needs_its_reason(client: TestClient, enrolled: str) -> None:
+def test_a_change_needs_its_reason(client: TestClient, participant_code: str) -> None:
     answer = client.put(PATH, json={"margins": {"tremor_points": 5}, "reason": "  "})
     assert (answer.status_code, "reason" in answer.json()["detail"]) == (422, True)
     assert len(client.get(PATH).json()) == 1
 
 
 @pytest.mark.parametrize("name", sorted(BOUNDS))
-def test_what_cannot_be_a_margin_is_refused_with_its_bounds(client: TestClient, enrolled: str, name: str) -> None:
+def test_what_cannot_be_a_margin_is_refused_with_its_bounds(client: TestClient, participant_code: str, name: str) -> None:
     for value in (-0.1, BOUNDS[name].high * 1.01):
         answer = client.put(PATH, json={"margins": {name: value}, "reason": "a slip"})
         assert answer.status_code == 422
@@ -61,7 +61,7 @@ def test_what_cannot_be_a_margin_is_refused_with_its_bounds(client: TestClient, 
     assert len(client.get(PATH).json()) == 1
 
 
-def test_the_page_changes_what_was_typed_and_keeps_what_was_refused(client: TestClient, enrolled: str) -> None:
+def test_the_page_changes_what_was_typed_and_keeps_what_was_refused(client: TestClient, participant_code: str) -> None:
     page = "/participants/P1/margins"
     refused = client.post(page, data={"version": "1", "tremor_points": "500", "reason": "r"}, headers=HTML)
     assert refused.status_code == 422
@@ -74,7 +74,7 @@ def test_the_page_changes_what_was_typed_and_keeps_what_was_refused(client: Test
     assert old.status_code == 409, "a form opened before somebody else's change does not take it back"
 
 
-def test_the_page_says_which_visits_only_explore(client: TestClient, enrolled: str) -> None:
+def test_the_page_says_which_visits_only_explore(client: TestClient, participant_code: str) -> None:
     page = "/participants/P1/margins"
     assert "only explore" not in client.get(page, headers=HTML).text
     locked = client.post(f"{PATH}/locks", json={"version": 1, "reason": "protocol", "password": PASSWORD})

@@ -50,8 +50,8 @@ def test_a_confirmed_session_is_deleted_by_nobody(db: Session, owner_db: Session
         session.rollback()
 
 
-def test_a_dose_that_was_taken_back_stays_and_may_be_entered_anew(client: TestClient, enrolled: str, db: Session) -> None:
-    visit = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 5, "date": "2026-03-02"}).json()["id"]
+def test_a_dose_that_was_taken_back_stays_and_may_be_entered_anew(client: TestClient, participant_code: str, db: Session) -> None:
+    visit = client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 5, "date": "2026-03-02"}).json()["id"]
     dose = {"drug": "levodopa", "mg": 100, "taken_at": "2026-03-02T07:00:00Z"}
     number = client.post(f"/api/v1/visits/{visit}/doses", json=dose).json()["id"]
     assert client.post(f"/api/v1/doses/{number}/removal", json={"reason": "it was 50 mg"}).status_code == 204
@@ -67,12 +67,12 @@ def test_a_dose_that_was_taken_back_stays_and_may_be_entered_anew(client: TestCl
     assert (removal.status_code, "doses of medication" in removal.text) == (409, True)
 
 
-def test_an_amplitude_that_is_stated_no_more_stays_and_outlasts_its_visit(client: TestClient, enrolled: str, db: Session) -> None:
+def test_an_amplitude_that_is_stated_no_more_stays_and_outlasts_its_visit(client: TestClient, participant_code: str, db: Session) -> None:
     def stated(*sides: tuple[str, float]) -> list[dict[str, Any]]:
         return [{"hemisphere": side, "amplitude_ma": ma} for side, ma in sides]
 
     first = {"number": 6, "cdbs_amplitudes": stated(("left", 2.5), ("right", 3.0))}
-    visit = client.post(f"/api/v1/participants/{enrolled}/visits", json=first).json()["id"]
+    visit = client.post(f"/api/v1/participants/{participant_code}/visits", json=first).json()["id"]
     path = f"/api/v1/visits/{visit}"
     assert client.patch(path, json={"cdbs_amplitudes": stated(("left", 2.5)), "reason": "the left side alone"}).status_code == 200
     assert [a["hemisphere"] for a in client.get(path).json()["cdbs_amplitudes"]] == ["left"]

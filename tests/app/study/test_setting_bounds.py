@@ -40,7 +40,7 @@ def open_every_page(client: TestClient, session: int, visit: int = 1) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(SETTING_BOUNDS))
-def test_a_value_outside_its_bounds_is_refused_with_the_bounds_and_the_unit(client: TestClient, enrolled: str, name: str) -> None:
+def test_a_value_outside_its_bounds_is_refused_with_the_bounds_and_the_unit(client: TestClient, participant_code: str, name: str) -> None:
     bound = SETTING_BOUNDS[name]
     whole = name == "window"
     for value in (bound.low - 1, bound.high + 1):
@@ -57,14 +57,16 @@ def test_a_value_outside_its_bounds_is_refused_with_the_bounds_and_the_unit(clie
 
 
 @pytest.mark.parametrize(("unit", "status"), [("uV", 422), ("dB", 200)])
-def test_a_threshold_is_positive_but_in_units_that_may_be_negative(client: TestClient, enrolled: str, unit: str, status: int) -> None:
+def test_a_threshold_is_positive_but_in_units_that_may_be_negative(
+    client: TestClient, participant_code: str, unit: str, status: int
+) -> None:
     for xi_beta in (-1.0, 0.0):
         body = {"settings": {"xi_beta": xi_beta, "beta_unit": unit}}
         assert client.put("/api/v1/participants/P1/settings", json=body).status_code == status
 
 
 @pytest.mark.parametrize("amplitude", [TINY, 0.0, 0.09, 25.6])
-def test_a_visits_cdbs_amplitude_has_the_same_bounds(client: TestClient, enrolled: str, amplitude: float) -> None:
+def test_a_visits_cdbs_amplitude_has_the_same_bounds(client: TestClient, participant_code: str, amplitude: float) -> None:
     stated = {"cdbs_amplitudes": [{"hemisphere": "left", "amplitude_ma": amplitude}]}
     answers = [
         client.post("/api/v1/participants/P1/visits", json={"number": 2} | stated),
@@ -75,7 +77,7 @@ def test_a_visits_cdbs_amplitude_has_the_same_bounds(client: TestClient, enrolle
         assert (answer.status_code, "must lie between 0.1 and 25.5 mA" in answer.text) == (422, True), answer.text[-600:]
 
 
-def test_no_page_fails_whatever_is_set(client: TestClient, enrolled: str, upload: Upload) -> None:
+def test_no_page_fails_whatever_is_set(client: TestClient, participant_code: str, upload: Upload) -> None:
     session = upload(steps=12)
     names = sorted(set(SETTING_BOUNDS) - {"window"})
 
@@ -107,7 +109,7 @@ EARLIER = [
 
 @pytest.mark.parametrize("earlier", EARLIER, ids=lambda e: ",".join(e))
 def test_rows_of_before_there_were_bounds_are_shown_and_break_no_page(
-    client: TestClient, enrolled: str, upload: Upload, db: Session, earlier: dict[str, float]
+    client: TestClient, participant_code: str, upload: Upload, db: Session, earlier: dict[str, float]
 ) -> None:
     session = upload(steps=12)
     with transaction("test") as own:

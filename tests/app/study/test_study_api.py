@@ -19,16 +19,16 @@ def test_a_new_participant_gets_the_papers_constants(client: TestClient) -> None
     assert (settings["c2"], settings["c3"], settings["c4"], settings["xi_beta"], settings["version"]) == (10, 10, 10, None, 1)
 
 
-def test_a_change_of_settings_makes_a_version_and_keeps_the_rest(client: TestClient, enrolled: str) -> None:
-    changed = client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"gamma": 0.9}, "reason": "shorter sight"})
+def test_a_change_of_settings_makes_a_version_and_keeps_the_rest(client: TestClient, participant_code: str) -> None:
+    changed = client.put(f"/api/v1/participants/{participant_code}/settings", json={"settings": {"gamma": 0.9}, "reason": "shorter sight"})
     assert changed.status_code == 200
     assert (changed.json()["version"], changed.json()["gamma"], changed.json()["xi_beta"]) == (2, 0.9, 1.0)
-    versions = client.get(f"/api/v1/participants/{enrolled}/settings").json()
+    versions = client.get(f"/api/v1/participants/{participant_code}/settings").json()
     assert [v["gamma"] for v in versions] == [0.99, 0.9]
 
 
-def test_the_same_settings_again_make_no_version(client: TestClient, enrolled: str) -> None:
-    again = client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"gamma": 0.99}})
+def test_the_same_settings_again_make_no_version(client: TestClient, participant_code: str) -> None:
+    again = client.put(f"/api/v1/participants/{participant_code}/settings", json={"settings": {"gamma": 0.99}})
     assert again.json()["version"] == 1
 
 
@@ -52,23 +52,23 @@ def test_bad_settings_are_refused_by_name(client: TestClient, settings: dict[str
     assert client.get("/api/v1/participants/P9").status_code == 404
 
 
-def test_codes_and_visit_numbers_are_unique(client: TestClient, enrolled: str) -> None:
-    assert client.post("/api/v1/participants", json={"code": enrolled}).status_code == 409
-    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 1}).status_code == 409
+def test_codes_and_visit_numbers_are_unique(client: TestClient, participant_code: str) -> None:
+    assert client.post("/api/v1/participants", json={"code": participant_code}).status_code == 409
+    assert client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 1}).status_code == 409
 
 
-def test_lists_are_paged(client: TestClient, enrolled: str) -> None:
+def test_lists_are_paged(client: TestClient, participant_code: str) -> None:
     for number in range(2, 6):
-        client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": number})
-    page = client.get(f"/api/v1/participants/{enrolled}/visits", params={"limit": 2, "offset": 3}).json()
+        client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": number})
+    page = client.get(f"/api/v1/participants/{participant_code}/visits", params={"limit": 2, "offset": 3}).json()
     assert [v["number"] for v in page["items"]] == [4, 5]
     assert (page["total"], page["limit"], page["offset"]) == (5, 2, 3)
 
 
-def test_a_viewer_reads_and_does_not_write(client: TestClient, client_as, enrolled: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_viewer_reads_and_does_not_write(client: TestClient, client_as, participant_code: str) -> None:  # type: ignore[no-untyped-def]
     viewer = client_as("viewer")
-    assert viewer.get(f"/api/v1/participants/{enrolled}").status_code == 200
-    assert viewer.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 7}).status_code == 403
+    assert viewer.get(f"/api/v1/participants/{participant_code}").status_code == 200
+    assert viewer.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 7}).status_code == 403
 
 
 def test_nothing_is_told_without_a_token(service_app) -> None:  # type: ignore[no-untyped-def]
@@ -77,7 +77,7 @@ def test_nothing_is_told_without_a_token(service_app) -> None:  # type: ignore[n
     assert bare.get("/healthz").json()["status"] == "ok"
 
 
-def test_every_write_leaves_an_audit_row_that_cannot_be_changed(client: TestClient, enrolled: str, db: Session) -> None:
+def test_every_write_leaves_an_audit_row_that_cannot_be_changed(client: TestClient, participant_code: str, db: Session) -> None:
     rows = db.scalars(select(AuditEvent).where(AuditEvent.entity == "visit")).all()
     assert [(r.action, r.actor) for r in rows] == [("insert", "admin@clinic.example")]
     assert rows[0].after is not None
@@ -100,13 +100,13 @@ def test_the_database_itself_refuses_impossible_qocs(db: Session, column: str, v
         db.execute(text(f"insert into qoc (session_id, revision, entered_by, {column}) select id, 1, 'x', {value} from session"))
 
 
-def test_codes_that_differ_by_case_only_are_the_same(client: TestClient, enrolled: str) -> None:
-    assert client.post("/api/v1/participants", json={"code": enrolled.lower()}).status_code == 409
+def test_codes_that_differ_by_case_only_are_the_same(client: TestClient, participant_code: str) -> None:
+    assert client.post("/api/v1/participants", json={"code": participant_code.lower()}).status_code == 409
 
 
-def test_a_session_takes_only_its_own_participants_policy_and_its_own_traces(client: TestClient, enrolled: str) -> None:
+def test_a_session_takes_only_its_own_participants_policy_and_its_own_traces(client: TestClient, participant_code: str) -> None:
     table = b"t_s,beta,amplitude_fraction\n0,1,1\n2,1,1\n"
-    data = {"participant": enrolled, "visit": "1", "controller": "other"}
+    data = {"participant": participant_code, "visit": "1", "controller": "other"}
     session = client.post("/api/v1/uploads", data=data, files={"file": ("s.csv", table)}).json()["sessions"][0]["id"]
     foreign = client.patch(f"/api/v1/sessions/{session}", json={"controller": "rl", "policy_id": 12345})
     assert foreign.status_code == 422
@@ -122,9 +122,9 @@ def test_a_unit_has_one_spelling(client: TestClient) -> None:
     assert settings["beta_unit"] == "uV2"
 
 
-def test_a_controller_without_a_policy_takes_none(client: TestClient, enrolled: str) -> None:
+def test_a_controller_without_a_policy_takes_none(client: TestClient, participant_code: str) -> None:
     table = b"t_s,beta,amplitude_fraction\n0,1,1\n2,1,1\n"
-    data = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+    data = {"participant": participant_code, "visit": "1", "controller": "cdbs"}
     session = client.post("/api/v1/uploads", data=data, files={"file": ("s.csv", table)}).json()["sessions"][0]["id"]
     refused = client.patch(f"/api/v1/sessions/{session}", json={"policy_id": 1})
     assert refused.status_code == 422
@@ -132,7 +132,7 @@ def test_a_controller_without_a_policy_takes_none(client: TestClient, enrolled: 
 
 
 @pytest.mark.parametrize("day", ["0001-01-01", "0226-03-02", "1989-12-31", "2201-01-01", "9999-12-31"])
-def test_a_mistyped_year_of_a_visit_is_refused(client: TestClient, enrolled: str, day: str) -> None:
+def test_a_mistyped_year_of_a_visit_is_refused(client: TestClient, participant_code: str, day: str) -> None:
     made = client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": day})
     assert made.status_code == 422
     assert "the year must lie between 1990 and 2200" in made.json()["detail"]

@@ -128,10 +128,10 @@ def test_a_runner_whose_reader_went_away_says_so_and_blames_no_log(tmp_path: Pat
 
 
 @pytest.mark.hazard("H21")
-def test_an_uploaded_log_is_the_session_that_the_device_had(logged: tuple[Device, Path], client: TestClient, enrolled: str) -> None:
+def test_an_uploaded_log_is_the_session_that_the_device_had(logged: tuple[Device, Path], client: TestClient, participant_code: str) -> None:
     device, log = logged
-    client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"cdbs_amplitude_ma": 3.0}})
-    data = {"participant": enrolled, "visit": "1", "controller": "other"}
+    client.put(f"/api/v1/participants/{participant_code}/settings", json={"settings": {"cdbs_amplitude_ma": 3.0}})
+    data = {"participant": participant_code, "visit": "1", "controller": "other"}
     answer = client.post("/api/v1/uploads", data=data, files={"file": ("log.csv", log.read_bytes())})
     assert answer.status_code == 201, answer.text
     assert "each put to the period that followed it" in answer.json()["report"][0]["understood"][0]
@@ -147,9 +147,9 @@ def test_an_uploaded_log_is_the_session_that_the_device_had(logged: tuple[Device
 
 
 @pytest.mark.hazard("H21")
-def test_a_log_without_its_first_line_is_refused_in_words(logged: tuple[Device, Path], client: TestClient, enrolled: str) -> None:
+def test_a_log_without_its_first_line_is_refused_in_words(logged: tuple[Device, Path], client: TestClient, participant_code: str) -> None:
     bare = logged[1].read_bytes().split(b"\n", 2)[2]
-    data = {"participant": enrolled, "visit": "1", "controller": "other"}
+    data = {"participant": participant_code, "visit": "1", "controller": "other"}
     answer = client.post("/api/v1/uploads", data=data, files={"file": ("log.csv", bare)})
     assert answer.status_code == 422, answer.text
     assert "the log of a controller without its first line" in answer.text
@@ -157,7 +157,7 @@ def test_a_log_without_its_first_line_is_refused_in_words(logged: tuple[Device, 
 
 
 @pytest.mark.hazard("H21")
-def test_a_log_of_another_participant_is_refused(logged: tuple[Device, Path], client: TestClient, enrolled: str) -> None:
+def test_a_log_of_another_participant_is_refused(logged: tuple[Device, Path], client: TestClient, participant_code: str) -> None:
     enrol = client.post("/api/v1/participants", json={"code": "P2"})
     assert enrol.status_code == 201
     assert client.post("/api/v1/participants/P2/visits", json={"number": 1}).status_code == 201
@@ -169,14 +169,14 @@ def test_a_log_of_another_participant_is_refused(logged: tuple[Device, Path], cl
 
 
 def test_a_log_names_policy_and_limits_of_its_session(
-    logged: tuple[Device, Path], client: TestClient, enrolled: str, tmp_path: Path
+    logged: tuple[Device, Path], client: TestClient, participant_code: str, tmp_path: Path
 ) -> None:
     with zipfile.ZipFile(tmp_path / "bundle.zip") as bundle:
         network = bundle.read("model.onnx")
 
     def uploaded(rows: int | None) -> dict[str, Any]:
         sent = {"file": ("log.csv", b"".join(logged[1].read_bytes().splitlines(keepends=True)[:rows]))}
-        answer = client.post("/api/v1/uploads", data={"participant": enrolled, "visit": "1", "confirm": "false"}, files=sent)
+        answer = client.post("/api/v1/uploads", data={"participant": participant_code, "visit": "1", "confirm": "false"}, files=sent)
         assert answer.status_code == 201, answer.text
         body = answer.json()
         (found,) = body["proposals"]
@@ -185,7 +185,7 @@ def test_a_log_names_policy_and_limits_of_its_session(
     foreign = uploaded(-3)
     assert (foreign["session"]["controller"], foreign["session"]["policy_id"]) == (None, None)
     assert "a policy (number 3 where its bundle was made) that is none of this participant's" in foreign["flagged"]
-    home = f"/api/v1/participants/{enrolled}"
+    home = f"/api/v1/participants/{participant_code}"
     policy = client.post(f"{home}/policies", data={"name": "rl-01"}, files={"file": ("x.onnx", network)}).json()["id"]
     client.put(f"{home}/settings", json={"settings": {"cdbs_amplitude_ma": 2.5}})
     known = uploaded(None)

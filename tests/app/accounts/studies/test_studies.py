@@ -85,14 +85,14 @@ def test_a_role_holds_at_its_site_alone_and_ends_at_once(client: TestClient, cli
     [("monitor", 403, 403, 403, 200), ("coordinator", 201, 403, 403, 200)],
 )
 def test_what_monitors_and_coordinators_may(
-    client: TestClient, enrolled: str, client_as: Clients, role: str, enrols: int, settings: int, plans: int, audit: int
+    client: TestClient, participant_code: str, client_as: Clients, role: str, enrols: int, settings: int, plans: int, audit: int
 ) -> None:
     person = client_as(role)
-    assert person.get(f"/api/v1/participants/{enrolled}").status_code == 200
+    assert person.get(f"/api/v1/participants/{participant_code}").status_code == 200
     assert enrol(person, "P9", "main") == enrols
-    changed = person.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"cdbs_amplitude_ma": 3.0}, "reason": "x"})
+    changed = person.put(f"/api/v1/participants/{participant_code}/settings", json={"settings": {"cdbs_amplitude_ma": 3.0}, "reason": "x"})
     assert changed.status_code == settings
-    visit = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 77}).json()["id"]
+    visit = client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 77}).json()["id"]
     assert person.post(f"/api/v1/visits/{visit}/plan", json={"policy_ids": [1]}).status_code == plans
     assert person.get("/audit").status_code == audit
 

@@ -138,7 +138,7 @@ def test_a_session_that_cannot_be_read_does_not_stop_the_others(client: TestClie
     assert "cannot be read: No hemisphere is named" in answer["excluded"][0]["reason"]
 
 
-def test_a_participant_without_sessions_has_an_empty_analysis(client: TestClient, enrolled: str) -> None:
+def test_a_participant_without_sessions_has_an_empty_analysis(client: TestClient, participant_code: str) -> None:
     answer = client.get(PATH).json()
     assert (answer["sessions"], answer["controllers"]) == (0, [])
     assert all(m["groups"] == [] and m["comparisons"] == [] for m in answer["metrics"])
@@ -154,7 +154,7 @@ def test_the_page_shows_charts_tables_tests_and_limits(client: TestClient, study
     assert "<b>Not enough data</b> for 5 of 10 comparisons" in flat(page.text)
 
 
-def test_only_who_may_read_the_participant_sees_the_analysis(service_app, enrolled: str) -> None:  # type: ignore[no-untyped-def]
+def test_only_who_may_read_the_participant_sees_the_analysis(service_app, participant_code: str) -> None:  # type: ignore[no-untyped-def]
     assert TestClient(service_app).get(PATH).status_code == 401
 
 
@@ -176,9 +176,9 @@ def test_sessions_whose_amplitudes_contradict_their_controller_are_named_and_cou
         assert "mean amplitude fraction is 1.20; 0.9 to 1.1 is expected" in page
 
 
-def test_a_participant_without_cdbs_sessions_has_a_page_that_says_so(client: TestClient, enrolled: str) -> None:
+def test_a_participant_without_cdbs_sessions_has_a_page_that_says_so(client: TestClient, participant_code: str) -> None:
     table = b"t_s,beta,amplitude_fraction\n0,1,1\n2,1,0.5\n4,1,0.6\n"
-    data = {"participant": enrolled, "visit": "1", "controller": "random"}
+    data = {"participant": participant_code, "visit": "1", "controller": "random"}
     assert client.post("/api/v1/uploads", data=data, files={"file": ("s.csv", table)}).status_code == 201
     for path in ("/participants/P1/analyses/paper", "/participants/P1"):
         page = client.get(path, headers={"Accept": "text/html"})

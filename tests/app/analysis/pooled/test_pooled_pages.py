@@ -26,11 +26,11 @@ from tests.app.analysis.conftest import adder
 
 
 @pytest.fixture
-def four(client: TestClient, db: Session, enrolled: str) -> dict[str, float]:
+def four(client: TestClient, db: Session, participant_code: str) -> dict[str, float]:
     """Participants P1 to P4 of three visits each; RL lowers the energy by a known share and is a little faster in grasps."""
     saved = {"P1": 0.5, "P2": 0.4, "P3": 0.6, "P4": 0.3}
     for code, share in saved.items():
-        if code != enrolled:
+        if code != participant_code:
             assert client.post("/api/v1/participants", json={"code": code, "settings": {"cdbs_amplitude_ma": 3.0}}).status_code == 201
         add = adder(db, code)
         for visit in (1, 2, 3):
@@ -117,14 +117,14 @@ def test_an_asterisk_stands_only_in_the_desired_direction(client: TestClient, ad
     assert labels.count(".008") == 2
 
 
-def test_computation_time_counts_ended_steps(client: TestClient, db: Session, enrolled: str) -> None:
+def test_computation_time_counts_ended_steps(client: TestClient, db: Session, participant_code: str) -> None:
     from datetime import UTC, datetime, timedelta
 
     from app.accounts.permissions import SYSTEM
     from app.study import repository
     from app.tables.jobs import Job, JobStatus, JobStep
 
-    participant = repository.participant_by_code(db, enrolled, SYSTEM)
+    participant = repository.participant_by_code(db, participant_code, SYSTEM)
     start = datetime(2026, 3, 2, tzinfo=UTC)
     fields: dict[str, Any] = {"params": {}, "code_version": "x", "created_by": "test", "kind": "train", "participant_id": participant.id}
     db.add(Job(id="j", status=JobStatus.SUCCEEDED, finished_at=start, **fields))

@@ -31,9 +31,9 @@ AddSession = Callable[..., int]
 
 
 @pytest.fixture
-def policy(client: TestClient, enrolled: str) -> int:
+def policy(client: TestClient, participant_code: str) -> int:
     onnx = MlpPolicy(10, (8,), mean=1.0, std=0.5, seed=1).to_onnx()
-    answer = client.post(f"/api/v1/participants/{enrolled}/policies", data={"name": "own"}, files={"file": ("p.onnx", onnx)})
+    answer = client.post(f"/api/v1/participants/{participant_code}/policies", data={"name": "own"}, files={"file": ("p.onnx", onnx)})
     assert answer.status_code == 201, answer.text
     return int(answer.json()["id"])
 

@@ -34,7 +34,7 @@ def ranked(client: TestClient) -> dict[str, Any]:
     return body
 
 
-def test_before_any_evaluation_the_ranking_says_what_to_do(client: TestClient, enrolled: str) -> None:
+def test_before_any_evaluation_the_ranking_says_what_to_do(client: TestClient, participant_code: str) -> None:
     answer = client.get(RANKING)
     assert answer.status_code == 404
     assert "pipeline" in answer.json()["hint"]

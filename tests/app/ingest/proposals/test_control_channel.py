@@ -101,10 +101,10 @@ def test_a_survey_is_a_recording_that_goes_through_montages() -> None:
 
 
 def test_a_montage_survey_of_a_patient_is_not_proposed_as_a_session_without_dbs(
-    client: TestClient, enrolled: str, recordings: Path
+    client: TestClient, participant_code: str, recordings: Path
 ) -> None:
     content = (recordings / "rcs" / "montage_packet_loss.zip").read_bytes()
-    answer = client.post("/api/v1/uploads", data={"participant": enrolled, "visit": "1"}, files={"file": ("m.zip", content)})
+    answer = client.post("/api/v1/uploads", data={"participant": participant_code, "visit": "1"}, files={"file": ("m.zip", content)})
     assert answer.status_code == 201, answer.text
     for proposal in answer.json()["proposals"]:
         assert proposal["session"]["controller"] is None
@@ -127,9 +127,11 @@ def on_cortex(content: bytes) -> bytes:
 
 
 def test_the_control_channel_can_be_changed_on_the_proposal_with_its_reason_shown(
-    client: TestClient, enrolled: str, send: Any, proposals: Callable[[], list[dict[str, Any]]]
+    client: TestClient, participant_code: str, send: Any, proposals: Callable[[], list[dict[str, Any]]]
 ) -> None:
-    client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"beta_source": "time_domain", "cdbs_amplitude_ma": 4.0}})
+    client.put(
+        f"/api/v1/participants/{participant_code}/settings", json={"settings": {"beta_source": "time_domain", "cdbs_amplitude_ma": 4.0}}
+    )
     send(("a.zip", on_cortex(device_zip())), visit=1)
     (proposal,) = proposals()
     session = proposal["session"]["id"]
@@ -149,7 +151,7 @@ def test_the_control_channel_can_be_changed_on_the_proposal_with_its_reason_show
     page = client.get(f"/proposals/{session}", headers={"Accept": "text/html"}).text
     assert f'value="{stream}|{channel}" selected' in page
     form = {f"version-{session}": "2", f"control-{session}": f"beta|{beta[0]}", f"seen-{session}": "{}", "do": "save"}
-    posted = client.post(f"/participants/{enrolled}/proposals", data=form, follow_redirects=False)
+    posted = client.post(f"/participants/{participant_code}/proposals", data=form, follow_redirects=False)
     assert posted.status_code == 303, posted.text
     assert proposals()[0]["session"]["control_channel"] == beta[0]
 

@@ -71,22 +71,22 @@ def test_a_controller_without_a_visit_is_refused_in_words(send: Any) -> None:
     assert "no visit" in answer.json()["detail"]
 
 
-def test_a_proposal_counts_nowhere_until_it_is_confirmed(send: Any, client: TestClient, enrolled: str, db: Session) -> None:
+def test_a_proposal_counts_nowhere_until_it_is_confirmed(send: Any, client: TestClient, participant_code: str, db: Session) -> None:
     counted = send(("c.csv", steady(1)), visit=1, controller="cdbs").json()["sessions"][0]
     (proposal,) = send(("p.csv", steady(0.5, beta=0.5)), visit=1).json()["proposals"]
     number = proposal["session"]["id"]
     visit = counted["visit_id"]
 
     def everywhere() -> dict[str, set[int]]:
-        person = study.participant_by_code(db, enrolled, SYSTEM)
+        person = study.participant_by_code(db, participant_code, SYSTEM)
         with zipfile.ZipFile(io.BytesIO(export_participant(db, person, SYSTEM))) as z:
-            rows = z.read(f"{enrolled}/sessions.csv").decode().splitlines()[1:]
-        snapshot = client.post(f"/api/v1/participants/{enrolled}/snapshots").json()
+            rows = z.read(f"{participant_code}/sessions.csv").decode().splitlines()[1:]
+        snapshot = client.post(f"/api/v1/participants/{participant_code}/snapshots").json()
         return {
             "visit": {s["id"] for s in client.get(f"/api/v1/visits/{visit}/sessions").json()["items"]},
             "export": {int(r.split(",")[0]) for r in rows},
             "buffer": {s["session_id"] for s in snapshot["members"]},
-            "analysis": {client.get(f"/api/v1/participants/{enrolled}/analyses").json()["sessions"]},
+            "analysis": {client.get(f"/api/v1/participants/{participant_code}/analyses").json()["sessions"]},
         }
 
     before = everywhere()
@@ -103,9 +103,9 @@ def test_a_proposal_counts_nowhere_until_it_is_confirmed(send: Any, client: Test
     assert after["analysis"] == {2}
 
 
-def test_a_buffer_of_proposals_alone_is_refused(send: Any, client: TestClient, enrolled: str) -> None:
+def test_a_buffer_of_proposals_alone_is_refused(send: Any, client: TestClient, participant_code: str) -> None:
     send(("p.csv", steady(1)), visit=1)
-    answer = client.post(f"/api/v1/participants/{enrolled}/snapshots")
+    answer = client.post(f"/api/v1/participants/{participant_code}/snapshots")
     assert answer.status_code == Invalid.status
     assert "no confirmed session" in answer.text
 
@@ -258,13 +258,13 @@ def test_the_same_bytes_again_give_the_same_proposal(send: Any, proposals: Any) 
     assert again["proposals"] == first["proposals"] == proposals()
 
 
-def test_fractions_become_milliamperes_of_the_visit_they_are_confirmed_for(send: Any, client: TestClient, enrolled: str) -> None:
+def test_fractions_become_milliamperes_of_the_visit_they_are_confirmed_for(send: Any, client: TestClient, participant_code: str) -> None:
     body = {"number": 2, "date": "2026-03-30", "cdbs_amplitudes": [{"hemisphere": "left", "amplitude_ma": 2.0}]}
-    assert client.post(f"/api/v1/participants/{enrolled}/visits", json=body).status_code == 201
+    assert client.post(f"/api/v1/participants/{participant_code}/visits", json=body).status_code == 201
     (proposal,) = send(("t.csv", steady(0.5)), visit=1).json()["proposals"]
     number = proposal["session"]["id"]
     assert post(client, proposal, "confirm", visit=2, hemisphere="left", controller="other").status_code == 200
-    client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"cdbs_amplitude_ma": 9.0}})
+    client.put(f"/api/v1/participants/{participant_code}/settings", json={"settings": {"cdbs_amplitude_ma": 9.0}})
     assert client.get(f"/api/v1/sessions/{number}/trace").json()["amplitude_ma"][-1] == pytest.approx(1.0)
 
 

@@ -23,7 +23,7 @@ MOST_MB = 600
 
 
 @pytest.fixture
-def service(enrolled: str, make_token: Callable[[str], str]) -> Iterator[tuple[httpx.Client, subprocess.Popen[bytes]]]:
+def service(participant_code: str, make_token: Callable[[str], str]) -> Iterator[tuple[httpx.Client, subprocess.Popen[bytes]]]:
     """`betaloop serve` on the test's database, and a client of an engineer."""
     port = free_port()
     command = [sys.executable, "-m", "app.cli", "serve", "--port", str(port)]

@@ -58,25 +58,25 @@ def send_unreadable(client: TestClient, participant: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["changed", "missing"])
-def test_the_same_bytes_sent_again_take_the_place_of_a_damaged_file(client: TestClient, enrolled: str, how: str) -> None:
-    first = send(client, enrolled, "s.csv", TABLE, visit="1", controller="random")
+def test_the_same_bytes_sent_again_take_the_place_of_a_damaged_file(client: TestClient, participant_code: str, how: str) -> None:
+    first = send(client, participant_code, "s.csv", TABLE, visit="1", controller="random")
     whole = files.read(first["stored_sha256"])
-    assert MADE_ANEW not in send(client, enrolled, "s.csv", TABLE)["told"]
+    assert MADE_ANEW not in send(client, participant_code, "s.csv", TABLE)["told"]
     damage(first["stored_sha256"], how)
-    again = send(client, enrolled, "s.csv", TABLE)
+    again = send(client, participant_code, "s.csv", TABLE)
     assert again["duplicate"]
     assert MADE_ANEW in again["told"]
     assert files.read(again["stored_sha256"]) == whole
-    assert MADE_ANEW not in send(client, enrolled, "s.csv", TABLE)["told"]
+    assert MADE_ANEW not in send(client, participant_code, "s.csv", TABLE)["told"]
 
 
-def test_a_damaged_file_in_quarantine_comes_back_encrypted(client: TestClient, enrolled: str, db: Session) -> None:
+def test_a_damaged_file_in_quarantine_comes_back_encrypted(client: TestClient, participant_code: str, db: Session) -> None:
     sealed = text("select quarantine_sha256 from upload_file")
-    send_unreadable(client, enrolled)
+    send_unreadable(client, participant_code)
     before = db.scalar(sealed)
     assert before is not None
     damage(before, "changed")
-    send_unreadable(client, enrolled)
+    send_unreadable(client, participant_code)
     db.rollback()
     (after,) = db.scalars(sealed).all()
     assert files.is_whole(after)
@@ -85,9 +85,9 @@ def test_a_damaged_file_in_quarantine_comes_back_encrypted(client: TestClient, e
 
 
 def test_a_file_that_is_cleaned_otherwise_today_leaves_nothing_damaged_behind(
-    client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, participant_code: str, db: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = send(client, enrolled, "s.csv", TABLE, visit="1", controller="random")
+    first = send(client, participant_code, "s.csv", TABLE, visit="1", controller="random")
     damage(first["stored_sha256"], "changed")
     real = reading.clean
 
@@ -98,7 +98,7 @@ def test_a_file_that_is_cleaned_otherwise_today_leaves_nothing_damaged_behind(
 
     monkeypatch.setattr(reading, "clean", newer)
     monkeypatch.setattr(receiving, "REDACTOR_VERSION", 99)
-    again = send(client, enrolled, "s.csv", TABLE)
+    again = send(client, participant_code, "s.csv", TABLE)
     assert MADE_ANEW in again["told"]
     assert again["stored_sha256"] != first["stored_sha256"]
     assert files.is_whole(again["stored_sha256"])
@@ -110,9 +110,9 @@ def test_a_file_that_is_cleaned_otherwise_today_leaves_nothing_damaged_behind(
 @pytest.mark.parametrize("stopped", ["before they go", "after they went"])
 @pytest.mark.parametrize("first_is", ["whole", "changed"])
 def test_a_stop_while_bytes_of_no_use_come_again_leaves_nothing_that_nobody_names(
-    client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch, first_is: str, stopped: str
+    client: TestClient, participant_code: str, db: Session, monkeypatch: pytest.MonkeyPatch, first_is: str, stopped: str
 ) -> None:
-    send_unreadable(client, enrolled)
+    send_unreadable(client, participant_code)
     sealed = text("select quarantine_sha256 from upload_file")
     (before,) = db.scalars(sealed).all()
     if first_is != "whole":
@@ -126,7 +126,7 @@ def test_a_stop_while_bytes_of_no_use_come_again_leaves_nothing_that_nobody_name
 
     with monkeypatch.context() as patch, new_session() as dying:
         patch.setattr(files, "remove", stop)
-        mine = study.participant_by_code(dying, enrolled, SYSTEM)
+        mine = study.participant_by_code(dying, participant_code, SYSTEM)
         with pytest.raises(Stopped):
             service.receive(dying, mine, StatedSession(), [Incoming("x.csv", io.BytesIO(b"no recording at all"))], SYSTEM)
     assert [taken.done for taken in resume("test")] == [True]
@@ -138,14 +138,14 @@ def test_a_stop_while_bytes_of_no_use_come_again_leaves_nothing_that_nobody_name
     assert kept == [files.path_of(after)]
 
 
-def test_the_doctor_names_what_needs_a_damaged_file_and_how_it_comes_back(client: TestClient, enrolled: str) -> None:
-    first = send(client, enrolled, "s.csv", TABLE, visit="1", controller="random")
+def test_the_doctor_names_what_needs_a_damaged_file_and_how_it_comes_back(client: TestClient, participant_code: str) -> None:
+    first = send(client, participant_code, "s.csv", TABLE, visit="1", controller="random")
     damage(first["stored_sha256"], "missing")
     (found,) = [f for f in examine() if f.name == "files"]
     assert f"needed by upload file {first['id']})" in found.detail
     assert "uploaded once more" in found.hint
     assert "betaloop restore" in found.hint
-    send(client, enrolled, "s.csv", TABLE)
+    send(client, participant_code, "s.csv", TABLE)
     assert [f.ok for f in examine(hashes=True) if f.name == "files"] == [True]
 
 
@@ -159,9 +159,9 @@ def test_bytes_that_are_kept_a_second_time_replace_damaged_ones(db: Session) -> 
 
 
 @pytest.mark.parametrize("how", DAMAGES)
-def test_a_backup_goes_on_around_a_damaged_file_and_names_it(client: TestClient, enrolled: str, tmp_path: Path, how: str) -> None:
-    good = send(client, enrolled, "a.csv", TABLE, visit="1", controller="random")["stored_sha256"]
-    bad = send(client, enrolled, "b.csv", TABLE + b"42,1,1\n", visit="1", controller="random")["stored_sha256"]
+def test_a_backup_goes_on_around_a_damaged_file_and_names_it(client: TestClient, participant_code: str, tmp_path: Path, how: str) -> None:
+    good = send(client, participant_code, "a.csv", TABLE, visit="1", controller="random")["stored_sha256"]
+    bad = send(client, participant_code, "b.csv", TABLE + b"42,1,1\n", visit="1", controller="random")["stored_sha256"]
     damage(bad, how)
     key = tmp_path / "key"
     backups.make_key(key)

@@ -48,7 +48,7 @@ def post_in_chunks(app: Any, path: str, headers: dict[str, str]) -> tuple[int, i
 @pytest.mark.parametrize("path", ["/api/v1/uploads", "/participants/P1/upload"])
 @pytest.mark.parametrize(("role", "status"), [(None, 401), ("viewer", 403)])
 def test_a_caller_who_may_not_upload_is_refused_before_the_body_is_read(
-    client: TestClient, service_app: Any, enrolled: str, make_token: Callable[[str], str], path: str, role: str | None, status: int
+    client: TestClient, service_app: Any, participant_code: str, make_token: Callable[[str], str], path: str, role: str | None, status: int
 ) -> None:
     headers = {"authorization": f"Bearer {make_token(role)}"} if role else {}
     got, taken = post_in_chunks(service_app, path, headers)
@@ -56,6 +56,6 @@ def test_a_caller_who_may_not_upload_is_refused_before_the_body_is_read(
     assert got in ((status,) if path.startswith("/api") or role else (401, 303))
 
 
-def test_a_caller_who_may_upload_is_read_to_the_end(service_app: Any, enrolled: str, make_token: Callable[[str], str]) -> None:
+def test_a_caller_who_may_upload_is_read_to_the_end(service_app: Any, participant_code: str, make_token: Callable[[str], str]) -> None:
     _, taken = post_in_chunks(service_app, "/api/v1/uploads", {"authorization": f"Bearer {make_token('engineer')}"})
     assert taken >= CHUNKS

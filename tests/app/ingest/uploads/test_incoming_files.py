@@ -65,7 +65,7 @@ def assert_open_files_show_nothing(process: subprocess.Popen[bytes]) -> None:
 
 
 @pytest.mark.parametrize("moment", ["coming", "cleaning"])
-def test_a_process_killed_in_mid_upload_leaves_no_raw_bytes(enrolled: str, moment: str) -> None:
+def test_a_process_killed_in_mid_upload_leaves_no_raw_bytes(participant_code: str, moment: str) -> None:
     with subprocess.Popen([sys.executable, "-c", UPLOAD, moment], cwd=ROOT, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"here\n", "the upload is in its middle"
@@ -195,21 +195,23 @@ def test_what_the_parser_of_the_form_puts_aside_is_encrypted(fresh_database: str
         process.kill()
 
 
-def test_the_routes_of_uploads_read_their_forms_encrypted(client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_routes_of_uploads_read_their_forms_encrypted(
+    client: TestClient, participant_code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made: list[object] = []
     monkeypatch.setattr(encrypted_form, "raw_stream", lambda: made.append(raw := raw_bytes.raw_stream()) or raw)
-    for path in ("/api/v1/uploads", f"/participants/{enrolled}/upload"):
+    for path in ("/api/v1/uploads", f"/participants/{participant_code}/upload"):
         table = b"t_s,beta,amplitude_fraction\n" + b"".join(b"%d,1,1\n" % (2 * k) for k in range(20 + len(made)))
-        fields = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+        fields = {"participant": participant_code, "visit": "1", "controller": "cdbs"}
         assert client.post(path, data=fields, files={"file": ("t.csv", table)}).status_code in (200, 201, 303), path
     assert [stream.closed for stream in made] == [True, True]
 
 
-def test_a_disk_that_fills_while_a_form_comes_is_named(client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_fills_while_a_form_comes_is_named(client: TestClient, participant_code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     full = lambda: raw_bytes._stream(open("/dev/full", "r+b", buffering=0), bytes(32))  # noqa: E731, SIM115 - its reader closes it
     monkeypatch.setattr(encrypted_form, "raw_stream", full)
-    for path in ("/api/v1/uploads", f"/participants/{enrolled}/upload"):
-        fields = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+    for path in ("/api/v1/uploads", f"/participants/{participant_code}/upload"):
+        fields = {"participant": participant_code, "visit": "1", "controller": "cdbs"}
         answer = client.post(path, data=fields, files={"file": ("t.csv", b"1" * (1 << 20))}, headers={"accept": "text/html"})
         assert answer.status_code == 507, path
         assert "There is no room left on the disk." in answer.text

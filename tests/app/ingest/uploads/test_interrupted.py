@@ -62,7 +62,7 @@ def cut_short(db: Session, monkeypatch: pytest.MonkeyPatch, where: Any, name: st
     ids=["while the first file is decoded", "before the second file is decoded", "before the sessions are made"],
 )
 def test_an_upload_that_was_cut_short_is_taken_up(
-    client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch, where: Any, name: str, nth: int, files: int
+    client: TestClient, participant_code: str, db: Session, monkeypatch: pytest.MonkeyPatch, where: Any, name: str, nth: int, files: int
 ) -> None:
     number = cut_short(db, monkeypatch, where, name, nth)
     assert client.get(f"/api/v1/uploads/{number}").json()["status"] == "received"
@@ -82,7 +82,7 @@ def test_an_upload_that_was_cut_short_is_taken_up(
 
 
 def test_what_the_sender_had_stated_holds_when_it_is_taken_up(
-    client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, participant_code: str, db: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     visit = study.visit_by_number(db, study.participant_by_code(db, "P1", SYSTEM).id, 1)
     cut_short(db, monkeypatch, service, "make_sessions", visit=visit, controller=Controller.RANDOM)
@@ -100,7 +100,7 @@ def test_what_the_sender_had_stated_holds_when_it_is_taken_up(
     ],
 )
 def test_what_was_cut_short_waits_while_nothing_new_is_taken(
-    client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch, ending: str, undoing: str, why: str
+    client: TestClient, participant_code: str, db: Session, monkeypatch: pytest.MonkeyPatch, ending: str, undoing: str, why: str
 ) -> None:
     number = cut_short(db, monkeypatch, service, "make_sessions")
     db.execute(text(ending))
@@ -122,7 +122,7 @@ def test_what_was_cut_short_waits_while_nothing_new_is_taken(
 
 
 def test_an_upload_that_is_still_coming_is_left_alone(
-    client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, participant_code: str, db: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     number = cut_short(db, monkeypatch, reading, "decode")
     page = lambda: client.get("/participants/P1/upload", headers={"Accept": "text/html"}).text  # noqa: E731
@@ -135,7 +135,7 @@ def test_an_upload_that_is_still_coming_is_left_alone(
     assert interrupted(db) == [number]
 
 
-def test_the_command_takes_up_what_was_cut_short(enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_takes_up_what_was_cut_short(participant_code: str, db: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     number = cut_short(db, monkeypatch, reading, "decode")
     result = CliRunner().invoke(command_line, ["ingest", "resume"])
     assert (result.exit_code, result.output) == (0, f"Upload {number}: files: 1, sessions: 1\n")
@@ -143,7 +143,7 @@ def test_the_command_takes_up_what_was_cut_short(enrolled: str, db: Session, mon
 
 
 def test_bytes_that_nobody_can_read_are_told_when_they_are_taken_up(
-    client: TestClient, enrolled: str, db: Session, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, participant_code: str, db: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch, new_session() as dying:
         patch.setattr(Receiver, "decode", lambda *_: (_ for _ in ()).throw(Stopped()))
@@ -242,11 +242,11 @@ def test_a_disk_that_fills_while_identity_is_taken_out_keeps_nothing(
 
 
 def test_the_page_of_an_upload_that_a_full_disk_cut_short_says_what_is_kept(
-    client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, participant_code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service, "make_sessions", failing(NO_ROOM))
     answer = client.post(
-        f"/participants/{enrolled}/upload",
+        f"/participants/{participant_code}/upload",
         data={"visit": "1", "controller": "cdbs"},
         files={"file": ("t.csv", steady(1))},
         headers={"accept": "text/html"},
@@ -256,7 +256,7 @@ def test_the_page_of_an_upload_that_a_full_disk_cut_short_says_what_is_kept(
 
 
 def test_a_database_that_dies_during_an_upload_does_not_hide_what_is_kept(
-    client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, participant_code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def dies(db: Session, *_: Any) -> None:
         mine = "datname = current_database() and pid <> pg_backend_pid()"
@@ -264,7 +264,7 @@ def test_a_database_that_dies_during_an_upload_does_not_hide_what_is_kept(
         db.execute(text("select pg_terminate_backend(pg_backend_pid())"))
 
     monkeypatch.setattr(service, "make_sessions", dies)
-    stated = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+    stated = {"participant": participant_code, "visit": "1", "controller": "cdbs"}
     answer = client.post("/api/v1/uploads", data=stated, files=[("file", ("t.csv", steady(1)))])
     assert (answer.status_code, answer.headers.get("retry-after")) == (503, "5")
     assert "the bytes of 1 of its 1 file are kept" in answer.json()["detail"]
@@ -285,10 +285,10 @@ def test_a_fault_between_two_files_says_how_many_are_kept(send: Send, monkeypatc
 
 
 def test_the_reading_of_a_file_is_told_while_it_lasts(
-    service_app: Any, make_token: Any, enrolled: str, client: TestClient, monkeypatch: pytest.MonkeyPatch
+    service_app: Any, make_token: Any, participant_code: str, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reading, "DECODE", f"{readers.__name__}:hold")
-    stated = {"participant": enrolled, "visit": "1", "controller": "cdbs"}
+    stated = {"participant": participant_code, "visit": "1", "controller": "cdbs"}
 
     def send_one() -> None:
         client.post("/api/v1/uploads", data=stated, files=[("file", ("a.csv", steady(1)))])

@@ -63,7 +63,7 @@ def killed(action: str, where: str) -> None:
     assert done.returncode == -9, done.stderr.decode()[-2000:]
 
 
-def test_a_file_that_ends_the_service_twice_is_put_aside_and_can_be_read(client: TestClient, enrolled: str, db: Session) -> None:
+def test_a_file_that_ends_the_service_twice_is_put_aside_and_can_be_read(client: TestClient, participant_code: str, db: Session) -> None:
     killed("send", "decode")
     killed("resume", "decode")
     (taken,) = resume("test")
@@ -80,14 +80,14 @@ def test_a_file_that_ends_the_service_twice_is_put_aside_and_can_be_read(client:
     assert len(client.get("/api/v1/participants/P1/proposals").json()) == 1
 
 
-def test_a_file_whose_reading_ended_the_service_once_is_resumed(client: TestClient, enrolled: str) -> None:
+def test_a_file_whose_reading_ended_the_service_once_is_resumed(client: TestClient, participant_code: str) -> None:
     killed("send", "decode")
     assert [t.done for t in resume("test")] == [True]
     assert len(client.get("/api/v1/participants/P1/proposals").json()) == 1
 
 
 @pytest.mark.slow
-def test_sessions_that_end_the_service_twice_are_not_made_a_third_time(client: TestClient, enrolled: str, db: Session) -> None:
+def test_sessions_that_end_the_service_twice_are_not_made_a_third_time(client: TestClient, participant_code: str, db: Session) -> None:
     killed("send", "make_sessions")
     killed("resume", "make_sessions")
     assert [t.done for t in resume("test")] == [True]
@@ -146,7 +146,7 @@ def test_when_the_process_that_forks_readers_is_killed_the_next_file_starts_anot
 
 
 @pytest.mark.slow
-def test_readers_die_with_the_service(enrolled: str) -> None:
+def test_readers_die_with_the_service(participant_code: str) -> None:
     with subprocess.Popen([sys.executable, "-c", LETHAL, "send", "slowly", steady(1).decode()], cwd=ROOT) as service:
         try:
             mine = _descendants(service.pid, 2)

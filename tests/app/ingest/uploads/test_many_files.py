@@ -123,7 +123,7 @@ def test_bundles_are_equal_bytes_for_equal_files() -> None:
 
 @pytest.mark.parametrize("kind", ["zip", "loose", "percept"])
 def test_two_uploads_at_once_of_the_same_files_make_one_recording(
-    send: Any, client: TestClient, service_app: Any, enrolled: str, recordings: Path, kind: str, proposals: Any
+    send: Any, client: TestClient, service_app: Any, participant_code: str, recordings: Path, kind: str, proposals: Any
 ) -> None:
     parts = {
         "zip": lambda: [("s.zip", device_zip())],
@@ -229,7 +229,7 @@ def test_one_file_above_the_limit_loses_none_of_the_others(send: Any, monkeypatc
     assert "not kept" in problem["hint"]
 
 
-def test_a_request_that_claims_ten_gigabytes_is_refused_before_it_is_read(client: TestClient, enrolled: str) -> None:
+def test_a_request_that_claims_ten_gigabytes_is_refused_before_it_is_read(client: TestClient, participant_code: str) -> None:
     headers = {"content-length": "10000000000", "content-type": "multipart/form-data; boundary=x"}
     answer = client.post("/api/v1/uploads", headers=headers, content=b"")
     assert answer.status_code == 413

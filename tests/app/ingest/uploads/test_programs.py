@@ -47,13 +47,13 @@ def _shift(group: dict[str, Any], moving: bool) -> None:
 
 
 @pytest.fixture
-def visit(client: TestClient, enrolled: str) -> int:
+def visit(client: TestClient, participant_code: str) -> int:
     stated = [
         {"hemisphere": "right", "program": 0, "amplitude_ma": STEADY_MA}, {"hemisphere": "right", "program": 1, "amplitude_ma": 3.0},
         {"hemisphere": "left", "program": 0, "amplitude_ma": 2.6},
     ]  # fmt: skip
     body = {"number": 2, "date": "2026-03-02", "cdbs_amplitudes": stated}
-    assert client.post(f"/api/v1/participants/{enrolled}/visits", json=body).status_code == 201
+    assert client.post(f"/api/v1/participants/{participant_code}/visits", json=body).status_code == 201
     return 2
 
 
@@ -113,9 +113,9 @@ def test_the_proposal_says_which_program_was_taken_and_a_person_names_another(se
     assert "moved as well as that of right side, program 0" in notes
 
 
-def test_what_is_stated_of_another_program_makes_no_fraction(send: Any, client: TestClient, enrolled: str) -> None:
+def test_what_is_stated_of_another_program_makes_no_fraction(send: Any, client: TestClient, participant_code: str) -> None:
     body = {"number": 2, "date": "2026-03-02", "cdbs_amplitudes": [{"hemisphere": "right", "program": 0, "amplitude_ma": STEADY_MA}]}
-    assert client.post(f"/api/v1/participants/{enrolled}/visits", json=body).status_code == 201
+    assert client.post(f"/api/v1/participants/{participant_code}/visits", json=body).status_code == 201
     (proposal,) = send(("right.zip", with_a_second_program(device_zip(("random",), "P1"))), visit=2).json()["proposals"]
     control = next(u for u in proposal["usable_steps"] if u["is_control"])
     assert control["usable"] == 0

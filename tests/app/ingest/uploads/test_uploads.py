@@ -32,7 +32,7 @@ def upload(client: TestClient, content: bytes, name: str = "session.csv", **fiel
     return client.post("/api/v1/uploads", data=data, files={"file": (name, content)})
 
 
-def test_a_table_becomes_a_confirmed_session_on_the_papers_grid(client: TestClient, enrolled: str) -> None:
+def test_a_table_becomes_a_confirmed_session_on_the_papers_grid(client: TestClient, participant_code: str) -> None:
     answer = upload(client, TABLE)
     assert answer.status_code == 201
     body = answer.json()
@@ -51,7 +51,7 @@ def test_a_table_becomes_a_confirmed_session_on_the_papers_grid(client: TestClie
     assert rows[6] == pytest.approx((0.7, 3.6, 1.2))
 
 
-def test_a_fraction_above_one_is_stored_and_flagged_not_clipped(client: TestClient, enrolled: str) -> None:
+def test_a_fraction_above_one_is_stored_and_flagged_not_clipped(client: TestClient, participant_code: str) -> None:
     body = upload(client, TABLE).json()
     trace = client.get(f"/api/v1/sessions/{body['sessions'][0]['id']}/trace").json()
     assert trace["steps_above_cdbs"] == 1
@@ -59,7 +59,7 @@ def test_a_fraction_above_one_is_stored_and_flagged_not_clipped(client: TestClie
     assert any("above" in sentence or "exceed" in sentence for report in body["report"] for sentence in report["flagged"])
 
 
-def test_parquet_gives_the_same_trace_as_csv(client: TestClient, enrolled: str) -> None:
+def test_parquet_gives_the_same_trace_as_csv(client: TestClient, participant_code: str) -> None:
     sink = io.BytesIO()
     columns = {"t_s": [-2.0, 0, 2, 4, 6], "beta": [0.8, 0.9, 1.5, 1.2, 0.7], "amplitude_fraction": [1, 1, 0.5, 0.6, 1.2]}
     pq.write_table(pa.table(columns), sink)
@@ -73,7 +73,7 @@ def test_parquet_gives_the_same_trace_as_csv(client: TestClient, enrolled: str) 
     assert traces[0]["amplitude_fraction"] == traces[1]["amplitude_fraction"]
 
 
-def test_the_same_bytes_again_change_nothing_and_say_so(client: TestClient, enrolled: str) -> None:
+def test_the_same_bytes_again_change_nothing_and_say_so(client: TestClient, participant_code: str) -> None:
     first = upload(client, TABLE).json()
     again = upload(client, TABLE, name="copy.csv", controller="cdbs")
     assert again.status_code == 201
@@ -86,7 +86,7 @@ def test_the_same_bytes_again_change_nothing_and_say_so(client: TestClient, enro
     assert client.get(f"/api/v1/visits/{visit}/sessions").json()["total"] == 1
 
 
-def test_the_same_recording_in_another_file_is_the_same_session(client: TestClient, enrolled: str) -> None:
+def test_the_same_recording_in_another_file_is_the_same_session(client: TestClient, participant_code: str) -> None:
     first = upload(client, TABLE).json()
     other = upload(client, TABLE.replace(b",", b";"), name="semicolons.csv").json()
     assert other["sha256"] != first["sha256"]
@@ -94,7 +94,9 @@ def test_the_same_recording_in_another_file_is_the_same_session(client: TestClie
     assert other["sessions"][0]["id"] == first["sessions"][0]["id"]
 
 
-def test_two_uploads_at_once_of_one_file_make_one_session(service_app: Any, make_token: Any, client: TestClient, enrolled: str) -> None:
+def test_two_uploads_at_once_of_one_file_make_one_session(
+    service_app: Any, make_token: Any, client: TestClient, participant_code: str
+) -> None:
     headers = dict(client.headers)
     answers: list[Any] = []
 
@@ -120,7 +122,7 @@ def test_two_uploads_at_once_of_one_file_make_one_session(service_app: Any, make
         (b"\x00\x01\x02\x03" * 100, "noise.bin", "format"),
     ],
 )
-def test_a_file_of_no_use_is_kept_and_named(client: TestClient, enrolled: str, content: bytes, name: str, named: str) -> None:
+def test_a_file_of_no_use_is_kept_and_named(client: TestClient, participant_code: str, content: bytes, name: str, named: str) -> None:
     answer = upload(client, content, name)
     assert answer.status_code == 422
     assert answer.headers["content-type"] == "application/problem+json"
@@ -134,7 +136,7 @@ def test_a_file_of_no_use_is_kept_and_named(client: TestClient, enrolled: str, c
     assert files.path_of(kept["stored_sha256"]).exists()
 
 
-def test_of_an_empty_file_nothing_is_kept_and_the_answer_says_so(client: TestClient, enrolled: str) -> None:
+def test_of_an_empty_file_nothing_is_kept_and_the_answer_says_so(client: TestClient, participant_code: str) -> None:
     answer = upload(client, b"", "empty.csv")
     assert answer.status_code == 422
     assert "empty.csv: the file is empty (0 bytes). Nothing of it was kept." in answer.json()["detail"]
@@ -142,7 +144,7 @@ def test_of_an_empty_file_nothing_is_kept_and_the_answer_says_so(client: TestCli
     assert client.get(f"/api/v1/uploads/{again['upload_id']}").json()["files"][0]["stored_sha256"] is None
 
 
-def test_what_cannot_be_parsed_is_kept_encrypted(client: TestClient, enrolled: str) -> None:
+def test_what_cannot_be_parsed_is_kept_encrypted(client: TestClient, participant_code: str) -> None:
     secret = b"\x00\x01 Jane Example, born 1950 " * 10
     problem = upload(client, secret, "noise.bin").json()
     kept = client.get(f"/api/v1/uploads/{problem['upload_id']}").json()["files"][0]["stored_sha256"]
@@ -150,7 +152,7 @@ def test_what_cannot_be_parsed_is_kept_encrypted(client: TestClient, enrolled: s
     assert b"".join(encryption.decrypt(files.path_of(kept))) == secret
 
 
-def test_a_bad_file_loses_nothing_else_in_the_upload(client: TestClient, enrolled: str) -> None:
+def test_a_bad_file_loses_nothing_else_in_the_upload(client: TestClient, participant_code: str) -> None:
     data = {"participant": "P1", "visit": "1", "controller": "random"}
     answer = client.post("/api/v1/uploads", data=data, files=[("file", ("bad.csv", b"x,y\n1,2\n")), ("file", ("good.csv", TABLE))])
     assert answer.status_code == 201
@@ -170,24 +172,24 @@ def test_a_bad_file_loses_nothing_else_in_the_upload(client: TestClient, enrolle
         ({"policy": "ghost"}, 422, "ghost"),
     ],
 )
-def test_what_is_stated_must_exist(client: TestClient, enrolled: str, fields: dict[str, Any], status: int, named: str) -> None:
+def test_what_is_stated_must_exist(client: TestClient, participant_code: str, fields: dict[str, Any], status: int, named: str) -> None:
     answer = upload(client, TABLE, **fields)
     assert answer.status_code == status
     assert named in answer.text
 
 
-def test_more_bytes_than_allowed_are_refused(client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_bytes_than_allowed_are_refused(client: TestClient, participant_code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(get_settings(), "upload_limit_mb", 1)
     answer = upload(client, b"t_s,beta,amplitude_fraction\n" + b"0,1,1\n" * 600_000)
     assert answer.status_code == 413
     assert "1 MiB" in answer.json()["detail"]
 
 
-def test_a_viewer_may_not_upload(client: TestClient, client_as: Any, enrolled: str) -> None:
+def test_a_viewer_may_not_upload(client: TestClient, client_as: Any, participant_code: str) -> None:
     assert upload(client_as("viewer"), TABLE).status_code == 403
 
 
-def test_the_stimulation_sweep_becomes_a_session_with_its_steps(client: TestClient, enrolled: str, recordings: Path) -> None:
+def test_the_stimulation_sweep_becomes_a_session_with_its_steps(client: TestClient, participant_code: str, recordings: Path) -> None:
     content = (recordings / "rcs" / "stim_sweep.zip").read_bytes()
     answer = upload(client, content, "stim_sweep.zip", controller="other")
     assert answer.status_code == 201
@@ -207,7 +209,7 @@ def test_the_stimulation_sweep_becomes_a_session_with_its_steps(client: TestClie
     assert means[0] > 2 * means[1.1] > means[2.4]
 
 
-def test_no_identity_of_a_device_file_is_stored_anywhere(client: TestClient, enrolled: str, recordings: Path) -> None:
+def test_no_identity_of_a_device_file_is_stored_anywhere(client: TestClient, participant_code: str, recordings: Path) -> None:
     archive = recordings / "rcs" / "stim_sweep.zip"
     with zipfile.ZipFile(archive) as zipped:
         serials = {part for name in zipped.namelist() for part in name.split("/") if part.startswith("Device") and "." not in part}
@@ -222,7 +224,9 @@ def test_no_identity_of_a_device_file_is_stored_anywhere(client: TestClient, enr
         assert not any(s.encode() in stored for s in serials)
 
 
-def test_a_stated_start_inside_a_recording_leaves_what_came_before_as_the_lead(client: TestClient, enrolled: str, recordings: Path) -> None:
+def test_a_stated_start_inside_a_recording_leaves_what_came_before_as_the_lead(
+    client: TestClient, participant_code: str, recordings: Path
+) -> None:
     content = (recordings / "rcs" / "stim_sweep.zip").read_bytes()
     body = upload(client, content, "stim_sweep.zip", controller="other", started_at="2019-08-15T19:33:45.6Z").json()
     session = body["sessions"][0]
@@ -233,7 +237,7 @@ def test_a_stated_start_inside_a_recording_leaves_what_came_before_as_the_lead(c
     assert None not in lead
 
 
-def test_the_participants_unit_and_source_are_taken_and_said(client: TestClient, enrolled: str) -> None:
+def test_the_participants_unit_and_source_are_taken_and_said(client: TestClient, participant_code: str) -> None:
     body = upload(client, TABLE).json()
     trace = client.get(f"/api/v1/sessions/{body['sessions'][0]['id']}/trace").json()
     assert (trace["beta_unit"], trace["beta_source"]) == ("uV", "table")
@@ -241,7 +245,7 @@ def test_the_participants_unit_and_source_are_taken_and_said(client: TestClient,
     assert any(said in s for s in body["report"][0]["understood"])
 
 
-def test_a_stated_unit_and_source_win(client: TestClient, enrolled: str) -> None:
+def test_a_stated_unit_and_source_win(client: TestClient, participant_code: str) -> None:
     body = upload(client, TABLE, beta_unit="mV", beta_source="time_domain").json()
     trace = client.get(f"/api/v1/sessions/{body['sessions'][0]['id']}/trace").json()
     assert (trace["beta_unit"], trace["beta_source"]) == ("mV", "time_domain")
@@ -249,14 +253,14 @@ def test_a_stated_unit_and_source_win(client: TestClient, enrolled: str) -> None
     assert any(said in s for s in body["report"][0]["understood"])
 
 
-def test_the_headers_unit_wins_over_the_stated_one_and_a_contradiction_is_flagged(client: TestClient, enrolled: str) -> None:
+def test_the_headers_unit_wins_over_the_stated_one_and_a_contradiction_is_flagged(client: TestClient, participant_code: str) -> None:
     body = upload(client, TABLE.replace(b"beta", b"beta [mV]"), beta_unit="uV").json()
     report = body["report"][0]
     assert any("unit 'mV' as the file's header says, source 'table' as the participant's settings say" in s for s in report["understood"])
     assert any("beta is in 'mV' as the file's header says, the upload says 'uV'" in s for s in report["flagged"])
 
 
-def test_other_columns_of_a_table_are_neither_stored_nor_named(client: TestClient, enrolled: str) -> None:
+def test_other_columns_of_a_table_are_neither_stored_nor_named(client: TestClient, participant_code: str) -> None:
     lines = TABLE.decode().splitlines()
     content = "\n".join([lines[0] + ",Jane Doe MRN 4711", *(f"{line},1950-03-01" for line in lines[1:])]).encode()
     answer = upload(client, content)
@@ -268,7 +272,7 @@ def test_other_columns_of_a_table_are_neither_stored_nor_named(client: TestClien
     assert not any(word in kept for word in (b"Jane", b"4711", b"1950"))
 
 
-def test_a_table_of_no_use_is_quoted_to_its_sender_alone(client: TestClient, enrolled: str) -> None:
+def test_a_table_of_no_use_is_quoted_to_its_sender_alone(client: TestClient, participant_code: str) -> None:
     problem = upload(client, b"t_s,beta,Jane Doe\n2,1,1\n", "session.csv").json()
     assert "'Jane Doe'" in problem["detail"]
     later = client.get(f"/api/v1/uploads/{problem['upload_id']}")
@@ -279,7 +283,7 @@ def test_a_table_of_no_use_is_quoted_to_its_sender_alone(client: TestClient, enr
     assert b"Jane" not in files.read(kept["stored_sha256"])
 
 
-def test_a_threshold_in_another_unit_is_never_held_against_a_trace(client: TestClient, enrolled: str, recordings: Path) -> None:
+def test_a_threshold_in_another_unit_is_never_held_against_a_trace(client: TestClient, participant_code: str, recordings: Path) -> None:
     content = (recordings / "rcs" / "stim_sweep.zip").read_bytes()
     session = upload(client, content, "stim_sweep.zip", controller="other").json()["sessions"][0]["id"]
     assert client.get(f"/api/v1/sessions/{session}/trace").json()["xi_beta"] is None
@@ -290,7 +294,9 @@ def test_a_threshold_in_another_unit_is_never_held_against_a_trace(client: TestC
     assert client.get(f"/api/v1/sessions/{table}/trace").json()["xi_beta"] == 1.0
 
 
-def test_the_session_page_shows_the_devices_steps_and_the_notes_that_disagree(client: TestClient, enrolled: str, recordings: Path) -> None:
+def test_the_session_page_shows_the_devices_steps_and_the_notes_that_disagree(
+    client: TestClient, participant_code: str, recordings: Path
+) -> None:
     content = (recordings / "rcs" / "stim_sweep.zip").read_bytes()
     session = upload(client, content, "stim_sweep.zip", controller="other").json()["sessions"][0]["id"]
     page = client.get(f"/sessions/{session}").text
@@ -300,28 +306,28 @@ def test_the_session_page_shows_the_devices_steps_and_the_notes_that_disagree(cl
     assert "n = 4 that disagree" in page
 
 
-def test_what_was_delivered_does_not_change_when_the_cdbs_amplitude_does(client: TestClient, enrolled: str) -> None:
+def test_what_was_delivered_does_not_change_when_the_cdbs_amplitude_does(client: TestClient, participant_code: str) -> None:
     session = upload(client, TABLE).json()["sessions"][0]["id"]
     before = client.get(f"/api/v1/sessions/{session}/trace").json()
-    client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"cdbs_amplitude_ma": 2.0}})
+    client.put(f"/api/v1/participants/{participant_code}/settings", json={"settings": {"cdbs_amplitude_ma": 2.0}})
     after = client.get(f"/api/v1/sessions/{session}/trace").json()
     assert before["amplitude_ma"] == after["amplitude_ma"]
     assert after["amplitude_fraction"][-1] == pytest.approx(1.8)
 
 
 @pytest.mark.parametrize("start", ["0001-01-01T00:00:00+14:00", "9999-12-31T23:59:59-14:00", "1969-01-01T00:00:00Z"])
-def test_a_start_outside_the_calendar_is_refused_and_nothing_is_stored(client: TestClient, enrolled: str, start: str) -> None:
+def test_a_start_outside_the_calendar_is_refused_and_nothing_is_stored(client: TestClient, participant_code: str, start: str) -> None:
     assert upload(client, TABLE, started_at=start).status_code == 422
     visit = client.get("/api/v1/participants/P1/visits").json()["items"][0]["id"]
     assert client.get(f"/api/v1/visits/{visit}/sessions").json()["total"] == 0
 
 
-def test_a_controller_that_contradicts_its_amplitudes_is_flagged(client: TestClient, enrolled: str) -> None:
+def test_a_controller_that_contradicts_its_amplitudes_is_flagged(client: TestClient, participant_code: str) -> None:
     flagged = upload(client, TABLE, controller="no_dbs").json()["report"][0]["flagged"]
     assert any("Said to be without DBS, but its mean amplitude is 77 %" in s for s in flagged)
 
 
-def test_the_upload_of_a_file_that_came_before_can_be_read_again(client: TestClient, enrolled: str) -> None:
+def test_the_upload_of_a_file_that_came_before_can_be_read_again(client: TestClient, participant_code: str) -> None:
     first = upload(client, TABLE).json()
     again = upload(client, TABLE).json()
     assert again["id"] != first["id"]
@@ -331,7 +337,7 @@ def test_the_upload_of_a_file_that_came_before_can_be_read_again(client: TestCli
     assert read.json()["sessions"] == first["sessions"]
 
 
-def test_a_recording_without_data_is_kept_and_makes_no_session(client: TestClient, enrolled: str, recordings: Path) -> None:
+def test_a_recording_without_data_is_kept_and_makes_no_session(client: TestClient, participant_code: str, recordings: Path) -> None:
     answer = upload(client, (recordings / "rcs" / "empty_streams.zip").read_bytes(), "empty_streams.zip", controller="other")
     assert answer.status_code == 201
     assert answer.json()["sessions"] == []
@@ -339,5 +345,5 @@ def test_a_recording_without_data_is_kept_and_makes_no_session(client: TestClien
 
 
 @pytest.mark.parametrize("fields", [{"beta_unit": "a\0b"}, {"participant": "P\0"}, {"policy": "\0"}])
-def test_a_zero_character_is_refused_in_words(client: TestClient, enrolled: str, fields: dict[str, str]) -> None:
+def test_a_zero_character_is_refused_in_words(client: TestClient, participant_code: str, fields: dict[str, str]) -> None:
     assert upload(client, TABLE, **fields).status_code == 422

@@ -100,7 +100,7 @@ def test_a_clinician_may_open_it_with_a_reason_shut_it_again_and_go_back_to_the_
     assert back["open"] is back["opened_by_test"] is False
 
 
-def test_a_decision_without_a_reason_is_refused_and_none_is_ever_changed(client: TestClient, enrolled: str, db: Session) -> None:
+def test_a_decision_without_a_reason_is_refused_and_none_is_ever_changed(client: TestClient, participant_code: str, db: Session) -> None:
     assert client.post(GATE, json={"choice": "open", "reason": "  "}).status_code == 422
     client.post(GATE, json={"choice": "open", "reason": "agreed"})
     row = db.query(BufferGateDecision).one()

@@ -113,7 +113,7 @@ def post(client: TestClient, content: bytes) -> Any:
     ids=["a loop of 2^62", "a constant of 1.6 GB", "external data", "a tensor of 4 TB", "a custom operator"],
 )
 def test_a_hostile_policy_is_refused_in_words_and_costs_the_service_nothing(
-    client: TestClient, enrolled: str, content: bytes, words: str
+    client: TestClient, participant_code: str, content: bytes, words: str
 ) -> None:
     assert len(content) < 2000
     before, begun = psutil.Process().memory_info().rss, time.process_time()
@@ -125,7 +125,7 @@ def test_a_hostile_policy_is_refused_in_words_and_costs_the_service_nothing(
     assert psutil.Process().memory_info().rss - before < 100 << 20
 
 
-def test_the_web_process_runs_no_policy_made_elsewhere(client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_web_process_runs_no_policy_made_elsewhere(client: TestClient, participant_code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def never(*_: Any, **__: Any) -> None:
         raise AssertionError("opened in the web process")
 

@@ -58,7 +58,7 @@ def test_baselines_are_made_once(upload: Upload, db: Session) -> None:
     assert proportional.config["low"] == pytest.approx(float(np.nanquantile(beta, 0.25)))
 
 
-def test_a_policy_made_elsewhere_is_stored_as_it_came(client: TestClient, enrolled: str) -> None:
+def test_a_policy_made_elsewhere_is_stored_as_it_came(client: TestClient, participant_code: str) -> None:
     content = constant_onnx(0.6, 10)
     answer = post_policy(client, content)
     assert answer.status_code == 201
@@ -78,7 +78,7 @@ def test_a_policy_made_elsewhere_is_stored_as_it_came(client: TestClient, enroll
     ],
     ids=["no ONNX", "another window", "out of range"],
 )
-def test_what_is_no_policy_is_refused_in_words(client: TestClient, enrolled: str, content: bytes, words: str) -> None:
+def test_what_is_no_policy_is_refused_in_words(client: TestClient, participant_code: str, content: bytes, words: str) -> None:
     answer = post_policy(client, content)
     assert answer.status_code == 422
     assert answer.headers["content-type"] == "application/problem+json"
@@ -88,7 +88,9 @@ def test_what_is_no_policy_is_refused_in_words(client: TestClient, enrolled: str
     assert client.get("/api/v1/participants/P1/policies").json()["total"] == 0
 
 
-def test_a_name_is_given_once_and_a_viewer_adds_nothing(client: TestClient, client_as: Callable[[str], TestClient], enrolled: str) -> None:
+def test_a_name_is_given_once_and_a_viewer_adds_nothing(
+    client: TestClient, client_as: Callable[[str], TestClient], participant_code: str
+) -> None:
     assert post_policy(client, constant_onnx(0.6, 10)).status_code == 201
     assert post_policy(client, constant_onnx(0.7, 10)).status_code == 409
     assert post_policy(client_as("viewer"), constant_onnx(0.7, 10), "mine").status_code == 403
@@ -96,7 +98,7 @@ def test_a_name_is_given_once_and_a_viewer_adds_nothing(client: TestClient, clie
     assert post_policy(client_as("engineer"), constant_onnx(0.7, 10), "mine").status_code == 201
 
 
-def test_a_policy_is_retired_with_a_reason_and_taken_back(client: TestClient, enrolled: str) -> None:
+def test_a_policy_is_retired_with_a_reason_and_taken_back(client: TestClient, participant_code: str) -> None:
     policy = post_policy(client, constant_onnx(0.6, 10)).json()["id"]
     retired = client.patch(f"/api/v1/policies/{policy}", json={"retired_reason": "too strong"})
     assert retired.json()["retired_reason"] == "too strong"
@@ -119,14 +121,14 @@ def test_the_bundle_is_whole_and_says_for_whom_and_within_which_limits(client: T
     assert np.ptp(vectors["windows"]) > 0.5
 
 
-def test_limits_that_contradict_each_other_make_no_bundle(client: TestClient, enrolled: str) -> None:
+def test_limits_that_contradict_each_other_make_no_bundle(client: TestClient, participant_code: str) -> None:
     policy = post_policy(client, constant_onnx(0.6, 10)).json()["id"]
     answer = client.get(f"/api/v1/policies/{policy}/bundle", params={"min_ma": 2.0, "max_ma": 1.0})
     assert answer.status_code == 422
     assert "limits" in answer.json()["detail"]
 
 
-def test_the_pages_show_a_policy_and_take_one_in(client: TestClient, enrolled: str, db: Session) -> None:
+def test_the_pages_show_a_policy_and_take_one_in(client: TestClient, participant_code: str, db: Session) -> None:
     added = client.post(
         "/participants/P1/policies",
         data={"name": "paris"},
@@ -154,7 +156,7 @@ def test_a_student_gets_the_asked_layers_and_a_seed_of_its_own() -> None:
 
 @pytest.mark.parametrize("name", ["\x00", "a\x00b", "a\x1bb", "a\x7fb", "a\x85b", "a\nb", "  ", ""])
 def test_a_name_without_a_visible_character_or_with_a_control_character_is_refused(
-    client: TestClient, enrolled: str, db: Session, name: str
+    client: TestClient, participant_code: str, db: Session, name: str
 ) -> None:
     files = {"file": ("x.onnx", constant_onnx(0.5, 10))}
     for path in ("/api/v1/participants/P1/policies", "/participants/P1/policies"):
@@ -162,11 +164,11 @@ def test_a_name_without_a_visible_character_or_with_a_control_character_is_refus
     assert db.query(Policy).count() == 0
 
 
-def test_a_control_character_in_a_name_is_named(client: TestClient, enrolled: str) -> None:
+def test_a_control_character_in_a_name_is_named(client: TestClient, participant_code: str) -> None:
     assert "no control characters" in post_policy(client, constant_onnx(0.5, 10), "a\x00b").text  # type: ignore[attr-defined]
 
 
-def test_a_reason_with_the_zero_character_retires_nothing(client: TestClient, enrolled: str) -> None:
+def test_a_reason_with_the_zero_character_retires_nothing(client: TestClient, participant_code: str) -> None:
     policy = post_policy(client, constant_onnx(0.6, 10)).json()["id"]  # type: ignore[attr-defined]
     assert client.post(f"/participants/P1/policies/{policy}/retire", data={"reason": "a\x00b"}).status_code == 422
     assert client.get(f"/api/v1/policies/{policy}").json()["retired_reason"] is None

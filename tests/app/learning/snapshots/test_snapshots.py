@@ -166,9 +166,9 @@ def test_no_snapshot_without_a_threshold_but_a_suggestion(upload: Upload, client
     assert 0.9 < refused.value.extra["suggested_xi_beta"] < 1.4
 
 
-def test_no_snapshot_without_a_usable_session(client: TestClient, enrolled: str, db: Session) -> None:
+def test_no_snapshot_without_a_usable_session(client: TestClient, participant_code: str, db: Session) -> None:
     with pytest.raises(Invalid, match="no confirmed session"):
-        take_snapshot(db, participant_by_code(db, enrolled, SYSTEM), SYSTEM)
+        take_snapshot(db, participant_by_code(db, participant_code, SYSTEM), SYSTEM)
 
 
 def test_two_workers_at_once_make_one_snapshot(upload: Upload, db: Session) -> None:

@@ -18,10 +18,10 @@ def lines(page: str) -> dict[str, tuple[bool, str]]:
     return {name: (bool(opened), " ".join(re.sub("<[^>]*>", " ", rest).split())) for opened, name, rest in FOLD.findall(unescape(page))}
 
 
-def test_every_file_is_a_line_and_only_a_problem_stands_open(browser: TestClient, enrolled: str, table: bytes) -> None:
+def test_every_file_is_a_line_and_only_a_problem_stands_open(browser: TestClient, participant_code: str, table: bytes) -> None:
     files = [("good.csv", table), ("bad.csv", b"a,b\n1,2\n"), ("noise.bin", b"\x00\x01")]
     fields = {"visit": "1", "controller": "cdbs"}
-    page = browser.post(f"/participants/{enrolled}/upload", data=fields, files=[("file", f) for f in files]).text
+    page = browser.post(f"/participants/{participant_code}/upload", data=fields, files=[("file", f) for f in files]).text
     told = lines(page)
     assert {name: opened for name, (opened, _) in told.items()} == {"good.csv": False, "bad.csv": True, "noise.bin": True}
     assert re.fullmatch(r"file \d+ read 4 to look at table, \d+ B · 1 session · 50 rows of 2 s: .*", told["good.csv"][1]), told["good.csv"]
@@ -35,9 +35,9 @@ def test_every_file_is_a_line_and_only_a_problem_stands_open(browser: TestClient
     assert sorted(opened for opened, _ in stored.values()) == [False, True, True]
 
 
-def test_the_files_of_an_archive_are_lines_within_its_line(browser: TestClient, enrolled: str, table: bytes) -> None:
+def test_the_files_of_an_archive_are_lines_within_its_line(browser: TestClient, participant_code: str, table: bytes) -> None:
     given = [("file", ("device.zip", device_zip())), ("file", ("steps.csv", table))]
-    page = browser.post(f"/participants/{enrolled}/upload", data={"visit": "1", "controller": "cdbs"}, files=given).text
+    page = browser.post(f"/participants/{participant_code}/upload", data={"visit": "1", "controller": "cdbs"}, files=given).text
     told = lines(page)
     opened, line = told.pop("device.zip")
     assert told.pop("steps.csv")[0] is False
@@ -50,9 +50,9 @@ def test_the_files_of_an_archive_are_lines_within_its_line(browser: TestClient, 
     assert "<h3>" not in page
 
 
-def test_a_single_file_stands_open_and_what_is_in_it_does_not(browser: TestClient, enrolled: str) -> None:
+def test_a_single_file_stands_open_and_what_is_in_it_does_not(browser: TestClient, participant_code: str) -> None:
     given = {"file": ("device.zip", device_zip())}
-    page = browser.post(f"/participants/{enrolled}/upload", data={"visit": "1", "controller": "cdbs"}, files=given).text
+    page = browser.post(f"/participants/{participant_code}/upload", data={"visit": "1", "controller": "cdbs"}, files=given).text
     told = lines(page)
     assert told.pop("device.zip")[0] is True
     assert len(told) >= 3

@@ -38,7 +38,7 @@ TELLING = ("net-", "rl", "distilled", "random", "paper", "stratified", "relu", "
 
 
 @pytest.fixture
-def policies(client: TestClient, studied: Any) -> list[int]:
+def policies(client: TestClient, study_world: Any) -> list[int]:
     """A small network and a large one, which goes from one end to the other at the smallest change of beta: limits and ramp hold it."""
     made = []
     for name, layers, std in (("net-small", (8,), 0.5), ("net-large", (96, 96), 1e-3)):
@@ -49,24 +49,24 @@ def policies(client: TestClient, studied: Any) -> list[int]:
 
 
 @pytest.fixture
-def plan(client: TestClient, db: Session, studied: Any, policies: list[int], sign_plan: Callable[..., Any]) -> dict[str, Any]:
+def plan(client: TestClient, db: Session, study_world: Any, policies: list[int], sign_plan: Callable[..., Any]) -> dict[str, Any]:
     """A blinded plan of today: two policies, cDBS between, a random session; who may see it all knows what is what."""
     client.put("/api/v1/participants/P1/settings", json={"settings": {"design": "stratified"}})
-    db.execute(text("update visit set date = :day where id = :id"), {"day": TODAY, "id": studied.visit})
+    db.execute(text("update visit set date = :day where id = :id"), {"day": TODAY, "id": study_world.visit})
     db.commit()
     wanted = {"policy_ids": policies, "seed": 7, "min_ma": 0.5, "random_sessions": 1, "minutes_per_session": 5, "blinded": True}
-    drafted = client.post(f"/api/v1/visits/{studied.visit}/plan", json=wanted)
+    drafted = client.post(f"/api/v1/visits/{study_world.visit}/plan", json=wanted)
     assert drafted.status_code == 201, drafted.text
-    assert sign_plan(studied.visit, plan_id=drafted.json()["id"]).status_code == 200
+    assert sign_plan(study_world.visit, plan_id=drafted.json()["id"]).status_code == 200
     return dict(drafted.json())
 
 
 @pytest.fixture
-def bundles(client: TestClient, studied: Any, plan: dict[str, Any]) -> dict[int, bytes]:
+def bundles(client: TestClient, study_world: Any, plan: dict[str, Any]) -> dict[int, bytes]:
     """By position."""
     found = {}
     for session in plan["sessions"]:
-        answer = client.get(f"/api/v1/visits/{studied.visit}/plan/sessions/{session['position']}/bundle")
+        answer = client.get(f"/api/v1/visits/{study_world.visit}/plan/sessions/{session['position']}/bundle")
         assert answer.status_code == 200, answer.text
         assert re.fullmatch(r'attachment; filename="P1-visit-\d+-session-\d+.zip"', answer.headers["content-disposition"])
         found[session["position"]] = answer.content
@@ -106,24 +106,24 @@ def test_nobody_tells_from_a_blinded_bundle_what_it_runs(bundles: dict[int, byte
 
 
 def test_the_page_of_bundles_tells_the_limits_of_all_sessions_alike_until_the_key_is_opened(
-    client: TestClient, studied: Any, plan: dict[str, Any]
+    client: TestClient, study_world: Any, plan: dict[str, Any]
 ) -> None:
     def rows() -> list[str]:
-        page = client.get(f"/visits/{studied.visit}/bundles", headers={"Accept": "text/html"}).text
+        page = client.get(f"/visits/{study_world.visit}/bundles", headers={"Accept": "text/html"}).text
         found = page.split("<tbody>")[1].split("</tbody>")[0].split("<tr>")[1:]
         return [re.sub(r"<[^>]*>", " ", row) for row in found]
 
     sealed = rows()
     assert len(sealed) == len(plan["sessions"])
     assert all("0.5 to 3 mA, cDBS 3 mA" in row and "blinded" in row for row in sealed), sealed
-    opened = client.post(f"/api/v1/visits/{studied.visit}/plan/key", json={"reason": "the visit is over"})
+    opened = client.post(f"/api/v1/visits/{study_world.visit}/plan/key", json={"reason": "the visit is over"})
     assert opened.status_code == 200, opened.text
     assert [("cDBS 3 mA" in row, "blinded" in row) for row in rows()] == [(True, False)] * len(sealed)
     assert any(re.search(r"\s3 mA, cDBS", row) for row in rows()), "a session of cDBS has one amplitude"
 
 
 def test_the_page_of_a_policy_lists_the_bundles_of_a_sealed_plan_once_its_key_is_opened(
-    client: TestClient, db: Session, studied: Any, policies: list[int], bundles: dict[int, bytes]
+    client: TestClient, db: Session, study_world: Any, policies: list[int], bundles: dict[int, bytes]
 ) -> None:
     def taken() -> int:
         page = client.get(f"/participants/P1/policies/{policies[0]}/bundle", headers={"Accept": "text/html"})
@@ -132,7 +132,7 @@ def test_the_page_of_a_policy_lists_the_bundles_of_a_sealed_plan_once_its_key_is
 
     assert db.scalar(text("select count(*) from bundle_release where policy_id = :id"), {"id": policies[0]}) == 1
     assert taken() == 0, "when it was taken, beside the other sessions' bundles, would tell which session it was"
-    assert client.post(f"/api/v1/visits/{studied.visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
+    assert client.post(f"/api/v1/visits/{study_world.visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
     assert taken() == 1
 
 
@@ -163,7 +163,7 @@ def packed(files: dict[str, bytes]) -> bytes:
 
 
 def test_a_blinded_day_runs_without_telling_and_comes_back_by_its_slots(
-    client: TestClient, db: Session, studied: Any, plan: dict[str, Any], bundles: dict[int, bytes], tmp_path: Path
+    client: TestClient, db: Session, study_world: Any, plan: dict[str, Any], bundles: dict[int, bytes], tmp_path: Path
 ) -> None:
     key = client.get("/api/v1/bundle-key").text.strip()
     items = {row.position: row for row in db.execute(text("select * from plan_item")).all()}
@@ -190,10 +190,10 @@ def test_a_blinded_day_runs_without_telling_and_comes_back_by_its_slots(
         sent = client.post("/api/v1/uploads", data={"participant": "P1"}, files={"file": ("log.csv", log.read_bytes())})
         assert sent.status_code == 201, sent.text
     assert len(heads) == 1, "one log looks like another but for its amplitudes"
-    path = f"/api/v1/visits/{studied.visit}/slots"
+    path = f"/api/v1/visits/{study_world.visit}/slots"
     done = client.post(f"{path}/confirm", json={})
     assert done.status_code == 200, done.text
-    assert client.post(f"/api/v1/visits/{studied.visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
+    assert client.post(f"/api/v1/visits/{study_world.visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
     for row in client.get(path).json()["rows"]:
         item = items[row["position"]]
         assert (row["confirmed"], row["deviations"]) == (True, [])
@@ -247,7 +247,7 @@ def test_a_withdrawn_policy_and_another_participant_are_refused_to_a_blinded_bun
 
 
 def test_the_audit_trail_gives_no_limits_of_a_sealed_plans_bundles(
-    client: TestClient, db: Session, studied: Any, plan: dict[str, Any], bundles: dict[int, bytes], monkeypatch: pytest.MonkeyPatch
+    client: TestClient, db: Session, study_world: Any, plan: dict[str, Any], bundles: dict[int, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def trail() -> str:
         paths = ("/audit?limit=100", "/audit?entity=bundle_release", "/audit?entity=stored_file&limit=100")
@@ -258,9 +258,9 @@ def test_the_audit_trail_gives_no_limits_of_a_sealed_plans_bundles(
     old = "controller bundle of P1, policy 7: 0.5 to 3 mA"  # as earlier versions wrote it
     monkeypatch.setattr("app.planning.wording.release_reason", lambda manifest: old)
     stored.remove(db.scalar(text("select sha256 from bundle_release order by id limit 1")))  # so that the file is stored anew
-    assert client.get(f"/api/v1/visits/{studied.visit}/plan/sessions/1/bundle").status_code == 200
+    assert client.get(f"/api/v1/visits/{study_world.visit}/plan/sessions/1/bundle").status_code == 200
     sealed = trail()
     assert "took the bundle of a session of a blinded plan" in sealed
     assert not re.findall(rf".{{0,200}}{old}", sealed)
-    assert client.post(f"/api/v1/visits/{studied.visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
+    assert client.post(f"/api/v1/visits/{study_world.visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
     assert trail().count(old) == 3, "on the page of all, and with the releases and the files"

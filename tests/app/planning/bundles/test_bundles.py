@@ -30,7 +30,7 @@ from ml.rl import MlpPolicy
 
 
 @pytest.fixture
-def policy(client: TestClient, enrolled: str) -> int:
+def policy(client: TestClient, participant_code: str) -> int:
     content = MlpPolicy(10, (20, 10), mean=1.0, std=0.5, seed=1).to_onnx()
     posted = client.post("/api/v1/participants/P1/policies", data={"name": "lyon"}, files={"file": ("x.onnx", content)})
     return int(posted.json()["id"])
@@ -255,7 +255,7 @@ def test_a_policy_whose_stored_file_is_gone_is_named(client: TestClient, policy:
 
 
 def test_a_plain_network_made_elsewhere_leaves_with_its_c_header_and_the_page_says_why_another_does_not(
-    client: TestClient, enrolled: str
+    client: TestClient, participant_code: str
 ) -> None:
     from app.learning.policies.baselines import constant_onnx
 

@@ -18,15 +18,15 @@ PAGE = {"Accept": "text/html"}
 
 
 @pytest.fixture
-def path(client: TestClient, studied: Any, sign_plan: Callable[..., Any]) -> str:
-    body = {"policy_ids": list(studied.policies), "blinded": True, "no_dbs": True, "min_ma": 0.5}
-    drafted = client.post(f"/api/v1/visits/{studied.visit}/plan", json=body).json()
+def path(client: TestClient, study_world: Any, sign_plan: Callable[..., Any]) -> str:
+    body = {"policy_ids": list(study_world.policies), "blinded": True, "no_dbs": True, "min_ma": 0.5}
+    drafted = client.post(f"/api/v1/visits/{study_world.visit}/plan", json=body).json()
     assert (drafted["key"]["sealed"], drafted["sessions"][0]["controller"] is None) == (False, False), "who signs has read it"
-    assert sign_plan(studied.visit).status_code == 200
-    return f"/api/v1/visits/{studied.visit}/plan"
+    assert sign_plan(study_world.visit).status_code == 200
+    return f"/api/v1/visits/{study_world.visit}/plan"
 
 
-def test_every_session_has_a_letter_of_its_own_and_nothing_tells_its_controller(client: TestClient, studied: Any, path: str) -> None:
+def test_every_session_has_a_letter_of_its_own_and_nothing_tells_its_controller(client: TestClient, study_world: Any, path: str) -> None:
     plan = client.get(path).json()
     sessions = plan["sessions"]
     assert plan["key"]["sealed"] is True
@@ -35,12 +35,12 @@ def test_every_session_has_a_letter_of_its_own_and_nothing_tells_its_controller(
     assert {s[name] for s in sessions for name in telling} == {None}
     # those of the session without stimulation and of cDBS are within them
     assert {(s["min_ma"], s["max_ma"], s["ramp_ma_per_s"], s["repeat"]) for s in sessions} == {(0.0, 3.0, 1.5, 1)}
-    day = client.get(f"/visits/{studied.visit}/plan", headers=PAGE).text
+    day = client.get(f"/visits/{study_world.visit}/plan", headers=PAGE).text
     sheet = " ".join(p.extract_text() for p in PdfReader(BytesIO(client.get(f"{path}.pdf").content)).pages)
     for text in (day, sheet, str(plan["warnings"])):
         assert not [name for name in ("rl-01", "rl-02", "Distilled", "not supported", "95.0") if name in text]
     assert "key sealed" in day
-    form = client.get(f"/visits/{studied.visit}/plan?replace=yes", headers=PAGE).text
+    form = client.get(f"/visits/{study_world.visit}/plan?replace=yes", headers=PAGE).text
     assert "rl-01" in form[form.index('id="draft"') :], "policies are named to who would replace the plan, and ticked are none"
     assert " checked>" not in form
 
@@ -58,10 +58,10 @@ def test_the_key_is_opened_with_a_reason_and_stands_in_the_audit_trail(
 
 
 def test_in_an_emergency_one_action_opens_it_and_the_reason_is_asked_for_afterwards(
-    client_as: Callable[..., TestClient], studied: Any, path: str
+    client_as: Callable[..., TestClient], study_world: Any, path: str
 ) -> None:
     clinician = client_as("clinician")
-    page = f"/visits/{studied.visit}/plan"
+    page = f"/visits/{study_world.visit}/plan"
     opened = clinician.post(f"{page}/key", data={"emergency": "yes"}, headers=PAGE, follow_redirects=False)
     assert opened.status_code == 303
     plan = clinician.get(path).json()
@@ -72,8 +72,8 @@ def test_in_an_emergency_one_action_opens_it_and_the_reason_is_asked_for_afterwa
     assert clinician.get(path).json()["key"]["reason"] == "dystonia in session C"
 
 
-def test_a_plan_that_is_not_blinded_has_no_key(client: TestClient, studied: Any) -> None:
-    client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
-    assert client.get(f"/api/v1/visits/{studied.visit}/plan").json()["key"] is None
-    refused = client.post(f"/api/v1/visits/{studied.visit}/plan/key", json={"reason": "x"})
+def test_a_plan_that_is_not_blinded_has_no_key(client: TestClient, study_world: Any) -> None:
+    client.post(f"/api/v1/visits/{study_world.visit}/plan", json={"policy_ids": [study_world.policies[0]]})
+    assert client.get(f"/api/v1/visits/{study_world.visit}/plan").json()["key"] is None
+    refused = client.post(f"/api/v1/visits/{study_world.visit}/plan/key", json={"reason": "x"})
     assert (refused.status_code, "is not blinded" in refused.json()["detail"]) == (409, True)

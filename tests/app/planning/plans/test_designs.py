@@ -42,7 +42,7 @@ def designed(client: TestClient, visit_id: int, **more: Any) -> list[dict[str, A
     return [s["design"] for s in sessions if s["design"]]
 
 
-def test_new_participants_have_the_stratified_design_and_settings_of_before_the_papers(client: TestClient, enrolled: str) -> None:
+def test_new_participants_have_the_stratified_design_and_settings_of_before_the_papers(client: TestClient, participant_code: str) -> None:
     settings = client.get("/api/v1/participants/P1").json()["settings"]
     assert (settings["design"], settings["design_ladder"], settings["early_visits"]) == ("stratified", False, 3)
     assert settle(client, design="paper").json()["design"] == "paper"
@@ -53,7 +53,7 @@ def test_new_participants_have_the_stratified_design_and_settings_of_before_the_
     assert "The paper&#39;s: a new draw every step." in page
 
 
-def test_levels_are_stratified_over_the_sessions_and_the_visits(client: TestClient, enrolled: str) -> None:
+def test_levels_are_stratified_over_the_sessions_and_the_visits(client: TestClient, participant_code: str) -> None:
     settle(client, cdbs_amplitude_ma=3.0, lower_bound=0.3)
     levels = []
     for number in (2, 3, 4):
@@ -70,14 +70,14 @@ def test_levels_are_stratified_over_the_sessions_and_the_visits(client: TestClie
     assert {d["seed"] for d in later} != {d["seed"] for d in found}
 
 
-def test_drafting_again_draws_the_same_design(client: TestClient, enrolled: str) -> None:
+def test_drafting_again_draws_the_same_design(client: TestClient, participant_code: str) -> None:
     settle(client, cdbs_amplitude_ma=3.0)
     number = visit(client, 2)
     first = designed(client, number)
     assert designed(client, number, seed=99, note="another order") == first
 
 
-def test_safety_comes_before_information(client: TestClient, enrolled: str) -> None:
+def test_safety_comes_before_information(client: TestClient, participant_code: str) -> None:
     settle(client, cdbs_amplitude_ma=3.3, lower_bound=0.35)
     for number in (2, 3, 4):
         for d in designed(client, visit(client, number), minutes_per_session=20, total_minutes=300):
@@ -95,7 +95,7 @@ def test_safety_comes_before_information(client: TestClient, enrolled: str) -> N
                 assert h["log_density"] == pytest.approx(float(np.log(law.density(h["amplitude"]))))
 
 
-def test_no_draw_lies_below_the_lowest_amplitude_of_the_plan(client: TestClient, enrolled: str) -> None:
+def test_no_draw_lies_below_the_lowest_amplitude_of_the_plan(client: TestClient, participant_code: str) -> None:
     """What a limit would cut is not drawn: the sheet names what the tablet gives, and densities are those of what was drawn."""
     settle(client, cdbs_amplitude_ma=3.0, lower_bound=0.3)
     number = visit(client, 2)
@@ -128,7 +128,7 @@ def test_rounding_never_goes_below_the_bound() -> None:
     assert delivered_ma(0.5, bound) in (1.5, 1.6)
 
 
-def test_a_ladder_stands_once_in_each_visit_and_the_papers_design_is_named_so(client: TestClient, enrolled: str) -> None:
+def test_a_ladder_stands_once_in_each_visit_and_the_papers_design_is_named_so(client: TestClient, participant_code: str) -> None:
     settle(client, cdbs_amplitude_ma=3.0, design_ladder=True)
     found = designed(client, visit(client, 2))
     assert sorted(d["design"] for d in found) == ["ladder", "stratified", "stratified"]
@@ -141,7 +141,9 @@ def test_a_ladder_stands_once_in_each_visit_and_the_papers_design_is_named_so(cl
     assert "the paper&#39;s design: a new draw every 2 s, uniform from 0.3 to 1 of cDBS" in client.get(f"/visits/{number}/plan").text
 
 
-def test_a_plan_without_a_bound_in_milliamperes_cannot_be_signed(client: TestClient, enrolled: str, sign_plan: Callable[..., Any]) -> None:
+def test_a_plan_without_a_bound_in_milliamperes_cannot_be_signed(
+    client: TestClient, participant_code: str, sign_plan: Callable[..., Any]
+) -> None:
     number = visit(client, 2)
     settle(client, cdbs_amplitude_ma=None)
     assert designed(client, number)[0]["bounds"] == []
@@ -161,7 +163,7 @@ def test_a_plan_without_a_bound_in_milliamperes_cannot_be_signed(client: TestCli
     assert (bound["cdbs_ma"], bound["lowest_ma"], bound["low_ma"]) == (2.5, 0.8, 1.5)
 
 
-def test_each_side_has_its_bound_and_the_page_and_the_sheet_say_it(client: TestClient, enrolled: str) -> None:
+def test_each_side_has_its_bound_and_the_page_and_the_sheet_say_it(client: TestClient, participant_code: str) -> None:
     sides = [{"hemisphere": "left", "amplitude_ma": 3.0}, {"hemisphere": "right", "amplitude_ma": 2.0}]
     number = visit(client, 2, cdbs_amplitudes=sides)
     designs = designed(client, number)
@@ -190,7 +192,7 @@ def buffer_of(db: Session) -> Any:
 
 
 @pytest.fixture
-def approved(client: TestClient, enrolled: str, sign_plan: Callable[..., Any]) -> list[dict[str, Any]]:
+def approved(client: TestClient, participant_code: str, sign_plan: Callable[..., Any]) -> list[dict[str, Any]]:
     settle(client, cdbs_amplitude_ma=3.0, lower_bound=0.3, xi_beta=1.05)
     number = visit(client, 2)
     found = designed(client, number)
@@ -235,7 +237,7 @@ def test_what_came_after_a_return_to_cdbs_is_no_decision_of_the_design(
     assert held.holds[0].log_density is not None
 
 
-def test_held_draws_of_no_plan_are_recognised_and_said(client: TestClient, db: Session, enrolled: str) -> None:
+def test_held_draws_of_no_plan_are_recognised_and_said(client: TestClient, db: Session, participant_code: str) -> None:
     settle(client, cdbs_amplitude_ma=3.0, xi_beta=1.05)
     visit(client, 2)
     rng = np.random.default_rng(0)
@@ -249,7 +251,7 @@ def test_held_draws_of_no_plan_are_recognised_and_said(client: TestClient, db: S
     assert "not stated; taken for the paper&#39;s, a new draw every step" in client.get(f"/sessions/{drawn}").text
 
 
-def test_a_proposal_says_that_its_draws_are_held(client: TestClient, enrolled: str) -> None:
+def test_a_proposal_says_that_its_draws_are_held(client: TestClient, participant_code: str) -> None:
     settle(client, cdbs_amplitude_ma=3.0, xi_beta=1.05)
     visit(client, 2)
     fraction = np.repeat(np.random.default_rng(0).uniform(0.3, 1.0, 15), 20)
@@ -259,7 +261,7 @@ def test_a_proposal_says_that_its_draws_are_held(client: TestClient, enrolled: s
     assert "the amplitudes are held (15 of them)" in client.get(f"/proposals/{proposal['id']}").text
 
 
-def test_stated_holds_may_not_leave_out_steps(client: TestClient, enrolled: str) -> None:
+def test_stated_holds_may_not_leave_out_steps(client: TestClient, participant_code: str) -> None:
     settle(client, cdbs_amplitude_ma=3.0, xi_beta=1.05)
     visit(client, 2)
     session = upload(client, np.full(60, 0.7))

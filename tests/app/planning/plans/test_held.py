@@ -24,7 +24,7 @@ from tests.app.planning.plans.test_designs import amplitudes, buffer_of, settle,
 
 
 @pytest.fixture
-def number(client: TestClient, enrolled: str) -> int:
+def number(client: TestClient, participant_code: str) -> int:
     settle(client, cdbs_amplitude_ma=3.0, lower_bound=0.3, xi_beta=1.05)
     return visit(client, 2, date="2099-03-02")
 

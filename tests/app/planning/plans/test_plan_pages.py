@@ -20,8 +20,8 @@ def _post(client: TestClient, path: str, **fields: Any) -> Any:
     return client.post(path, data=fields, headers=PAGE, follow_redirects=False)
 
 
-def test_the_page_of_a_visit_without_a_plan_offers_the_ranked_policies(client: TestClient, studied: Any) -> None:
-    page = client.get(f"/visits/{studied.visit}/plan", headers=PAGE)
+def test_the_page_of_a_visit_without_a_plan_offers_the_ranked_policies(client: TestClient, study_world: Any) -> None:
+    page = client.get(f"/visits/{study_world.visit}/plan", headers=PAGE)
     assert page.status_code == 200
     assert "has no plan yet.</b> Draft one below." in page.text
     assert page.text.index("rl-01<") < page.text.index("rl-02<") < page.text.index("rl-01-small<")
@@ -29,10 +29,10 @@ def test_the_page_of_a_visit_without_a_plan_offers_the_ranked_policies(client: T
     assert page.text.count('name="policy_ids"') == 4
 
 
-def test_draft_then_sign_with_forms_alone(client: TestClient, client_as: Any, studied: Any, db: Session) -> None:
-    path = f"/visits/{studied.visit}/plan"
+def test_draft_then_sign_with_forms_alone(client: TestClient, client_as: Any, study_world: Any, db: Session) -> None:
+    path = f"/visits/{study_world.visit}/plan"
     drafted = _post(
-        client, path, policy_ids=[str(i) for i in studied.policies[:2]], minutes_per_session="12,5", no_dbs="yes", seed="", note=""
+        client, path, policy_ids=[str(i) for i in study_world.policies[:2]], minutes_per_session="12,5", no_dbs="yes", seed="", note=""
     )
     assert (drafted.status_code, drafted.headers["location"]) == (303, f"{path}?done=drafted")
     plan = db.scalars(select(Plan)).one()
@@ -62,9 +62,9 @@ def test_draft_then_sign_with_forms_alone(client: TestClient, client_as: Any, st
     assert "Why the approved plan is replaced" in client.get(f"{path}?replace=yes", headers=PAGE).text
 
 
-def test_a_refused_form_comes_back_as_it_was_filled_in(client: TestClient, studied: Any, db: Session) -> None:
-    path = f"/visits/{studied.visit}/plan"
-    chosen = [str(i) for i in studied.policies]
+def test_a_refused_form_comes_back_as_it_was_filled_in(client: TestClient, study_world: Any, db: Session) -> None:
+    path = f"/visits/{study_world.visit}/plan"
+    chosen = [str(i) for i in study_world.policies]
     page = _post(client, path, policy_ids=chosen, total_minutes="61", washout_minutes="3", note="keep me")
     assert page.status_code == 422
     assert "4 policies with the sessions around them take 88 minutes; the visit has 61." in page.text
@@ -83,31 +83,31 @@ def test_a_refused_form_comes_back_as_it_was_filled_in(client: TestClient, studi
     assert "no number" in spelled.text
 
 
-def test_ticked_policies_of_the_ranking_go_to_the_visit_that_is_chosen(client: TestClient, studied: Any, db: Session) -> None:
-    ticked = {"policy_ids": [str(studied.policies[0])], "evaluation_id": str(studied.evaluation)}
+def test_ticked_policies_of_the_ranking_go_to_the_visit_that_is_chosen(client: TestClient, study_world: Any, db: Session) -> None:
+    ticked = {"policy_ids": [str(study_world.policies[0])], "evaluation_id": str(study_world.evaluation)}
     asked = _post(client, "/participants/P1/plan/draft", **ticked)
     assert (asked.status_code, "Which visit is planned?" in asked.text) == (200, True)
-    assert f'name="policy_ids" value="{studied.policies[0]}"' in asked.text
+    assert f'name="policy_ids" value="{study_world.policies[0]}"' in asked.text
     assert db.scalars(select(Plan)).all() == []
-    answer = _post(client, "/participants/P1/plan/draft", **ticked, visit_id=str(studied.visit))
-    assert (answer.status_code, answer.headers["location"]) == (303, f"/visits/{studied.visit}/plan?done=drafted")
-    assert client.get(f"/api/v1/visits/{studied.visit}/plan").json()["evaluation"]["id"] == studied.evaluation
+    answer = _post(client, "/participants/P1/plan/draft", **ticked, visit_id=str(study_world.visit))
+    assert (answer.status_code, answer.headers["location"]) == (303, f"/visits/{study_world.visit}/plan?done=drafted")
+    assert client.get(f"/api/v1/visits/{study_world.visit}/plan").json()["evaluation"]["id"] == study_world.evaluation
 
 
-def test_ticked_policies_never_replace_an_approved_plan_unasked(client: TestClient, studied: Any, db: Session, sign_plan: Any) -> None:
-    client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
-    assert sign_plan(studied.visit).status_code == 200
-    asked = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[1])])
+def test_ticked_policies_never_replace_an_approved_plan_unasked(client: TestClient, study_world: Any, db: Session, sign_plan: Any) -> None:
+    client.post(f"/api/v1/visits/{study_world.visit}/plan", json={"policy_ids": [study_world.policies[0]]})
+    assert sign_plan(study_world.visit).status_code == 200
+    asked = _post(client, "/participants/P1/plan/draft", policy_ids=[str(study_world.policies[1])])
     assert "its plan is signed" in asked.text
-    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[1])], visit_id=str(studied.visit))
+    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(study_world.policies[1])], visit_id=str(study_world.visit))
     assert (answer.status_code, "no reason is given why it is replaced" in answer.text) == (422, True)
     assert db.scalars(select(Visit.number).order_by(Visit.number)).all() == [1, 2], "no visit is made unasked"
-    assert client.get(f"/api/v1/visits/{studied.visit}/plan").json()["status"] == "approved"
+    assert client.get(f"/api/v1/visits/{study_world.visit}/plan").json()["status"] == "approved"
 
 
-def test_a_draft_can_make_its_visit(client: TestClient, studied: Any, db: Session) -> None:
+def test_a_draft_can_make_its_visit(client: TestClient, study_world: Any, db: Session) -> None:
     day = (date.today() + timedelta(days=30)).isoformat()
-    policy = str(studied.policies[0])
+    policy = str(study_world.policies[0])
     answer = _post(client, "/participants/P1/plan/draft", policy_ids=[policy], visit_id="new", visit_number="7", visit_date=day)
     visit = db.scalars(select(Visit).where(Visit.number == 7)).one()
     assert answer.headers["location"] == f"/visits/{visit.id}/plan?done=drafted"
@@ -118,43 +118,43 @@ def test_a_draft_can_make_its_visit(client: TestClient, studied: Any, db: Sessio
     assert db.scalars(select(Visit.number).order_by(Visit.number)).all() == [1, 2, 7]
 
 
-def test_a_draft_that_fails_makes_no_visit(client: TestClient, studied: Any, db: Session) -> None:
-    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.retired)], visit_number="9", visit_date="2199-01-01")
+def test_a_draft_that_fails_makes_no_visit(client: TestClient, study_world: Any, db: Session) -> None:
+    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(study_world.retired)], visit_number="9", visit_date="2199-01-01")
     assert answer.status_code == 422
     assert "was retired" in answer.text
     assert db.scalars(select(Visit).where(Visit.number == 9)).all() == []
 
 
-def test_a_visit_with_sessions_is_not_open_for_planning(client: TestClient, studied: Any) -> None:
-    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(studied.policies[0])], visit_id=str(studied.held_visit))
+def test_a_visit_with_sessions_is_not_open_for_planning(client: TestClient, study_world: Any) -> None:
+    answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(study_world.policies[0])], visit_id=str(study_world.held_visit))
     assert answer.status_code == 422
     assert "it has sessions, lies in the past" in answer.text
 
 
-def test_the_list_shows_every_plan_and_the_open_visits(client: TestClient, studied: Any) -> None:
+def test_the_list_shows_every_plan_and_the_open_visits(client: TestClient, study_world: Any) -> None:
     empty = client.get("/participants/P1/plans", headers=PAGE).text
     assert "No visit is planned for this participant.</b> The next visit would be number 3." in empty
     for _ in range(2):
-        client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
+        client.post(f"/api/v1/visits/{study_world.visit}/plan", json={"policy_ids": [study_world.policies[0]]})
     page = client.get("/participants/P1/plans", headers=PAGE).text
     assert page.count("superseded") == 1
-    assert f'href="/visits/{studied.visit}/plan"' in page
-    assert f'href="/visits/{studied.held_visit}/plan"' not in page
+    assert f'href="/visits/{study_world.visit}/plan"' in page
+    assert f'href="/visits/{study_world.held_visit}/plan"' not in page
 
 
-def test_a_viewer_sees_the_plan_and_no_buttons(client: TestClient, client_as, studied: Any) -> None:  # type: ignore[no-untyped-def]
-    client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
+def test_a_viewer_sees_the_plan_and_no_buttons(client: TestClient, client_as, study_world: Any) -> None:  # type: ignore[no-untyped-def]
+    client.post(f"/api/v1/visits/{study_world.visit}/plan", json={"policy_ids": [study_world.policies[0]]})
     viewer = client_as("viewer")
-    page = viewer.get(f"/visits/{studied.visit}/plan", headers=PAGE).text
+    page = viewer.get(f"/visits/{study_world.visit}/plan", headers=PAGE).text
     assert "Download PDF" in page
     assert "Approve plan" not in page
     assert "Draft plan" not in page
-    assert _post(viewer, f"/visits/{studied.visit}/plan", policy_ids=[str(studied.policies[0])]).status_code == 403
-    assert _post(viewer, f"/visits/{studied.visit}/plan/approve").status_code == 403
+    assert _post(viewer, f"/visits/{study_world.visit}/plan", policy_ids=[str(study_world.policies[0])]).status_code == 403
+    assert _post(viewer, f"/visits/{study_world.visit}/plan/approve").status_code == 403
 
 
-def test_a_participant_without_policies_gets_a_visit_of_random_sessions(client: TestClient, enrolled: str) -> None:
-    visit = client.get(f"/api/v1/participants/{enrolled}/visits").json()["items"][0]["id"]
+def test_a_participant_without_policies_gets_a_visit_of_random_sessions(client: TestClient, participant_code: str) -> None:
+    visit = client.get(f"/api/v1/participants/{participant_code}/visits").json()["items"][0]["id"]
     page = client.get(f"/visits/{visit}/plan").text
     assert "Policies learn from a visit of random sessions first" in page
     drafted = _post(client, f"/visits/{visit}/plan", random_sessions="3")
@@ -164,9 +164,9 @@ def test_a_participant_without_policies_gets_a_visit_of_random_sessions(client: 
     assert not any("ranking" in warning for warning in plan["warnings"])
 
 
-def test_a_plan_with_a_time_of_day_shows_its_sessions_by_the_clinics_clock(client: TestClient, studied: Any) -> None:
-    path, page = f"/api/v1/visits/{studied.visit}/plan", f"/visits/{studied.visit}/plan"
-    body = {"policy_ids": list(studied.policies[:2]), "order": "stated", "minutes_per_session": 5}
+def test_a_plan_with_a_time_of_day_shows_its_sessions_by_the_clinics_clock(client: TestClient, study_world: Any) -> None:
+    path, page = f"/api/v1/visits/{study_world.visit}/plan", f"/visits/{study_world.visit}/plan"
+    body = {"policy_ids": list(study_world.policies[:2]), "order": "stated", "minutes_per_session": 5}
     client.post(path, json=body)
     assert ">0:10</td>" in client.get(page, headers=PAGE).text
     client.post(path, json=body | {"starts_at": "23:55"})

@@ -33,14 +33,14 @@ TELLING = re.compile(r"rl-0\d|\brl\b|cdbs\b(?!_)|\brandom\b|distilled|No DBS|mea
 
 
 @pytest.fixture
-def plan(client: TestClient, db: Session, studied: Any, sign_plan: Callable[..., Any]) -> Plan:
+def plan(client: TestClient, db: Session, study_world: Any, sign_plan: Callable[..., Any]) -> Plan:
     """A signed, blinded plan: two policies, cDBS between, a random session."""
     client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "design": "stratified"}})
-    assert client.patch(f"/api/v1/visits/{studied.visit}", json={"date": str(DAY), "reason": "agreed"}).status_code == 200
-    wanted = {"policy_ids": list(studied.policies[:2]), "random_sessions": 1, "seed": 1, "minutes_per_session": 5, "blinded": True}
-    drafted = client.post(f"/api/v1/visits/{studied.visit}/plan", json=wanted)
+    assert client.patch(f"/api/v1/visits/{study_world.visit}", json={"date": str(DAY), "reason": "agreed"}).status_code == 200
+    wanted = {"policy_ids": list(study_world.policies[:2]), "random_sessions": 1, "seed": 1, "minutes_per_session": 5, "blinded": True}
+    drafted = client.post(f"/api/v1/visits/{study_world.visit}/plan", json=wanted)
     assert drafted.status_code == 201, drafted.text
-    assert sign_plan(studied.visit).status_code == 200
+    assert sign_plan(study_world.visit).status_code == 200
     return db.get_one(Plan, drafted.json()["id"])
 
 
@@ -60,9 +60,9 @@ def uploads(coordinator: TestClient, db: Session, plan: Plan) -> list[dict[str, 
 
 
 @pytest.fixture
-def sessions(coordinator: TestClient, studied: Any, uploads: list[dict[str, Any]]) -> dict[int, int]:
+def sessions(coordinator: TestClient, study_world: Any, uploads: list[dict[str, Any]]) -> dict[int, int]:
     """Confirmed by the coordinator in one step: session by position."""
-    done = coordinator.post(f"/api/v1/visits/{studied.visit}/slots/confirm", json={})
+    done = coordinator.post(f"/api/v1/visits/{study_world.visit}/slots/confirm", json={})
     assert done.status_code == 200, done.text
     assert not TELLING.search(str(done.json())), done.json()
     return {row["position"]: row["session_id"] for row in done.json()["comparison"]["rows"]}
@@ -78,17 +78,19 @@ def open_key(client: TestClient, visit: int) -> None:
     assert client.post(f"/api/v1/visits/{visit}/plan/key", json={"reason": "the visit is over"}).status_code == 200
 
 
-def test_the_key_opens_in_an_emergency_after_the_participant_has_withdrawn(client: TestClient, studied: Any, plan: Plan) -> None:
+def test_the_key_opens_in_an_emergency_after_the_participant_has_withdrawn(client: TestClient, study_world: Any, plan: Plan) -> None:
     left = client.patch("/api/v1/participants/P1", json={"status": "withdrawn", "reason": "asked to stop"})
     assert left.status_code == 200, left.text
-    opened = client.post(f"/api/v1/visits/{studied.visit}/plan/key", json={"emergency": True})
+    opened = client.post(f"/api/v1/visits/{study_world.visit}/plan/key", json={"emergency": True})
     assert opened.status_code == 200, opened.text
-    drafted = client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": list(studied.policies[:1]), "minutes_per_session": 5})
+    drafted = client.post(
+        f"/api/v1/visits/{study_world.visit}/plan", json={"policy_ids": list(study_world.policies[:1]), "minutes_per_session": 5}
+    )
     assert drafted.status_code == 409, "and nothing new is planned"
 
 
 def test_a_coordinator_uploads_and_confirms_by_letters(
-    client: TestClient, coordinator: TestClient, db: Session, studied: Any, plan: Plan, uploads: list[dict[str, Any]]
+    client: TestClient, coordinator: TestClient, db: Session, study_world: Any, plan: Plan, uploads: list[dict[str, Any]]
 ) -> None:
     for body in uploads:
         (proposal,) = body["proposals"]
@@ -96,7 +98,7 @@ def test_a_coordinator_uploads_and_confirms_by_letters(
         assert "key of the blinded plan is sealed" in proposal["evidence"]["controller"]
         assert not TELLING.search(str(body["report"])), body["report"]
     first = uploads[0]["proposals"][0]["session"]["id"]
-    for path in ("/participants/P1/proposals", f"/proposals/{first}", f"/uploads/{uploads[0]['id']}", f"/visits/{studied.visit}"):
+    for path in ("/participants/P1/proposals", f"/proposals/{first}", f"/uploads/{uploads[0]['id']}", f"/visits/{study_world.visit}"):
         said = words(coordinator.get(path, headers=PAGE).text).replace("cDBS amplitude", "").replace("% of cDBS", "")
         assert not TELLING.search(said), (path, TELLING.search(said))
     form = coordinator.get("/participants/P1/proposals", headers=PAGE).text
@@ -107,7 +109,7 @@ def test_a_coordinator_uploads_and_confirms_by_letters(
     fields = dict(re.findall(r'name="((?:version|seen)-\d+)" value="([^"]*)"', form))
     sent = fields | {f"controller-{b['proposals'][0]['session']['id']}": "hidden" for b in uploads} | {"do": "save:all"}
     assert coordinator.post("/participants/P1/proposals", data=sent, headers=PAGE, follow_redirects=False).status_code == 303
-    done = coordinator.post(f"/visits/{studied.visit}/slots/confirm", headers=PAGE)
+    done = coordinator.post(f"/visits/{study_world.visit}/slots/confirm", headers=PAGE)
     assert done.status_code == 200, done.text
     ran = db.execute(
         text("select s.controller, s.policy_id, i.controller, i.policy_id from session s join plan_item i on i.id = s.plan_item_id")
@@ -115,12 +117,12 @@ def test_a_coordinator_uploads_and_confirms_by_letters(
     pairs = [(tuple(row[:2]), tuple(row[2:])) for row in ran]
     assert len(pairs) == len(plan.items)
     assert all(session == item for session, item in pairs)
-    letters = {s["letter"] for s in coordinator.get(f"/api/v1/visits/{studied.visit}/sessions").json()["items"]}
+    letters = {s["letter"] for s in coordinator.get(f"/api/v1/visits/{study_world.visit}/sessions").json()["items"]}
     assert letters == {i.label for i in plan.items}
-    open_key(client, studied.visit)
-    shown = coordinator.get(f"/visits/{studied.visit}", headers=PAGE).text
+    open_key(client, study_world.visit)
+    shown = coordinator.get(f"/visits/{study_world.visit}", headers=PAGE).text
     assert {m.lower() for m in TELLING.findall(words(shown))} >= {"cdbs", "rl", "random"}
-    assert {s["controller"] for s in coordinator.get(f"/api/v1/visits/{studied.visit}/sessions").json()["items"]} == {
+    assert {s["controller"] for s in coordinator.get(f"/api/v1/visits/{study_world.visit}/sessions").json()["items"]} == {
         "cdbs",
         "rl",
         "random",
@@ -145,14 +147,14 @@ def test_no_page_and_no_route_depends_on_what_ran_until_the_key_is_opened(
     coordinator: TestClient,
     service_app: FastAPI,
     db: Session,
-    studied: Any,
+    study_world: Any,
     plan: Plan,
     sessions: dict[int, int],
 ) -> None:
     """What every page and route answers is the same where two sessions change places, and another once the key is open."""
-    policy = next(i for i in plan.items if i.policy_id == studied.policies[0])
+    policy = next(i for i in plan.items if i.policy_id == study_world.policies[0])
     other = next(i for i in plan.items if i.controller == "cdbs")
-    named = {"code": "P1", "visit_id": studied.visit, "policy_id": studied.policies[0]}
+    named = {"code": "P1", "visit_id": study_world.visit, "policy_id": study_world.policies[0]}
     skipped = ("/audit", "/bundle", "/events", "/metrics", ".pdf", "/key", "/account", "openapi", "/jobs")
     paths = sorted(
         {
@@ -180,15 +182,15 @@ def test_no_page_and_no_route_depends_on_what_ran_until_the_key_is_opened(
         now = answers(person)
         assert [p for p in paths if sealed[role][p] != now[p]] == [], role
     swap(db, PLANNED, policy.id, other.id)
-    now, visit = answers(coordinator), studied.visit
+    now, visit = answers(coordinator), study_world.visit
     of_signature = {f"/visits/{visit}/plan", f"/api/v1/visits/{visit}/plan", f"/api/v1/visits/{visit}/day", f"/visit-day/{visit}"}
     assert {p for p in paths if sealed["coordinator"][p] != now[p]} == of_signature, "it is broken by any change"
-    open_key(client, studied.visit)
+    open_key(client, study_world.visit)
     known = answers(coordinator)
     swap(db, HELD, policy.id, other.id)
     again = answers(coordinator)
     assert sum(known[p] != again[p] for p in paths) >= 10, "the swap shows once the key is open"
-    assert all(again[p] != sealed["coordinator"][p] for p in (f"/visits/{studied.visit}", f"/sessions/{sessions[policy.position]}"))
+    assert all(again[p] != sealed["coordinator"][p] for p in (f"/visits/{study_world.visit}", f"/sessions/{sessions[policy.position]}"))
 
 
 def test_traces_conditions_and_samples_are_refused_to_everybody_with_the_way_out(client: TestClient, sessions: dict[int, int]) -> None:
@@ -213,7 +215,7 @@ def test_traces_conditions_and_samples_are_refused_to_everybody_with_the_way_out
 
 
 def test_the_audit_trail_tells_no_arm_of_a_sealed_plan(
-    client: TestClient, db: Session, studied: Any, plan: Plan, sessions: dict[int, int]
+    client: TestClient, db: Session, study_world: Any, plan: Plan, sessions: dict[int, int]
 ) -> None:
     def trail() -> str:
         entities = ("plan_item", "session", "session_proposal", "session_conditions")
@@ -223,12 +225,12 @@ def test_the_audit_trail_tells_no_arm_of_a_sealed_plan(
     sealed = trail()
     assert "hidden from you" in sealed
     assert not re.findall(r".{0,60}\b(?:random|rl|rl-0\d|stratified)\b", sealed)
-    open_key(client, studied.visit)
+    open_key(client, study_world.visit)
     assert re.search(r"\brandom\b", trail())
 
 
 def test_no_search_and_no_table_of_the_trail_tells_an_arm_of_a_sealed_plan(
-    client: TestClient, studied: Any, plan: Plan, sessions: dict[int, int]
+    client: TestClient, study_world: Any, plan: Plan, sessions: dict[int, int]
 ) -> None:
     """A search that finds a row by a hidden value tells the value."""
 
@@ -240,20 +242,20 @@ def test_no_search_and_no_table_of_the_trail_tells_an_arm_of_a_sealed_plan(
 
     assert found("plan_item", "random")[0] == 0
     assert not re.search(r"random|rl-0\d", found("plan_item", "P1")[1])
-    open_key(client, studied.visit)
+    open_key(client, study_world.visit)
     assert found("plan_item", "random")[0] > 0
     assert re.search(r"random", found("plan_item", "P1")[1])
 
 
 def test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened(
-    client: TestClient, db: Session, studied: Any, plan: Plan, sessions: dict[int, int]
+    client: TestClient, db: Session, study_world: Any, plan: Plan, sessions: dict[int, int]
 ) -> None:
     participant = participant_by_code(db, "P1", SYSTEM)
     before = take_snapshot(db, participant, SYSTEM)
     db.commit()
     members = {m.session_id: m.left_out_reason or "" for m in before.members}
     assert all("blinded plan is sealed" in members[s] for s in sessions.values())
-    slots = f"/api/v1/visits/{studied.visit}/slots"
+    slots = f"/api/v1/visits/{study_world.visit}/slots"
     assert not [r for r in client.get(slots).json()["rows"] if r["predicted"] or "energy" in r["done"]], "100 % of cDBS would name cDBS"
     found = client.get("/api/v1/participants/P1/analyses").json()
     assert {e["reason"] for e in found["excluded"] if e["session_id"] in sessions.values()} == {
@@ -266,7 +268,7 @@ def test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened(
     # of machines too: what a job computes for people would tell them
     assert not set(sessions.values()) & {s.session_id for s in driven_sessions(db, before, SYSTEM)}
     assert describe(db, before, SYSTEM).sessions_by_visit.keys() == {1}
-    open_key(client, studied.visit)
+    open_key(client, study_world.visit)
     assert all("energy" in r["done"] for r in client.get(slots).json()["rows"])
     db.expire_all()
     ran = {s for s, i in zip(sessions.values(), plan.items, strict=True) if i.policy_id is not None or i.controller == "cdbs"}
@@ -278,7 +280,7 @@ def test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened(
 
 
 def test_what_can_be_learned_from_is_asked_anew_once_the_key_is_opened(
-    client: TestClient, db: Session, studied: Any, sessions: dict[int, int]
+    client: TestClient, db: Session, study_world: Any, sessions: dict[int, int]
 ) -> None:
     participant = participant_by_code(db, "P1", SYSTEM)
     for session in sessions_of_participant(db, participant.id):
@@ -289,27 +291,27 @@ def test_what_can_be_learned_from_is_asked_anew_once_the_key_is_opened(
     blocked = not_ready(db, participant)
     assert blocked is not None
     assert "blinded plan is sealed" in blocked.detail
-    open_key(client, studied.visit)
+    open_key(client, study_world.visit)
     db.expire_all()
     assert not_ready(db, participant) is None
 
 
 def test_a_sealed_plan_that_was_run_is_not_replaced_before_its_key_is_opened(
-    client: TestClient, studied: Any, sessions: dict[int, int]
+    client: TestClient, study_world: Any, sessions: dict[int, int]
 ) -> None:
-    draft = {"policy_ids": [studied.policies[0]], "reason": "another order"}
-    refused = client.post(f"/api/v1/visits/{studied.visit}/plan", json=draft)
+    draft = {"policy_ids": [study_world.policies[0]], "reason": "another order"}
+    refused = client.post(f"/api/v1/visits/{study_world.visit}/plan", json=draft)
     assert (refused.status_code, "Open the key first" in refused.json()["hint"]) == (409, True)
-    open_key(client, studied.visit)
-    assert client.post(f"/api/v1/visits/{studied.visit}/plan", json=draft).status_code == 201
+    open_key(client, study_world.visit)
+    assert client.post(f"/api/v1/visits/{study_world.visit}/plan", json=draft).status_code == 201
 
 
 def test_a_log_of_a_sealed_plan_that_is_uploaded_to_another_visit_tells_nothing_there(
-    client: TestClient, db: Session, plan: Plan, studied: Any
+    client: TestClient, db: Session, plan: Plan, study_world: Any
 ) -> None:
     bodies = [send(client, log_of(plan, i.position, 10 * i.position, number=i.position), visit="1") for i in plan.items[:2]]
     assert [p["session"]["controller"] for p in chain(*(b["proposals"] for b in bodies))] == [None, None]
-    assert {p["session"]["visit_id"] for p in chain(*(b["proposals"] for b in bodies))} == {studied.visit}, "whatever the sender says"
+    assert {p["session"]["visit_id"] for p in chain(*(b["proposals"] for b in bodies))} == {study_world.visit}, "whatever the sender says"
     assert "visit 1, which the upload says, is not taken" in str(bodies[0]["report"])
     proposal = bodies[0]["proposals"][0]
     path, asked = f"/api/v1/proposals/{proposal['session']['id']}", {"version": proposal["version"], "reason": "x"}
@@ -321,37 +323,41 @@ def test_a_log_of_a_sealed_plan_that_is_uploaded_to_another_visit_tells_nothing_
 
 
 def test_where_a_session_is_put_does_not_depend_on_the_controller_that_somebody_states(
-    client: TestClient, coordinator: TestClient, plan: Plan, studied: Any
+    client: TestClient, coordinator: TestClient, plan: Plan, study_world: Any
 ) -> None:
     """A recording without a slot's number goes by order and clock, so that no answer says which letter is cDBS."""
     other = next(i for i in plan.items if i.controller != plan.items[0].controller)
     data = {"participant": "P1", "visit": "2", "started_at": f"{DAY}T09:00:00Z", "controller": other.controller}
     sent = coordinator.post("/api/v1/uploads", data=data, files={"file": ("1.csv", recording(1, controlled=False))})
     assert sent.status_code == 201, sent.text
-    rows = coordinator.get(f"/api/v1/visits/{studied.visit}/slots").json()["rows"]
+    rows = coordinator.get(f"/api/v1/visits/{study_world.visit}/slots").json()["rows"]
     assert [r["position"] for r in rows if r["session_id"]] == [plan.items[0].position]
 
 
-def test_the_seed_from_which_the_order_was_drawn_is_hidden_until_the_key_is_opened(client: TestClient, plan: Plan, studied: Any) -> None:
+def test_the_seed_from_which_the_order_was_drawn_is_hidden_until_the_key_is_opened(
+    client: TestClient, plan: Plan, study_world: Any
+) -> None:
     def told() -> list[bool]:
-        pdf = PdfReader(io.BytesIO(client.get(f"/api/v1/visits/{studied.visit}/plan.pdf").content))
+        pdf = PdfReader(io.BytesIO(client.get(f"/api/v1/visits/{study_world.visit}/plan.pdf").content))
         trail = client.get(f"/audit?entity=plan&entity_id={plan.id}", headers=PAGE).text
         return [
-            client.get(f"/api/v1/visits/{studied.visit}/plan").json()["seed"] is not None,
-            "seed 1" in client.get(f"/visits/{studied.visit}/plan", headers=PAGE).text,
+            client.get(f"/api/v1/visits/{study_world.visit}/plan").json()["seed"] is not None,
+            "seed 1" in client.get(f"/visits/{study_world.visit}/plan", headers=PAGE).text,
             "seed 1" in pdf.pages[0].extract_text(),
             bool(re.search(r"seed</span>\s*<ins>1</ins>", trail)),
         ]
 
     assert told() == [False] * 4
-    open_key(client, studied.visit)
+    open_key(client, study_world.visit)
     assert told() == [True] * 4
 
 
-def test_the_devices_own_averages_of_a_sealed_visits_day_are_left_out(client: TestClient, db: Session, plan: Plan, studied: Any) -> None:
+def test_the_devices_own_averages_of_a_sealed_visits_day_are_left_out(
+    client: TestClient, db: Session, plan: Plan, study_world: Any
+) -> None:
     sent = client.post("/api/v1/uploads", data={"participant": "P1"}, files={"file": ("report.json", report())})
     assert sent.status_code == 201, sent.text
-    db.execute(text("update visit set date = '2026-02-02' where id = :id"), {"id": studied.visit})
+    db.execute(text("update visit set date = '2026-02-02' where id = :id"), {"id": study_world.visit})
     db.commit()
 
     def hours() -> list[float]:
@@ -363,5 +369,5 @@ def test_the_devices_own_averages_of_a_sealed_visits_day_are_left_out(client: Te
         return [(t - BEGIN.timestamp()) / 3600 for t in trend["unix_s"]]
 
     assert 0 < max(hours()) < 10, "from 14 hours before the day begins in UTC"
-    open_key(client, studied.visit)
+    open_key(client, study_world.visit)
     assert max(hours()) > 49

@@ -26,7 +26,7 @@ Clients = Callable[[str], TestClient]
 
 
 @pytest.fixture
-def policy(client: TestClient, enrolled: str) -> int:
+def policy(client: TestClient, participant_code: str) -> int:
     """A policy made elsewhere, which the administrator has added."""
     content = MlpPolicy(10, (20, 10), mean=1.0, std=0.5, seed=1).to_onnx()
     posted = client.post("/api/v1/participants/P1/policies", data={"name": "lyon"}, files={"file": ("x.onnx", content)})
@@ -82,9 +82,9 @@ def test_whoever_brought_it_an_engineer_and_a_wrong_password_release_nothing(
 
 
 def test_whoever_brought_a_policy_does_not_release_what_was_made_from_it(
-    client: TestClient, client_as: Clients, db: Session, studied: Any, external: int
+    client: TestClient, client_as: Clients, db: Session, study_world: Any, external: int
 ) -> None:
-    tuned, unrelated, student, _ = studied.policies
+    tuned, unrelated, student, _ = study_world.policies
     brought = db.get_one(Policy, external)
     brought.created_by = "admin@clinic.example"
     for made in (tuned, student):
@@ -153,56 +153,56 @@ class TestPlans:
     """What a release means for the plans that its policy stands in."""
 
     @pytest.fixture
-    def drafted(self, client: TestClient, studied: Any) -> int:
-        body = {"policy_ids": [studied.policies[0]], "seed": 7, "min_ma": 0.5, "max_ma": 3.5}
-        answer = client.post(f"/api/v1/visits/{studied.visit}/plan", json=body)
+    def drafted(self, client: TestClient, study_world: Any) -> int:
+        body = {"policy_ids": [study_world.policies[0]], "seed": 7, "min_ma": 0.5, "max_ma": 3.5}
+        answer = client.post(f"/api/v1/visits/{study_world.visit}/plan", json=body)
         assert answer.status_code == 201, answer.text
-        return int(studied.policies[0])
+        return int(study_world.policies[0])
 
     def test_a_plan_is_approved_without_releases_unless_they_are_asked_for(
-        self, client_as: Clients, studied: Any, drafted: int, sign_plan: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+        self, client_as: Clients, study_world: Any, drafted: int, sign_plan: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("BETALOOP_REQUIRE_RELEASED_POLICIES", "true")
         get_settings.cache_clear()
-        refused = sign_plan(studied.visit)
+        refused = sign_plan(study_world.visit)
         assert (refused.status_code, "is not released for testing in participants" in refused.text) == (409, True)
         assert release(client_as("clinician"), drafted, max_ma=3.5).status_code == 201
-        assert sign_plan(studied.visit).status_code == 200
+        assert sign_plan(study_world.visit).status_code == 200
 
     def test_a_plan_beyond_the_limits_of_a_release_is_not_approved(
-        self, client_as: Clients, studied: Any, drafted: int, sign_plan: Callable[..., Any]
+        self, client_as: Clients, study_world: Any, drafted: int, sign_plan: Callable[..., Any]
     ) -> None:
         clinician = client_as("clinician")
         for narrower in ({"max_ma": 3.4}, {"min_ma": 0.6}, {"ramp_ma_per_s": 1.4}):
             assert release(clinician, drafted, **{"max_ma": 3.5} | narrower).status_code == 201
-            refused = sign_plan(studied.visit)
+            refused = sign_plan(study_world.visit)
             assert (refused.status_code, "goes beyond the limits" in refused.text) == (409, True), narrower
         assert release(clinician, drafted, max_ma=3.5).status_code == 201
-        assert sign_plan(studied.visit).status_code == 200
+        assert sign_plan(study_world.visit).status_code == 200
 
     def test_a_release_as_its_page_proposes_it_allows_a_plan_by_its_own_defaults(
-        self, client: TestClient, client_as: Clients, db: Session, studied: Any, sign_plan: Callable[..., Any]
+        self, client: TestClient, client_as: Clients, db: Session, study_world: Any, sign_plan: Callable[..., Any]
     ) -> None:
-        give_a_network(db, studied.policies[0])
+        give_a_network(db, study_world.policies[0])
         db.commit()
         amplitude = {"settings": {"cdbs_amplitude_ma": 3.1249}, "reason": "programmed"}  # 1.56245 mA/s over a period of 2 s
         assert client.put("/api/v1/participants/P1/settings", json=amplitude).status_code == 200
-        policy, clinician = studied.policies[0], client_as("clinician")
+        policy, clinician = study_world.policies[0], client_as("clinician")
         form = clinician.get(f"/participants/P1/policies/{policy}/bundle", headers=PAGE).text.split('id="release"')[1]
         proposed = {name: re.search(rf'name="{name}"[^>]*?value="([^"]+)"', form) for name in LIMITS}
         shown = {name: found[1] for name, found in proposed.items() if found}
         assert set(shown) == set(LIMITS)
         path = f"/participants/P1/policies/{policy}/release"
         assert clinician.post(path, data=shown | {"password": PASSWORD}, headers=PAGE, follow_redirects=False).status_code == 303
-        assert client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [policy], "seed": 7}).status_code == 201
-        approved = sign_plan(studied.visit)
+        assert client.post(f"/api/v1/visits/{study_world.visit}/plan", json={"policy_ids": [policy], "seed": 7}).status_code == 201
+        approved = sign_plan(study_world.visit)
         assert approved.status_code == 200, approved.text
 
     def test_a_policy_that_was_changed_since_its_release_is_in_no_approved_plan(
-        self, client_as: Clients, studied: Any, drafted: int, owner_db: Session, sign_plan: Callable[..., Any]
+        self, client_as: Clients, study_world: Any, drafted: int, owner_db: Session, sign_plan: Callable[..., Any]
     ) -> None:
         assert release(client_as("clinician"), drafted, max_ma=3.5).status_code == 201
         owner_db.execute(text("update policy set seed = 77 where id = :policy"), {"policy": drafted})
         owner_db.commit()
-        refused = sign_plan(studied.visit)
+        refused = sign_plan(study_world.visit)
         assert (refused.status_code, "was changed since it was released" in refused.text) == (409, True)

@@ -20,14 +20,21 @@ COLUMNS = "t_s,due_s,beta,unit,source,amplitude_ma,action,hold,log_density,ended
 
 
 @pytest.fixture
-def planned(client: TestClient, studied: Any, sign_plan: Callable[..., Any], db: Session) -> Plan:
+def planned(client: TestClient, study_world: Any, sign_plan: Callable[..., Any], db: Session) -> Plan:
     """A signed plan: a policy, cDBS, a random session, cDBS, the policy again."""
     client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "design": "stratified"}})
-    assert client.patch(f"/api/v1/visits/{studied.visit}", json={"date": str(DAY), "reason": "agreed"}).status_code == 200
-    body = {"policy_ids": [studied.policies[0]], "repeats": 2, "random_sessions": 1, "order": "stated", "seed": 1, "minutes_per_session": 5}
-    drafted = client.post(f"/api/v1/visits/{studied.visit}/plan", json=body)
+    assert client.patch(f"/api/v1/visits/{study_world.visit}", json={"date": str(DAY), "reason": "agreed"}).status_code == 200
+    body = {
+        "policy_ids": [study_world.policies[0]],
+        "repeats": 2,
+        "random_sessions": 1,
+        "order": "stated",
+        "seed": 1,
+        "minutes_per_session": 5,
+    }
+    drafted = client.post(f"/api/v1/visits/{study_world.visit}/plan", json=body)
     assert drafted.status_code == 201, drafted.text
-    assert sign_plan(studied.visit).status_code == 200
+    assert sign_plan(study_world.visit).status_code == 200
     return db.get_one(Plan, drafted.json()["id"])
 
 
@@ -58,14 +65,14 @@ def send(client: TestClient, log: str, code: str = "P1", **stated: str) -> dict[
     return dict(answer.json())
 
 
-def test_logs_fill_the_slots_that_they_name_whatever_else_would_explain_them(client: TestClient, studied: Any, planned: Plan) -> None:
-    path = f"/api/v1/visits/{studied.visit}/slots"
+def test_logs_fill_the_slots_that_they_name_whatever_else_would_explain_them(client: TestClient, study_world: Any, planned: Plan) -> None:
+    path = f"/api/v1/visits/{study_world.visit}/slots"
     first, last = [s.position for s in planned.items if s.policy_id]
     send(client, log_of(planned, last, 5, number=1))  # the only log of the policy: by its order it could be the first session of it
     between = next(s.position for s in planned.items if s.controller == "cdbs")
     body = send(client, log_of(planned, between, 40, number=2))
     (found,) = body["proposals"]
-    assert (found["session"]["controller"], found["session"]["visit_id"]) == ("cdbs", studied.visit)
+    assert (found["session"]["controller"], found["session"]["visit_id"]) == ("cdbs", study_world.visit)
     assert f"its log is of session {between} of the plan of visit 2" in str(found["evidence"])
     rows = {r["position"]: r for r in client.get(path).json()["rows"]}
     assert rows[first]["session_id"] is None
@@ -79,13 +86,13 @@ def test_logs_fill_the_slots_that_they_name_whatever_else_would_explain_them(cli
 
 
 @pytest.mark.parametrize("design", ["stratified", "near"])
-def test_the_draws_of_a_random_session_are_those_of_its_log(client: TestClient, studied: Any, planned: Plan, design: str) -> None:
+def test_the_draws_of_a_random_session_are_those_of_its_log(client: TestClient, study_world: Any, planned: Plan, design: str) -> None:
     position = next(i.position for i in planned.items if i.controller == "random")
     holds = [(0, 60, 0.9, -0.25), (60, 90, 0.7, 0.5)]
     timed = {"n": 200, "mean": 217.0, "std": 33.0, "median": 200.0, "p99": 300.0}
     log = log_of(planned, position, 20, holds=holds, design=design, level=0.8, seed=99, lower_bound=0.45, latency_us=timed)
     send(client, log)
-    done = client.post(f"/api/v1/visits/{studied.visit}/slots/confirm", json={})
+    done = client.post(f"/api/v1/visits/{study_world.visit}/slots/confirm", json={})
     assert done.status_code == 200, done.text
     session = next(r["session_id"] for r in done.json()["comparison"]["rows"] if r["position"] == position)
     found = client.get(f"/api/v1/sessions/{session}/conditions").json()
@@ -93,11 +100,11 @@ def test_the_draws_of_a_random_session_are_those_of_its_log(client: TestClient, 
     kept = found["design_parameters"]
     assert kept["level"] == 0.8
     assert [(h["start"], h["steps"], h["amplitude"], h["log_density"]) for h in kept["holds"]][:2] == [tuple(h) for h in holds]
-    for page in (f"/sessions/{session}", f"/visits/{studied.visit}"):
+    for page in (f"/sessions/{session}", f"/visits/{study_world.visit}"):
         assert "0.217" in client.get(page, headers={"Accept": "text/html"}).text, "ms that a decision takes, as the tablet measured"
 
 
-def test_a_log_of_another_visit_is_asked_about_and_fills_no_slot_there(client: TestClient, studied: Any, planned: Plan) -> None:
+def test_a_log_of_another_visit_is_asked_about_and_fills_no_slot_there(client: TestClient, study_world: Any, planned: Plan) -> None:
     other = client.post("/api/v1/participants/P1/visits", json={"number": 9, "date": "2026-05-04"}).json()["id"]
     policy = str(planned.items[0].policy_id)
     body = send(client, log_of(planned, 1, 0), visit="9", controller="rl", policy=policy)
@@ -109,20 +116,20 @@ def test_a_log_of_another_visit_is_asked_about_and_fills_no_slot_there(client: T
     assert (refused.status_code, "its visit is open" in refused.json()["detail"]) == (422, True)
     right = client.post(f"/api/v1/proposals/{found['session']['id']}/confirm", json={"version": found["version"], "visit": 2})
     assert right.status_code == 200, right.text
-    assert client.get(f"/api/v1/visits/{studied.visit}/slots").json()["rows"][0]["session_id"] == found["session"]["id"]
+    assert client.get(f"/api/v1/visits/{study_world.visit}/slots").json()["rows"][0]["session_id"] == found["session"]["id"]
 
 
 def test_a_log_of_a_plan_that_is_not_signed_any_more_is_said_and_stands_beside_the_plan(
-    client: TestClient, studied: Any, planned: Plan, sign_plan: Callable[..., Any]
+    client: TestClient, study_world: Any, planned: Plan, sign_plan: Callable[..., Any]
 ) -> None:
     again = client.post(
-        f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[1]], "seed": 4, "reason": "another policy"}
+        f"/api/v1/visits/{study_world.visit}/plan", json={"policy_ids": [study_world.policies[1]], "seed": 4, "reason": "another policy"}
     )
     assert again.status_code == 201, again.text
-    assert sign_plan(studied.visit, plan_id=again.json()["id"]).status_code == 200
+    assert sign_plan(study_world.visit, plan_id=again.json()["id"]).status_code == 200
     body = send(client, log_of(planned, 2, 0))
     assert f"names session 2 of plan {planned.id}, visit 2 (2026-04-06), which is no signed plan" in " ".join(body["report"][0]["flagged"])
-    rows = client.get(f"/api/v1/visits/{studied.visit}/slots").json()["rows"]
+    rows = client.get(f"/api/v1/visits/{study_world.visit}/slots").json()["rows"]
     assert [r["deviations"] for r in rows if r["session_id"]] == [["other_plan"]]
 
 
@@ -136,33 +143,33 @@ def test_a_log_of_a_plan_that_is_not_signed_any_more_is_said_and_stands_beside_t
     ],
 )
 def test_a_log_that_names_no_session_here_fills_none_by_its_name(
-    client: TestClient, studied: Any, planned: Plan, change: dict[str, Any], words: str
+    client: TestClient, study_world: Any, planned: Plan, change: dict[str, Any], words: str
 ) -> None:
     stated = {"visit": "2", "controller": "rl", "policy": str(planned.items[0].policy_id)}
     body = send(client, log_of(planned, 1, 0, **change), **stated)
     assert words in " ".join(body["report"][0]["flagged"])
     assert len(body["proposals"]) == (1 if "purpose" in change else 0), "a trial on a bench never counts at once"
-    path = f"/api/v1/visits/{studied.visit}/slots"
+    path = f"/api/v1/visits/{study_world.visit}/slots"
     found = [(r["position"], r["deviations"]) for r in client.get(path).json()["rows"] if r["session_id"]]
     assert found == [(None, ["unplanned" if "purpose" in change else "other_plan"])]
     assert client.post(f"{path}/confirm", json={}).status_code == 409, "there is nothing to confirm into a slot"
 
 
 @pytest.mark.hazard("H17")
-def test_a_slot_that_two_tablets_ran_is_filled_once_and_the_second_log_is_told(client: TestClient, studied: Any, planned: Plan) -> None:
+def test_a_slot_that_two_tablets_ran_is_filled_once_and_the_second_log_is_told(client: TestClient, study_world: Any, planned: Plan) -> None:
     for number, minute in ((1, 0), (2, 40)):
         send(client, log_of(planned, 1, minute, number=number))
-    path = f"/api/v1/visits/{studied.visit}/slots"
+    path = f"/api/v1/visits/{study_world.visit}/slots"
     found = [(r["position"], r["deviations"]) for r in client.get(path).json()["rows"] if r["session_id"]]
     assert found == [(1, []), (None, ["second_run"])]
-    page = client.get(f"/visits/{studied.visit}/slots", headers={"Accept": "text/html"}).text
+    page = client.get(f"/visits/{study_world.visit}/slots", headers={"Accept": "text/html"}).text
     assert "a second run, or a second record of the same one" in page
     assert client.post(f"{path}/confirm", json={}).status_code == 200
     found = [(r["position"], r["confirmed"], r["deviations"]) for r in client.get(path).json()["rows"] if r["session_id"]]
     assert found == [(1, True, []), (None, False, ["second_run"])], "the second one counts nowhere unless somebody confirms it"
 
 
-def test_the_log_of_a_simulated_device_is_said_to_be_one(client: TestClient, studied: Any, planned: Plan) -> None:
+def test_the_log_of_a_simulated_device_is_said_to_be_one(client: TestClient, study_world: Any, planned: Plan) -> None:
     body = send(client, log_of(planned, 1, 0, simulated=True))
     assert "is of a simulated device: nobody was stimulated" in " ".join(body["report"][0]["flagged"])
     other = send(client, log_of(planned, 2, 20, number=3))
@@ -170,10 +177,10 @@ def test_the_log_of_a_simulated_device_is_said_to_be_one(client: TestClient, stu
 
 
 def test_the_page_of_a_visit_shows_its_slots_and_takes_its_logs(
-    client: TestClient, client_as: Callable[[str], TestClient], studied: Any, planned: Plan
+    client: TestClient, client_as: Callable[[str], TestClient], study_world: Any, planned: Plan
 ) -> None:
     page = {"Accept": "text/html"}
-    path = f"/visits/{studied.visit}"
+    path = f"/visits/{study_world.visit}"
     before = client.get(path, headers=page).text
     assert f"0 of {len(planned.items)} planned sessions found; " in before, "the day is over, and all are missing"
     assert 'data-after-upload="/visits/' in before

@@ -23,11 +23,11 @@ def recording(seed: int, controlled: bool) -> str:
 
 
 @pytest.fixture
-def planned(client: TestClient, studied: Any, sign_plan: Callable[..., Any]) -> list[dict[str, Any]]:
-    assert client.patch(f"/api/v1/visits/{studied.visit}", json={"date": DAY, "reason": "agreed"}).status_code == 200
-    body = {"policy_ids": list(studied.policies[:2]), "order": "stated", "repeats": 2, "seed": 1}
-    assert client.post(f"/api/v1/visits/{studied.visit}/plan", json=body).status_code == 201
-    plan = sign_plan(studied.visit).json()
+def planned(client: TestClient, study_world: Any, sign_plan: Callable[..., Any]) -> list[dict[str, Any]]:
+    assert client.patch(f"/api/v1/visits/{study_world.visit}", json={"date": DAY, "reason": "agreed"}).status_code == 200
+    body = {"policy_ids": list(study_world.policies[:2]), "order": "stated", "repeats": 2, "seed": 1}
+    assert client.post(f"/api/v1/visits/{study_world.visit}/plan", json=body).status_code == 201
+    plan = sign_plan(study_world.visit).json()
     sessions: list[dict[str, Any]] = plan["sessions"]
     assert [s["policy_id"] for s in sessions] == [1, None, 2, None, 1, None, 2]
     return sessions
@@ -41,9 +41,9 @@ def send(client: TestClient, number: int, minute: int, *, day: str = DAY, contro
 
 
 def test_uploads_of_the_day_are_found_in_their_slots_and_confirmed_in_one_step(
-    client: TestClient, studied: Any, planned: list[dict[str, Any]], db: Session
+    client: TestClient, study_world: Any, planned: list[dict[str, Any]], db: Session
 ) -> None:
-    path = f"/api/v1/visits/{studied.visit}/slots"
+    path = f"/api/v1/visits/{study_world.visit}/slots"
     for i, slot in enumerate(planned):
         if i == 3:
             continue  # the second cDBS session was not uploaded
@@ -54,7 +54,7 @@ def test_uploads_of_the_day_are_found_in_their_slots_and_confirmed_in_one_step(
     found = client.get(path).json()
     assert (found["planned"], found["found"], found["missing"]) == (7, 6, ["cDBS 2"])
     assert [r["confirmed"] for r in found["rows"]] == [False] * 7
-    page = client.get(f"/visits/{studied.visit}/slots", headers=PAGE).text
+    page = client.get(f"/visits/{study_world.visit}/slots", headers=PAGE).text
     assert "6 of 7 planned sessions found; cDBS 2 is missing" in page
     done = client.post(f"{path}/confirm", json={})
     assert done.status_code == 200, done.text
@@ -64,16 +64,16 @@ def test_uploads_of_the_day_are_found_in_their_slots_and_confirmed_in_one_step(
     assert rows[0]["predicted"]["energy"] == pytest.approx(0.4)
     assert rows[0]["done"]["energy"] == pytest.approx((0.36 + 1) / 2)
     db.expire_all()
-    held = db.scalars(select(StudySession).where(StudySession.visit_id == studied.visit)).all()
+    held = db.scalars(select(StudySession).where(StudySession.visit_id == study_world.visit)).all()
     assert {s.status for s in held} == {"confirmed"}
     assert len({s.plan_item_id for s in held} - {None}) == 6
     again = client.post(f"{path}/confirm", json={})
     assert (again.status_code, "has nothing to confirm" in again.json()["detail"]) == (409, True)
 
 
-def test_sessions_of_another_year_are_asked_about(client: TestClient, studied: Any, planned: list[dict[str, Any]]) -> None:
+def test_sessions_of_another_year_are_asked_about(client: TestClient, study_world: Any, planned: list[dict[str, Any]]) -> None:
     send(client, 1, 0, day="2024-04-06", controller="rl", policy="rl-01")
-    path = f"/visits/{studied.visit}/slots"
+    path = f"/visits/{study_world.visit}/slots"
     asked = client.post(f"/api/v1{path}/confirm", json={})
     assert (asked.status_code, asked.json()["asks"]) == (409, "other_day")
     assert "2024-04-06" in asked.json()["detail"]
@@ -84,12 +84,12 @@ def test_sessions_of_another_year_are_asked_about(client: TestClient, studied: A
 
 
 def test_a_visit_without_recordings_or_a_signature_has_nothing_to_confirm(
-    client: TestClient, studied: Any, sign_plan: Callable[..., Any]
+    client: TestClient, study_world: Any, sign_plan: Callable[..., Any]
 ) -> None:
-    path = f"/api/v1/visits/{studied.visit}/slots"
-    client.post(f"/api/v1/visits/{studied.visit}/plan", json={"policy_ids": [studied.policies[0]]})
+    path = f"/api/v1/visits/{study_world.visit}/slots"
+    client.post(f"/api/v1/visits/{study_world.visit}/plan", json={"policy_ids": [study_world.policies[0]]})
     unsigned = client.get(path)
     assert (unsigned.status_code, "is not signed" in unsigned.json()["detail"]) == (409, True)
-    assert sign_plan(studied.visit).status_code == 200
+    assert sign_plan(study_world.visit).status_code == 200
     assert client.get(path).json()["found"] == 0
     assert client.post(f"{path}/confirm", json={}).status_code == 409

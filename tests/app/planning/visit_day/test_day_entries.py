@@ -263,8 +263,8 @@ def test_a_locked_visit_still_takes_adverse_events(clinic_day: Any) -> None:
     assert clinic_day.outcomes(clinic_day.entry("adverse_event", fall)) == ["stored"]
 
 
-def test_a_sealed_plan_shows_its_letters_and_common_limits_to_everybody(client: TestClient, enrolled: str, sign_plan: Any) -> None:
-    visit = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 2, "date": "2099-11-22"}).json()["id"]
+def test_a_sealed_plan_shows_its_letters_and_common_limits_to_everybody(client: TestClient, participant_code: str, sign_plan: Any) -> None:
+    visit = client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 2, "date": "2099-11-22"}).json()["id"]
     draft = {"policy_ids": [], "random_sessions": 2, "seed": 1, "blinded": True}
     assert client.post(f"/api/v1/visits/{visit}/plan", json=draft).status_code == 201
     assert sign_plan(visit).status_code == 200

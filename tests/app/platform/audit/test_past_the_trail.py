@@ -36,9 +36,9 @@ def past_the_triggers(owner_db: Session, table: str, statement: str) -> None:
 
 
 @pytest.fixture
-def visit(client: TestClient, enrolled: str) -> int:
+def visit(client: TestClient, participant_code: str) -> int:
     body = {"number": 7, "note": "seen", "cdbs_amplitudes": [{"hemisphere": "left", "amplitude_ma": 2.5}]}
-    made = int(client.post(f"/api/v1/participants/{enrolled}/visits", json=body).json()["id"])
+    made = int(client.post(f"/api/v1/participants/{participant_code}/visits", json=body).json()["id"])
     assert found() == set()
     return made
 
@@ -152,26 +152,28 @@ def test_a_default_that_would_write_other_times_or_words_is_named(
     owner_db.commit()
 
 
-def written_at_a_false_time(client: TestClient, enrolled: str, owner_db: Session, clock: str) -> None:
+def written_at_a_false_time(client: TestClient, participant_code: str, owner_db: Session, clock: str) -> None:
     """One visit is written while the trail's clock says `clock`, the next when it is right again."""
     for number, default in ((7, clock), (8, "clock_timestamp()")):
         owner_db.execute(text(f"alter table audit_event alter column at set default {default}"))
         owner_db.commit()
-        assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": number}).status_code == 201
+        assert client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": number}).status_code == 201
 
 
 def test_what_was_written_at_a_false_time_stays_named_once_the_clock_is_right_again(
-    client: TestClient, enrolled: str, owner_db: Session
+    client: TestClient, participant_code: str, owner_db: Session
 ) -> None:
     last = owner_db.scalar(text("select max(id) from audit_event"))
-    written_at_a_false_time(client, enrolled, owner_db, "'2020-01-01'")
+    written_at_a_false_time(client, participant_code, owner_db, "'2020-01-01'")
     with new_session() as db:
         (named,) = verify(db).breaks
     assert (named.kind.value, (named.event_id or 0) > (last or 0)) == ("backdated", True)
 
 
-def test_a_clock_that_was_fast_is_accepted_with_a_reason_and_stays_listed(client: TestClient, enrolled: str, owner_db: Session) -> None:
-    written_at_a_false_time(client, enrolled, owner_db, "clock_timestamp() + interval '8 days'")
+def test_a_clock_that_was_fast_is_accepted_with_a_reason_and_stays_listed(
+    client: TestClient, participant_code: str, owner_db: Session
+) -> None:
+    written_at_a_false_time(client, participant_code, owner_db, "clock_timestamp() + interval '8 days'")
     with new_session() as db:
         (named,) = verify(db).breaks
     why, row = "the clock was 8 days ahead until it was set by NTP", str(named.event_id)
@@ -196,12 +198,12 @@ def test_a_clock_that_was_fast_is_accepted_with_a_reason_and_stays_listed(client
 
 
 def test_what_a_function_that_writes_nothing_let_through_stays_named_when_it_is_put_back(
-    client: TestClient, enrolled: str, owner_db: Session
+    client: TestClient, participant_code: str, owner_db: Session
 ) -> None:
     ours = owner_db.scalar(text("select pg_get_functiondef('audit_row()'::regprocedure)"))
     owner_db.execute(text(NOTHING))
     owner_db.commit()
-    number = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 7}).json()["id"]
+    number = client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 7}).json()["id"]
     owner_db.connection().exec_driver_sql(str(ours))
     owner_db.commit()
     assert found() == {("row_added", "visit", str(number), (), None)}
@@ -216,7 +218,7 @@ def test_what_a_function_that_writes_nothing_let_through_stays_named_when_it_is_
     ],
 )
 def test_a_signature_that_was_rewritten_is_named(
-    client: TestClient, enrolled: str, owner_db: Session, statement: str, kinds: set[str]
+    client: TestClient, participant_code: str, owner_db: Session, statement: str, kinds: set[str]
 ) -> None:
     assert client.post(LOCK, json={"version": 1, "reason": "protocol", "password": PASSWORD}).status_code == 201
     content = owner_db.scalar(text("select content from signature"))

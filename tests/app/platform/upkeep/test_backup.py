@@ -46,12 +46,12 @@ def place() -> Iterator[Path]:
 
 
 @pytest.fixture
-def filled(client: TestClient, enrolled: str) -> dict[str, int]:
+def filled(client: TestClient, participant_code: str) -> dict[str, int]:
     """A study with a participant, a visit, an uploaded session; rows of its tables."""
     sent = client.post(
         "/api/v1/uploads",
         files={"file": ("session.csv", TABLE_BYTES)},
-        data={"participant": enrolled, "visit": "1", "controller": "random", "started_at": "2026-03-02T10:00:00Z"},
+        data={"participant": participant_code, "visit": "1", "controller": "random", "started_at": "2026-03-02T10:00:00Z"},
     )
     assert sent.status_code == 201, sent.text
     with transaction("test") as db:

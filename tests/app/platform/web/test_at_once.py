@@ -40,7 +40,7 @@ def together(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_what_is_sent_twice_at_once_is_made_once(
-    client: TestClient, enrolled: str, together: None, path: str, body: dict[str, Any]
+    client: TestClient, participant_code: str, together: None, path: str, body: dict[str, Any]
 ) -> None:
     with capture_logs() as logs, ThreadPoolExecutor(AT_ONCE) as pool:
         answers = list(pool.map(lambda _: client.post(f"/api/v1{path}", json=body), range(AT_ONCE)))
@@ -53,7 +53,7 @@ def test_what_is_sent_twice_at_once_is_made_once(
     assert "ADAPT" not in str(logs), "values stay out of logs"
 
 
-def test_a_page_answers_as_the_interface_does(client: TestClient, enrolled: str, together: None) -> None:
+def test_a_page_answers_as_the_interface_does(client: TestClient, participant_code: str, together: None) -> None:
     typed = {"number": "7", "date": "2026-04-02", "note": "tired today"}
     with ThreadPoolExecutor(AT_ONCE) as pool:
         answers = list(pool.map(lambda _: client.post("/participants/P1/visits", data=typed, headers=PAGE), range(AT_ONCE)))

@@ -26,12 +26,12 @@ def searches() -> Iterator[list[int]]:
     gc.callbacks.remove(note)
 
 
-def test_requests_search_the_youngest_objects_alone(client: TestClient, enrolled: str, searches: list[int]) -> None:
-    client.get(f"/participants/{enrolled}")  # loads what the first page loads
+def test_requests_search_the_youngest_objects_alone(client: TestClient, participant_code: str, searches: list[int]) -> None:
+    client.get(f"/participants/{participant_code}")  # loads what the first page loads
     gc.collect()  # whatever earlier tests left to be searched
     searches.clear()
     for _ in range(REQUESTS):
-        assert client.get(f"/participants/{enrolled}", headers={"Accept": "text/html"}).status_code == 200
+        assert client.get(f"/participants/{participant_code}", headers={"Accept": "text/html"}).status_code == 200
     assert 0 in searches, "garbage in circles does go"
     assert len(searches) < REQUESTS
     assert 2 not in searches, "what the service keeps is not looked through"

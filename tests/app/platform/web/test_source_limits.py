@@ -82,7 +82,7 @@ def test_a_locked_account_says_when_to_come_back(client: TestClient) -> None:
 
 
 def test_files_beyond_what_a_source_may_send_are_refused_in_words(
-    client: TestClient, enrolled: str, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, participant_code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     large = TABLE + b"".join(b"%d,1.0%06d,1\n" % (2 * k, k) for k in range(21, 6000))
     stated = {"participant": "P1", "visit": "1", "controller": "random"}

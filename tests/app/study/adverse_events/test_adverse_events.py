@@ -71,7 +71,7 @@ def test_what_ran_before_any_recording_is_uploaded_can_be_named(client: TestClie
     assert {i: verdict for i, (verdict, _) in verdicts(client).items()} == {a: "test", b: "unsafe"}
 
 
-def test_an_entry_that_is_sent_twice_is_one_event(client: TestClient, enrolled: str) -> None:
+def test_an_entry_that_is_sent_twice_is_one_event(client: TestClient, participant_code: str) -> None:
     first = add(client, entry_key="tablet-7-1")
     assert add(client, entry_key="tablet-7-1")["id"] == first["id"]
     other = client.post(PATH, json=FALL | {"entry_key": "tablet-7-1", "note": "another fall"})
@@ -79,7 +79,7 @@ def test_an_entry_that_is_sent_twice_is_one_event(client: TestClient, enrolled: 
     assert len(client.get(PATH).json()) == 1
 
 
-def test_corrections_are_revisions_and_nothing_is_taken_back(client: TestClient, enrolled: str, db: Session) -> None:
+def test_corrections_are_revisions_and_nothing_is_taken_back(client: TestClient, participant_code: str, db: Session) -> None:
     event = add(client)
     change = {"severity": "none", "revision": 1, "reason": "of another participant"}
     path = f"/api/v1/adverse-events/{event['id']}"
@@ -103,7 +103,7 @@ def test_corrections_are_revisions_and_nothing_is_taken_back(client: TestClient,
         ({"policy_id": 999}, "no policy 999"),
     ],
 )
-def test_what_cannot_be_is_refused_in_words(client: TestClient, enrolled: str, changed: dict[str, Any], words: str) -> None:
+def test_what_cannot_be_is_refused_in_words(client: TestClient, participant_code: str, changed: dict[str, Any], words: str) -> None:
     answer = client.post(PATH, json=FALL | changed)
     assert answer.status_code in (404, 422)
     assert words in answer.text

@@ -72,8 +72,8 @@ def test_versions_follow_each_other_and_two_writers_are_told(db: Session, study_
         state(db, participant, 0, hand=RIGHT)
 
 
-def test_the_interface_and_the_page_state_them(client: TestClient, enrolled: str) -> None:
-    api = f"/api/v1/participants/{enrolled}/characteristics"
+def test_the_interface_and_the_page_state_them(client: TestClient, participant_code: str) -> None:
+    api = f"/api/v1/participants/{participant_code}/characteristics"
     content = {
         "leads": [{"hemisphere": "left", "target": "stn", "model": "3389", "sensing": "0-2", "stimulating": "C+1-"}],
         "symptoms": ["tremor"],
@@ -88,26 +88,26 @@ def test_the_interface_and_the_page_state_them(client: TestClient, enrolled: str
     assert [d["at"] for d in first.json()["medication"]] == ["07:00", "12:00"]
     refused = client.put(api, json={"version": 1, "characteristics": content | {"leads": [content["leads"][0] | {"model": "Dr. O'Hara"}]}})  # type: ignore[index, operator]
     assert refused.status_code == 422
-    page = client.get(f"/participants/{enrolled}/characteristics").text
+    page = client.get(f"/participants/{participant_code}/characteristics").text
     form = dict(re.findall(r'<input id="f-(\w+)" name="\w+" type="\w+" value="([^"]*)"', page))
     form |= dict(re.findall(r'<select id="f-(\w+)".*?<option value="([^"]*)" selected', page))
     assert (form["lead1_sensing"], form["hand"], form["dose1_at"], form["dose2_mg"]) == ("0-2", "right", "07:00", "200")
     sent = form | {"version": "1", "symptom_rigidity": "yes", "reason": "looked again"}
-    done = client.post(f"/participants/{enrolled}/characteristics", data=sent, follow_redirects=False)
+    done = client.post(f"/participants/{participant_code}/characteristics", data=sent, follow_redirects=False)
     assert done.headers["location"].endswith("done=changed")
     versions = client.get(api).json()
     assert [v["symptoms"] for v in versions] == [["tremor"], ["rigidity"]]
     assert versions[1]["leads"] == versions[0]["leads"]
     assert versions[1]["medication"] == versions[0]["medication"]
-    shown = unescape(client.get(f"/participants/{enrolled}").text)
+    shown = unescape(client.get(f"/participants/{participant_code}").text)
     assert "left STN, 3389, sensing 0-2, stimulating C+1-" in shown
-    stale = client.post(f"/participants/{enrolled}/characteristics", data=sent | {"hand": "left"}, follow_redirects=False)
+    stale = client.post(f"/participants/{participant_code}/characteristics", data=sent | {"hand": "left"}, follow_redirects=False)
     assert stale.status_code == 409
-    wrong = client.post(f"/participants/{enrolled}/characteristics", data=sent | {"version": "2", "dose1_mg": "much"})
+    wrong = client.post(f"/participants/{participant_code}/characteristics", data=sent | {"version": "2", "dose1_mg": "much"})
     assert wrong.status_code == 422
     assert "Dose 1, dose" in wrong.text
-    wrong = client.post(f"/participants/{enrolled}/characteristics", data=sent | {"version": "2", "lead4_model": "3389"})
+    wrong = client.post(f"/participants/{participant_code}/characteristics", data=sent | {"version": "2", "lead4_model": "3389"})
     assert (wrong.status_code, "Lead 4, side" in wrong.text) == (422, True)
     assert "More leads" not in wrong.text, "what was typed stays in sight"
-    wrong = client.post(f"/participants/{enrolled}/characteristics", data=sent | {"version": "2", "hand": "both"})
+    wrong = client.post(f"/participants/{participant_code}/characteristics", data=sent | {"version": "2", "hand": "both"})
     assert (wrong.status_code, len(client.get(api).json())) == (422, 2), "no hand is dropped silently"

@@ -33,10 +33,10 @@ def send_file(client: TestClient, rng: Any) -> int:
 
 
 def test_a_study_that_has_ended_is_read_and_nothing_in_it_changes(
-    client: TestClient, enrolled: str, client_as: Clients, db: Session, rng: Any
+    client: TestClient, participant_code: str, client_as: Clients, db: Session, rng: Any
 ) -> None:
     clinician = client_as("clinician")
-    visit = client.get(f"/api/v1/participants/{enrolled}/visits").json()["items"][0]["id"]
+    visit = client.get(f"/api/v1/participants/{participant_code}/visits").json()["items"][0]["id"]
     ended = client.post(f"{STUDY}/end", json=WHY)
     assert (ended.status_code, ended.json()["ended_at"] is not None) == (200, True), ended.text
     assert client.post(f"{STUDY}/end", json=WHY).status_code == 409
@@ -63,8 +63,8 @@ def test_a_study_that_has_ended_is_read_and_nothing_in_it_changes(
     assert "opened again the study main" in trail
 
 
-def test_today_leaves_an_ended_study_out_until_it_is_asked_for(client: TestClient, enrolled: str) -> None:
-    link = f'href="/participants/{enrolled}"'
+def test_today_leaves_an_ended_study_out_until_it_is_asked_for(client: TestClient, participant_code: str) -> None:
+    link = f'href="/participants/{participant_code}"'
     assert link in client.get("/").text
     assert client.post(f"{STUDY}/end", json=WHY).status_code == 200
     # also where nobody is left to show, the page says where they are
@@ -73,12 +73,12 @@ def test_today_leaves_an_ended_study_out_until_it_is_asked_for(client: TestClien
     assert "There is no participant that you may see" in alone
     assert '<a href="/?withdrawn=yes">Show also who has withdrawn' in alone
     assert link in client.get("/?withdrawn=yes").text
-    assert "the study has ended" in client.get(f"/participants/{enrolled}").text
+    assert "the study has ended" in client.get(f"/participants/{participant_code}").text
 
 
-def test_jobs_of_an_ended_study_are_cancelled(client: TestClient, enrolled: str, rng: Any, db: Session) -> None:
+def test_jobs_of_an_ended_study_are_cancelled(client: TestClient, participant_code: str, rng: Any, db: Session) -> None:
     assert send_file(client, rng) == 201
-    started = client.post(f"/api/v1/participants/{enrolled}/jobs", json={"kind": "pipeline", "preset": "quick"})
+    started = client.post(f"/api/v1/participants/{participant_code}/jobs", json={"kind": "pipeline", "preset": "quick"})
     assert started.status_code in (201, 202), started.text
     assert client.post(f"{STUDY}/end", json=WHY).status_code == 200
     assert db.get_one(Job, started.json()["id"]).status == JobStatus.CANCELLED
@@ -89,10 +89,10 @@ def test_jobs_of_an_ended_study_are_cancelled(client: TestClient, enrolled: str,
     [("post", f"{STUDY}/end", WHY), ("patch", "/api/v1/participants/P1", {"status": "withdrawn", "reason": "moved away"})],
 )
 def test_a_job_of_a_request_that_was_judged_before_the_end_is_refused(
-    client: TestClient, enrolled: str, rng: Any, db: Session, method: str, path: str, body: dict[str, str]
+    client: TestClient, participant_code: str, rng: Any, db: Session, method: str, path: str, body: dict[str, str]
 ) -> None:
     assert send_file(client, rng) == 201
-    judged = study.participant_by_code(db, enrolled, SYSTEM)
+    judged = study.participant_by_code(db, participant_code, SYSTEM)
     assert judged.site.study.ended_at is None
     assert client.request(method, path, json=body).status_code == 200
     with pytest.raises(Conflict, match=r"has (ended|withdrawn)"):
@@ -102,10 +102,10 @@ def test_a_job_of_a_request_that_was_judged_before_the_end_is_refused(
 
 
 def test_who_ends_a_study_waits_for_a_job_that_is_asked_for_and_cancels_it(
-    client: TestClient, enrolled: str, rng: Any, db: Session
+    client: TestClient, participant_code: str, rng: Any, db: Session
 ) -> None:
     assert send_file(client, rng) == 201
-    job = start_job(db, study.participant_by_code(db, enrolled, SYSTEM), "pipeline", {"preset": "quick"}, SYSTEM).job
+    job = start_job(db, study.participant_by_code(db, participant_code, SYSTEM), "pipeline", {"preset": "quick"}, SYSTEM).job
     with ThreadPoolExecutor(1) as other:
         ending = other.submit(client.post, f"{STUDY}/end", json=WHY)
         with pytest.raises(TimeoutError):
@@ -117,7 +117,7 @@ def test_who_ends_a_study_waits_for_a_job_that_is_asked_for_and_cancels_it(
 
 
 def test_an_ended_site_takes_neither_enrolments_nor_uploads_and_all_else_goes_on(
-    client: TestClient, enrolled: str, db: Session, rng: Any
+    client: TestClient, participant_code: str, db: Session, rng: Any
 ) -> None:
     assert client.post(f"{STUDY}/sites", json={"code": "south", "name": "South"}).status_code == 201
     assert client.post(f"{SITE}/end", json=WHY).json()["ended_at"] is not None
@@ -163,7 +163,7 @@ def test_the_page_renames_ends_and_opens_again_with_a_reason(client: TestClient,
     assert sorted(reasons) == sorted(["protocol 2", "moved", *["last visit held"] * 4])
 
 
-def test_the_command_line_renames_ends_and_opens_again(client: TestClient, enrolled: str) -> None:
+def test_the_command_line_renames_ends_and_opens_again(client: TestClient, participant_code: str) -> None:
     def run(*words: str) -> Any:
         return CliRunner().invoke(cli.app, ["study", *words])
 
@@ -173,7 +173,7 @@ def test_the_command_line_renames_ends_and_opens_again(client: TestClient, enrol
     assert run("reopen", "main", "--site", "main", "--reason", "late visit").exit_code == 0
     assert run("end", "main", "--reason", " ").exit_code == 2, "without a reason"
     assert run("end", "main", "--reason", "done").output == "Study main has ended.\n"
-    status = CliRunner().invoke(cli.app, ["participant", "status", enrolled, "completed", "--reason", "x"])
+    status = CliRunner().invoke(cli.app, ["participant", "status", participant_code, "completed", "--reason", "x"])
     assert isinstance(status.exception, Conflict), "the command line is held to it too"
     (study,) = client.get("/api/v1/studies").json()
     assert (study["name"], study["sites"][0]["name"], study["ended_at"] is None) == ("Main study", "Clinic", False)

@@ -18,12 +18,12 @@ HOME = "/api/v1/participants/P1/data-queries"
 
 
 @pytest.fixture
-def session_id(client: TestClient, enrolled: str) -> int:
+def session_id(client: TestClient, participant_code: str) -> int:
     """A session of P1 whose rating was typed wrong."""
     rows = "t_s,beta,amplitude_fraction\n" + "".join(f"{2 * k},1,1\n" for k in range(-9, 12))
     sent = client.post(
         "/api/v1/uploads",
-        data={"participant": enrolled, "visit": "1", "controller": "random"},
+        data={"participant": participant_code, "visit": "1", "controller": "random"},
         files={"file": ("s.csv", rows)},
     )
     assert sent.status_code == 201, sent.text
@@ -147,7 +147,7 @@ def test_the_value_of_a_dose_stays_readable_when_the_dose_is_taken_back(client: 
 
 
 @pytest.mark.parametrize("number", ["99999999999999999999", "-1", "x", "\u0663", ""])
-def test_a_form_about_no_number_is_the_common_one(client: TestClient, enrolled: str, number: str) -> None:
+def test_a_form_about_no_number_is_the_common_one(client: TestClient, participant_code: str, number: str) -> None:
     page = client.get("/participants/P1/data-queries", params={"visit": number}, headers={"Accept": "text/html"})
     assert (page.status_code, 'name="session_id"' in page.text) == (200, True)
     sent = {"visit_id": number, "field": "date", "text": "?"}

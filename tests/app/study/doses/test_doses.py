@@ -85,8 +85,8 @@ def test_levodopa_equivalents_are_those_of_tomlinson_2010() -> None:
         assert form in DRUGS[drug].name, "other forms have other factors, or no time since a dose"
 
 
-def test_doses_are_entered_refused_and_taken_back(client: TestClient, enrolled: str) -> None:
-    visit = client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 5, "date": "2026-03-02"}).json()["id"]
+def test_doses_are_entered_refused_and_taken_back(client: TestClient, participant_code: str) -> None:
+    visit = client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 5, "date": "2026-03-02"}).json()["id"]
     api = f"/api/v1/visits/{visit}/doses"
     dose = {"drug": "levodopa", "mg": 100, "taken_at": "2026-03-02T07:00:00+02:00"}
     made = client.post(api, json=dose).json()
@@ -99,7 +99,7 @@ def test_doses_are_entered_refused_and_taken_back(client: TestClient, enrolled: 
     client.post(f"/api/v1/visits/{visit}/lock", json={"reason": "complete", "password": PASSWORD})
     assert client.post(f"/api/v1/doses/{made['id']}/removal", json={"reason": "not taken"}).status_code == 409
     client.post(f"/api/v1/visits/{visit}/unlock", json={"reason": "misread"})
-    client.patch(f"/api/v1/participants/{enrolled}", json={"status": "withdrawn", "reason": "asked"})
+    client.patch(f"/api/v1/participants/{participant_code}", json={"status": "withdrawn", "reason": "asked"})
     assert client.post(api, json=dose | {"mg": 50, "taken_at": "2026-03-02T08:00:00Z"}).status_code == 409
     assert "Write down a dose" not in client.get(f"/visits/{visit}").text
     assert client.post(f"/api/v1/doses/{made['id']}/removal", json={"reason": "not taken"}).status_code == 204
@@ -122,28 +122,28 @@ def test_analyses_that_were_looked_at_follow_a_dose_that_is_entered_and_one_that
     assert timed() == []
 
 
-def test_the_visit_page_the_snapshot_and_the_package_carry_them(client: TestClient, enrolled: str, upload: Upload) -> None:
+def test_the_visit_page_the_snapshot_and_the_package_carry_them(client: TestClient, participant_code: str, upload: Upload) -> None:
     settings = {"xi_beta": 1.0, "beta_unit": "uV", "beta_source": "table"}
-    client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": settings})
+    client.put(f"/api/v1/participants/{participant_code}/settings", json={"settings": settings})
     session = upload("random", steps=40, started_at="2026-03-02T09:00:00Z")
     visit = client.get(f"/api/v1/sessions/{session}").json()["visit_id"]
-    bare = client.post(f"/api/v1/participants/{enrolled}/snapshots").json()
+    bare = client.post(f"/api/v1/participants/{participant_code}/snapshots").json()
     form = {"drug": "levodopa", "mg": "100", "taken_at": "2026-03-02T07:30"}
     assert client.post(f"/visits/{visit}/doses", data=form, follow_redirects=False).status_code == 303
     assert client.post(f"/visits/{visit}/doses", data=form | {"mg": "a lot"}).status_code == 422
     assert "Levodopa (carbidopa, benserazide)" in client.get(f"/visits/{visit}").text
     assert client.get(f"/api/v1/sessions/{session}").json()["hours_since_dose"] == pytest.approx(1.5)
     stated = {"version": 0, "characteristics": {"hand": "left"}, "reason": "asked"}
-    assert client.put(f"/api/v1/participants/{enrolled}/characteristics", json=stated).status_code == 200
-    snapshot = client.post(f"/api/v1/participants/{enrolled}/snapshots").json()
+    assert client.put(f"/api/v1/participants/{participant_code}/characteristics", json=stated).status_code == 200
+    snapshot = client.post(f"/api/v1/participants/{participant_code}/snapshots").json()
     assert snapshot["id"] != bare["id"]
     assert (bare["characteristics_version"], snapshot["characteristics_version"]) == (None, 1)
     assert [m["hours_since_dose"] for m in snapshot["members"]] == [pytest.approx(1.5)]
     with new_session() as db:
         stored = db.scalars(select(BufferSnapshot).order_by(BufferSnapshot.id)).all()
         assert [from_parquet(files.read(s.file_sha256)).sessions[0].medication_h for s in stored] == [None, pytest.approx(1.5)]
-    package = zipfile.ZipFile(io.BytesIO(client.get(f"/participants/{enrolled}/export.zip").content))
-    rows = {n: list(csv.DictReader(io.StringIO(package.read(f"{enrolled}/{n}.csv").decode()))) for n in ("sessions", "doses")}
+    package = zipfile.ZipFile(io.BytesIO(client.get(f"/participants/{participant_code}/export.zip").content))
+    rows = {n: list(csv.DictReader(io.StringIO(package.read(f"{participant_code}/{n}.csv").decode()))) for n in ("sessions", "doses")}
     assert float(rows["sessions"][0]["hours_since_dose"]) == pytest.approx(1.5)
     assert [(d["drug"], d["levodopa_equivalent_mg"]) for d in rows["doses"]] == [("levodopa", "100.0")]
-    assert b'"hand": "left"' in package.read(f"{enrolled}/characteristics.json")
+    assert b'"hand": "left"' in package.read(f"{participant_code}/characteristics.json")

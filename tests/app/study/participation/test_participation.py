@@ -57,7 +57,7 @@ def test_its_jobs_are_cancelled(client: TestClient, upload: Upload) -> None:
     assert client.get(f"/api/v1/jobs/{job.json()['id']}").json()["status"] == "cancelled"
 
 
-def test_the_page_asks_for_a_reason(client: TestClient, enrolled: str) -> None:
+def test_the_page_asks_for_a_reason(client: TestClient, participant_code: str) -> None:
     assert "Taking part" in client.get("/participants/P1/settings").text
     bare = client.post("/participants/P1/status", data={"status": "withdrawn", "status_reason": ""})
     assert bare.status_code == 422
@@ -66,7 +66,7 @@ def test_the_page_asks_for_a_reason(client: TestClient, enrolled: str) -> None:
     assert client.get("/api/v1/participants/P1").json()["status"] == "completed"
 
 
-def test_who_only_reads_changes_nothing(client: TestClient, enrolled: str, client_as: Callable[[str], TestClient]) -> None:
+def test_who_only_reads_changes_nothing(client: TestClient, participant_code: str, client_as: Callable[[str], TestClient]) -> None:
     assert withdraw(client_as("viewer")).status_code == 403
 
 

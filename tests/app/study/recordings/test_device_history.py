@@ -64,10 +64,10 @@ def report() -> bytes:
 
 
 @pytest.fixture
-def uploaded(client: TestClient, enrolled: str) -> str:
-    answer = client.post("/api/v1/uploads", data={"participant": enrolled}, files={"file": ("report.json", report())})
+def uploaded(client: TestClient, participant_code: str) -> str:
+    answer = client.post("/api/v1/uploads", data={"participant": participant_code}, files={"file": ("report.json", report())})
     assert answer.status_code == 201, answer.text
-    return enrolled
+    return participant_code
 
 
 def test_the_history_of_a_device_has_a_route_and_a_page_with_pictures(client: TestClient, uploaded: str) -> None:
@@ -100,7 +100,7 @@ def test_missing_averages_are_a_gap_and_the_table_has_a_row_per_day(client: Test
     assert "null" in table, "ten missing averages break the line"
 
 
-def test_sixty_days_of_both_sides_are_drawn_by_their_extremes_and_the_page_stays_small(client: TestClient, enrolled: str) -> None:
+def test_sixty_days_of_both_sides_are_drawn_by_their_extremes_and_the_page_stays_small(client: TestClient, participant_code: str) -> None:
     """What a device keeps at most. A spike of ten minutes stays, and so does the gap."""
     rng = np.random.default_rng(3)
     content = json.loads(report())
@@ -111,9 +111,11 @@ def test_sixty_days_of_both_sides_are_drawn_by_their_extremes_and_the_page_stays
         averages = [{"DateTime": at(10 * k), "LFP": p, "AmplitudeInMilliAmps": 2.0 + 0.1 * (k > 6000)} for k, p in enumerate(power)]
         logs[f"HemisphereLocationDef.{side}"] = {at(86400): averages[:7000] + averages[7010:]}
     content["DiagnosticData"]["LFPTrendLogs"] = logs
-    sent = client.post("/api/v1/uploads", data={"participant": enrolled}, files={"file": ("r.json", json.dumps(content).encode())})
+    sent = client.post("/api/v1/uploads", data={"participant": participant_code}, files={"file": ("r.json", json.dumps(content).encode())})
     assert sent.status_code == 201, sent.text
-    page = client.get(f"/participants/{enrolled}/device-history", headers={"Accept": "text/html", "Accept-Encoding": "identity"}).text
+    page = client.get(
+        f"/participants/{participant_code}/device-history", headers={"Accept": "text/html", "Accept-Encoding": "identity"}
+    ).text
     assert len(zlib.compress(page.encode())) < 40_000
     chart = page.split('id="trend-power-')[1].split("</figure>")[0]
     assert "lowest and highest of every 2 h" in chart
@@ -127,9 +129,9 @@ def test_sixty_days_of_both_sides_are_drawn_by_their_extremes_and_the_page_stays
     assert set(json.loads(levels)["data"][0]["y"]) == {2.0, 2.1, None}, "no amplitude that was never set"
 
 
-def test_a_participant_without_a_report_is_told_what_is_needed(client: TestClient, enrolled: str) -> None:
-    assert client.get(f"/api/v1/participants/{enrolled}/device-history").json() == []
-    page = client.get(f"/participants/{enrolled}/device-history", headers={"Accept": "text/html"}).text
+def test_a_participant_without_a_report_is_told_what_is_needed(client: TestClient, participant_code: str) -> None:
+    assert client.get(f"/api/v1/participants/{participant_code}/device-history").json() == []
+    page = client.get(f"/participants/{participant_code}/device-history", headers={"Accept": "text/html"}).text
     assert "Needed: a Percept session report with a history" in page
 
 

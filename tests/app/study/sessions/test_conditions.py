@@ -20,11 +20,11 @@ ROWS = [(2 * k, 1.0, 0.4 if k == 0 else 0.7) for k in range(-9, 21)]
 
 
 @pytest.fixture
-def confirmed(client: TestClient, enrolled: str) -> Callable[..., dict[str, Any]]:
+def confirmed(client: TestClient, participant_code: str) -> Callable[..., dict[str, Any]]:
     """Upload a file of P1 as a session that counts; its conditions with the session's number."""
 
     def send(content: bytes, **fields: Any) -> dict[str, Any]:
-        data = {"participant": enrolled, "visit": "1", "controller": "random"} | fields
+        data = {"participant": participant_code, "visit": "1", "controller": "random"} | fields
         answer = client.post("/api/v1/uploads", data=data, files={"file": ("a.csv", content)})
         assert answer.status_code == 201, answer.text
         session = answer.json()["sessions"][0]["id"]
@@ -87,8 +87,8 @@ def test_a_person_corrects_conditions_with_a_reason_and_every_revision_stays(
         db.execute(text("update session_conditions set lower_bound = 0.9"))
 
 
-def test_a_proposal_has_no_conditions_until_it_is_confirmed(client: TestClient, enrolled: str) -> None:
-    answer = client.post("/api/v1/uploads", data={"participant": enrolled, "visit": "1"}, files={"file": ("a.csv", table(ROWS))})
+def test_a_proposal_has_no_conditions_until_it_is_confirmed(client: TestClient, participant_code: str) -> None:
+    answer = client.post("/api/v1/uploads", data={"participant": participant_code, "visit": "1"}, files={"file": ("a.csv", table(ROWS))})
     (session,) = answer.json()["sessions"]
     assert client.get(f"/api/v1/sessions/{session['id']}/conditions").json() is None
     early = client.put(f"/api/v1/sessions/{session['id']}/conditions", json={"lower_bound": 0.2, "reason": "x"})

@@ -21,8 +21,8 @@ def long_session(steps: int) -> bytes:
     return sink.getvalue().encode()
 
 
-def test_the_page_of_eighty_minutes_travels_in_sixty_kilobytes(client: TestClient, enrolled: str) -> None:
-    body = {"participant": enrolled, "visit": "1", "controller": "random"}
+def test_the_page_of_eighty_minutes_travels_in_sixty_kilobytes(client: TestClient, participant_code: str) -> None:
+    body = {"participant": participant_code, "visit": "1", "controller": "random"}
     sent = client.post("/api/v1/uploads", data=body, files={"file": ("s.csv", long_session(80 * 30))})
     assert sent.status_code == 201, sent.text
     address = f"/sessions/{sent.json()['sessions'][0]['id']}"

@@ -8,9 +8,9 @@ from fastapi.testclient import TestClient
 from tests.app.ingest.conftest import device_zip
 
 
-def test_every_channel_power_and_amplitude_of_a_session_is_given_on_its_own_rows(client: TestClient, enrolled: str) -> None:
-    client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"cdbs_amplitude_ma": 4.0}})
-    data = {"participant": enrolled, "visit": "1", "controller": "random"}
+def test_every_channel_power_and_amplitude_of_a_session_is_given_on_its_own_rows(client: TestClient, participant_code: str) -> None:
+    client.put(f"/api/v1/participants/{participant_code}/settings", json={"settings": {"cdbs_amplitude_ma": 4.0}})
+    data = {"participant": participant_code, "visit": "1", "controller": "random"}
     answer = client.post("/api/v1/uploads", data=data, files={"file": ("a.zip", device_zip())})
     session = answer.json()["sessions"][0]["id"]
     traces = client.get(f"/api/v1/sessions/{session}/traces").json()

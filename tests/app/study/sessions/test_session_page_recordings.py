@@ -89,14 +89,14 @@ def test_a_montage_shows_its_five_configurations_its_loss_and_its_gaps(page_of: 
     assert 24 <= max(inside)[1] <= 29
 
 
-def test_annotations_and_ratings_within_a_run_stand_on_the_sessions_page(client: TestClient, enrolled: str) -> None:
+def test_annotations_and_ratings_within_a_run_stand_on_the_sessions_page(client: TestClient, participant_code: str) -> None:
     percept = Percept()
     report = percept.one_run(seconds=60.0)
     report["SymptomRatings"] = [
         {"DateTime": "2024-03-14T10:06:12Z", "Symptom": "Tremor", "Rating": 7, "By": "Ada"},
         {"DateTime": "2024-03-14T12:00:00Z", "Symptom": "Rigidity", "Rating": 1},
     ]
-    fields = {"participant": enrolled, "visit": "1", "controller": "other"}
+    fields = {"participant": participant_code, "visit": "1", "controller": "other"}
     answer = client.post("/api/v1/uploads", data=fields, files={"file": ("r.json", json.dumps(report).encode())})
     session = answer.json()["sessions"][0]["id"]
     page = unescape(client.get(f"/sessions/{session}", headers={"Accept": "text/html"}).text)

@@ -75,12 +75,12 @@ def test_the_interface_asks_and_takes_a_persons_word(client: TestClient, upload:
     assert client.put(url, json={"grasp_hz": 7.2, "rating": 6, "sure": []}).json()["rating"] == 6
 
 
-def test_a_program_that_can_ask_nobody_is_not_asked(client: TestClient, enrolled: str, upload: Any) -> None:
+def test_a_program_that_can_ask_nobody_is_not_asked(client: TestClient, participant_code: str, upload: Any) -> None:
     unusual = {"grasp_hz": 7.2, "tremor_percent": 0.3}
     assert client.put(f"/api/v1/sessions/{upload('cdbs', qoc={})}/qoc", json=unusual).status_code == 200
     high = [{"hemisphere": "left", "amplitude_ma": 8.0}]
-    assert client.post(f"/api/v1/participants/{enrolled}/visits", json={"number": 2, "cdbs_amplitudes": high}).status_code == 201
-    assert client.put(f"/api/v1/participants/{enrolled}/settings", json={"settings": {"cdbs_amplitude_ma": 9}}).status_code == 200
+    assert client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 2, "cdbs_amplitudes": high}).status_code == 201
+    assert client.put(f"/api/v1/participants/{participant_code}/settings", json={"settings": {"cdbs_amplitude_ma": 9}}).status_code == 200
     assert client.post("/api/v1/participants", json={"code": "P7", "settings": {"cdbs_amplitude_ma": 9}}).status_code == 201
 
 
@@ -92,8 +92,8 @@ def test_a_rating_is_held_against_the_newest_ones_of_its_visit(client: TestClien
     assert asked(client.put(url, json={"rating": 1, "sure": []})) == [("rating", "far_from_visit", False)]
 
 
-def test_amplitudes_of_visits_settings_and_enrolments_are_asked_about(client: TestClient, enrolled: str) -> None:
-    visits = f"/api/v1/participants/{enrolled}/visits"
+def test_amplitudes_of_visits_settings_and_enrolments_are_asked_about(client: TestClient, participant_code: str) -> None:
+    visits = f"/api/v1/participants/{participant_code}/visits"
     high = {"hemisphere": "left", "amplitude_ma": 8.0, "sure": False}
     refused = client.post(visits, json={"number": 2, "cdbs_amplitudes": [high]})
     assert asked(refused) == [("cdbs_amplitudes", "above_usual", False)]
@@ -105,8 +105,12 @@ def test_amplitudes_of_visits_settings_and_enrolments_are_asked_about(client: Te
     two = [high, {"hemisphere": "right", "amplitude_ma": 2.5}]
     assert client.patch(visit, json={"cdbs_amplitudes": two, "reason": "both sides"}).status_code == 200
     settings = {"settings": {"cdbs_amplitude_ma": 0.2}, "sure": []}
-    assert asked(client.put(f"/api/v1/participants/{enrolled}/settings", json=settings)) == [("cdbs_amplitude_ma", "below_usual", False)]
-    assert client.put(f"/api/v1/participants/{enrolled}/settings", json=settings | {"sure": ["cdbs_amplitude_ma"]}).status_code == 200
+    assert asked(client.put(f"/api/v1/participants/{participant_code}/settings", json=settings)) == [
+        ("cdbs_amplitude_ma", "below_usual", False)
+    ]
+    assert (
+        client.put(f"/api/v1/participants/{participant_code}/settings", json=settings | {"sure": ["cdbs_amplitude_ma"]}).status_code == 200
+    )
     new = {"code": "P7", "settings": {"cdbs_amplitude_ma": 9}, "sure": []}
     assert asked(client.post("/api/v1/participants", json=new)) == [("cdbs_amplitude_ma", "above_usual", False)]
     assert client.post("/api/v1/participants", json=new | {"sure": ["cdbs_amplitude_ma"]}).status_code == 201
@@ -135,18 +139,18 @@ def test_a_field_that_cannot_be_used_says_so_beside_itself(browser: TestClient, 
     assert page.count('aria-invalid="true"') == 1
 
 
-def test_the_pages_of_visits_settings_and_enrolment_ask_too(browser: TestClient, client: TestClient, enrolled: str) -> None:  # noqa: F811
+def test_the_pages_of_visits_settings_and_enrolment_ask_too(browser: TestClient, client: TestClient, participant_code: str) -> None:  # noqa: F811
     new = {"number": "2", "date": "2026-04-01", "note": "lay down", "cdbs_left": "8"}
-    page = unescape(browser.post(f"/participants/{enrolled}/visits", data=new).text)
+    page = unescape(browser.post(f"/participants/{participant_code}/visits", data=new).text)
     assert '<input type="checkbox" name="sure" value="cdbs_left=8">' in page
     assert "lay down" in page
-    made = browser.post(f"/participants/{enrolled}/visits", data=new | {"sure": "cdbs_left=8"})
+    made = browser.post(f"/participants/{participant_code}/visits", data=new | {"sure": "cdbs_left=8"})
     assert made.status_code == 303
     url = made.headers["location"].split("?")[0]
     tab = Tab(browser, url, url)
     assert 'value="cdbs_right_1=7.5"' in tab.send(cdbs_right_1="7.5", reason="read again").text
     assert tab.send(cdbs_right_1="7.5", reason="read again", sure="cdbs_right_1=7.5").status_code == 303
-    settings = Tab(browser, f"/participants/{enrolled}/settings", f"/participants/{enrolled}/settings")
+    settings = Tab(browser, f"/participants/{participant_code}/settings", f"/participants/{participant_code}/settings")
     assert 'value="cdbs_amplitude_ma=9"' in settings.send(cdbs_amplitude_ma="9").text
     assert settings.send(cdbs_amplitude_ma="9", sure="cdbs_amplitude_ma=9").status_code == 303
     enrol = {"code": "P8", "cdbs_amplitude_ma": "9"}
