@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ml.formats.counters import Counter
-from ml.formats.facts import ClockFact, Facts
+from ml.formats.facts import ClockFact, DoseModifier, Facts
 from ml.formats.sentinels import UINT8, UINT32, WIDE, Field
 
 FACTS = Facts(
@@ -22,5 +22,31 @@ FACTS = Facts(
         "CurrentAdaptiveState": Field("state", 0, 8, (15,), "Summit API: 15 is no state"),
         "batteryLevelPercent": Field("%", 0, 100, (UINT8, *WIDE), "a share of 100"),
     },
-    dose=(),
+    dose=(
+        DoseModifier(
+            "therapy off",
+            "therapyStatus of StimLog and DeviceSettings",
+            "0 mA; with a status other than off and on the amplitude is unknown",
+            "Summit API",
+        ),
+        DoseModifier(
+            "cycling",
+            "cyclingEnabled, cycleOnTime, cycleOffTime of the active group",
+            "the amplitude is unknown, and the report says the lengths where their unit is known",
+            "a recording of 60 s on and 60 s off, whose unit code is 2",
+        ),
+        DoseModifier(
+            "amplitude limits",
+            "upper limit of each program of the active group",
+            "a higher amplitude is unknown, and the report says why",
+            "assumed: a device keeps to its limits",
+        ),
+        DoseModifier(
+            "several programs",
+            "isEnabled of each program of the active group",
+            "one trace per program, and the report says so",
+            "Summit API",
+        ),
+        DoseModifier("ramp", "rampTime, rampRepeat", "none: the unit is in no source", "recordings"),
+    ),
 )

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.formats.rcs.packets.facts import FACTS
+
 TICKS_PER_S = 10_000
-ROLLOVER = 65_536
+ROLLOVER = int(FACTS.counters["systemTick"].turn)
 ROLLOVER_MS = 1000.0 * ROLLOVER / TICKS_PER_S
 LATEST_MS = 2.5e14
 """No PC time is later; what says so is damage."""
