@@ -45,7 +45,7 @@ def test_where_nothing_is_worth_a_test_random_and_cdbs_sessions_are_planned_at_a
     page = client.get(PAGE).text
     form = re.search(r'<form method="post" action="([^"]+/plan/draft)"(?:(?!</form>).)*Plan random and cDBS sessions of P1', page, re.S)
     assert form is not None
-    sent = dict(re.findall(r'name="(\w+)" value="(\d+)"', form[0])) | {"visit_number": "7", "visit_date": "2031-01-07"}
+    sent = dict(re.findall(r'name="(\w+)"\s+value="(\d+)"', form[0])) | {"visit_number": "7", "visit_date": "2031-01-07"}
     planned = client.post(form[1], data=sent, follow_redirects=False)
     assert planned.status_code == 303, planned.text
     visit = int(planned.headers["location"].split("/")[2])

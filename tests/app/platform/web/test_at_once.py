@@ -10,6 +10,7 @@ import pytest
 from fastapi.testclient import TestClient
 from structlog.testing import capture_logs
 
+from app.accounts import repository as accounts
 from app.accounts.studies import repository as studies
 from app.study import repository as study
 
@@ -20,7 +21,7 @@ PAGE = {"accept": "text/html"}
 @pytest.fixture
 def together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every request has looked whether the thing is there before any of them makes it."""
-    for module, name in ((study, "visit_by_number"), (studies, "study_by_code"), (studies, "site_by_code")):
+    for module, name in ((study, "visit_by_number"), (studies, "study_by_code"), (accounts, "site_by_code")):
         gate, look = Barrier(AT_ONCE, timeout=20), getattr(module, name)
 
         def waiting(*arguments: Any, gate: Barrier = gate, look: Any = look) -> Any:
