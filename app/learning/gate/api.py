@@ -6,14 +6,36 @@ from fastapi import APIRouter
 
 from app.accounts.deps import CurrentCaller
 from app.learning.gate import service as gates
-from app.learning.schemas import GateChange, GateOut
-from app.learning.serializers import gate_out
+from app.learning.schemas import GateChange, GateDecisionOut, GateOut, QocTestOut
 from app.platform.database import Db
 from app.platform.web.schemas import problems
 from app.study import repository as study_repository
 from app.study.deps import CurrentParticipant, ResultsViewed
 
 router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
+
+
+def gate_out(found: gates.Gate) -> GateOut:
+    """Convert the gate for the API."""
+    decision = found.decision
+    return GateOut(
+        open=found.is_open,
+        grounds=gates.gate_grounds(found),
+        opened_by_test=found.opened_by_test,
+        tests=[
+            QocTestOut(
+                qoc=t.field,
+                note=gates.gate_test_note(t),
+                **{name: getattr(t, name) for name in QocTestOut.model_fields if name not in ("qoc", "note")},
+            )
+            for t in found.tests
+        ],
+        decision=None
+        if decision is None
+        else GateDecisionOut(
+            choice=decision.choice, reason=decision.reason, created_at=decision.created_at, created_by=decision.created_by
+        ),
+    )
 
 
 @router.get("/participants/{code}/buffer-gate", dependencies=[ResultsViewed])

@@ -11,7 +11,6 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
-from app.learning import wording
 from app.learning.gate import service as gates
 from app.learning.schemas import GateChange
 from app.platform.database import Db
@@ -61,7 +60,7 @@ def _page(
         "learning/gate.html",
         participant=participant,
         gate=gate,
-        grounds=wording.gate_grounds(gate),
+        grounds=gates.gate_grounds(gate),
         alpha=gates.ALPHA,
         typed=typed or dict.fromkeys(LABELS, ""),
         may_decide=caller.may(can.DECIDE_GATE, site.study_id, site.id),

@@ -129,3 +129,30 @@ def _adjusted(tests: Sequence[QocTest]) -> tuple[QocTest, ...]:
     tested = [t for t in tests if t.tested]
     better, worse = (iter(holm([getattr(t, name) for t in tested])) for name in ("p_better", "p_worse"))
     return tuple(t if not t.tested else replace(t, p_better=next(better), p_worse=next(worse)) for t in tests)
+
+
+def gate_grounds(gate: Gate) -> str:
+    """Say why the gate of the replay buffer is open or shut."""
+    if gate.decision is not None and gate.decision.choice != GateChoice.TEST:
+        return f"decided by {gate.decision.created_by}: {gate.decision.reason}"
+    if gate.opened_by_test:
+        better = [t.name.lower() for t in gate.tests if t.p_better is not None and t.p_better < ALPHA]
+        return f"{' and '.join(better)} significantly better than under the random controller (Holm-adjusted p < {ALPHA})"
+    worse = [t.name.lower() for t in gate.tests if t.p_worse is not None and t.p_worse < ALPHA]
+    if worse:
+        return f"{' and '.join(worse)} significantly worse than under the random controller"
+    if not gate.tests:
+        return "no outcome counts in the reward of a session's end (C2 = C3 = C4 = 0), so nothing can be tested"
+    if not any(t.tested for t in gate.tests):
+        return gate_test_note(gate.tests[0])
+    return "no outcome is significantly better than under the random controller"
+
+
+def gate_test_note(test: QocTest) -> str:
+    """Say why a QoC could not be tested; empty where it was."""
+    if test.tested:
+        return ""
+    return (
+        f"not enough sessions with {test.name.lower()}: {test.n_learned} of learned policies and {test.n_random} of the random controller "
+        "(3 against 4, 2 against 5 or 1 against 20 are the fewest that can show a difference)"
+    )

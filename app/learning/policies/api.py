@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, File, Form, UploadFile
+from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
 from app.learning import repository
@@ -12,13 +13,38 @@ from app.learning.deps import CurrentPolicy
 from app.learning.policies import service
 from app.learning.policies.uploads import read_limited
 from app.learning.schemas import PolicyChange, PolicyName, PolicyOut
-from app.learning.serializers import policy_out
 from app.platform.database import Db
 from app.platform.web.schemas import Page, PagingQuery, problems
+from app.study import repository as study_repository
 from app.study.deps import CurrentParticipant
+from app.tables.learning import Policy
 from app.tables.participants import Participant
 
 router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
+
+
+def policy_out(db: Session, p: Policy, participant: Participant) -> PolicyOut:
+    """Convert a policy for the API."""
+    return PolicyOut(
+        id=p.id,
+        participant=participant.code,
+        name=p.name,
+        kind=p.kind,
+        algorithm=p.algorithm,
+        teacher_id=p.teacher_id,
+        parent_id=p.parent_id,
+        snapshot_id=p.snapshot_id,
+        settings_version=study_repository.settings_version(db, p.settings_version_id).version,
+        job_id=p.job_id,
+        config=p.config,
+        seed=p.seed,
+        metrics=p.metrics,
+        onnx_sha256=p.onnx_sha256,
+        code_version=p.code_version,
+        created_at=p.created_at,
+        created_by=p.created_by,
+        retired_reason=p.retired_reason,
+    )
 
 
 @router.get("/participants/{code}/policies")

@@ -3,19 +3,41 @@
 from __future__ import annotations
 
 from fastapi import APIRouter
+from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
 from app.learning import repository
 from app.learning.deps import CurrentSnapshot
-from app.learning.schemas import SnapshotOut
-from app.learning.serializers import snapshot_out
+from app.learning.schemas import SnapshotOut, SnapshotSessionOut
 from app.learning.snapshots import service as snapshots
 from app.platform.database import Db
 from app.platform.web.schemas import Page, PagingQuery, problems
+from app.study import repository as study_repository
 from app.study.deps import CurrentParticipant
+from app.tables.learning import BufferSnapshot
 from app.tables.participants import Participant
 
 router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
+
+
+def snapshot_out(db: Session, s: BufferSnapshot, participant: Participant) -> SnapshotOut:
+    """Convert a snapshot for the API."""
+    return SnapshotOut(
+        id=s.id,
+        participant=participant.code,
+        settings_version=study_repository.settings_version(db, s.settings_version_id).version,
+        characteristics_version=next((c.version for c in participant.characteristics if c.id == s.characteristics_id), None),
+        pins_sha256=s.pins_sha256,
+        file_sha256=s.file_sha256,
+        sessions=s.sessions,
+        steps=s.steps,
+        median_steps=s.median_steps,
+        beta_unit=s.beta_unit,
+        beta_source=s.beta_source,
+        created_at=s.created_at,
+        created_by=s.created_by,
+        members=[SnapshotSessionOut.model_validate(m, from_attributes=True) for m in s.members],
+    )
 
 
 @router.get("/participants/{code}/snapshots")

@@ -20,8 +20,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
-from app.learning import repository, wording
-from app.learning.gate.service import LEARNED, Gate, gate
+from app.learning import repository
+from app.learning.gate.service import LEARNED, Gate, gate, gate_grounds
 from app.learning.snapshots.trajectories import trajectory_of
 from app.platform import files
 from app.platform.errors import Invalid
@@ -32,7 +32,7 @@ from app.study import service as study
 from app.study.doses.since import hours_since_dose
 from app.study.sessions import repository as session_repository
 from app.study.sessions.data import failed_qoc_of, session_data
-from app.study.sessions.programming import Program, differences, stored
+from app.study.sessions.programming import Difference, Program, differences, stored
 from app.study.sessions.repeated import counts_elsewhere
 from app.study.threshold import mdp_settings, suggest_xi_beta
 from app.study.traces import StepTable, TracesOf, traces_of
@@ -311,7 +311,7 @@ def _of_one_programming(members: list[Member], version: SettingsVersion) -> list
     found = []
     for m in members:
         differs = differences(m.programs, newest.get(m.session.hemisphere, ()), m.session.hemisphere) if m.trajectory else []
-        found.append(Member(m.session, m.table, None, wording.other_programming(differs)) if differs else m)
+        found.append(Member(m.session, m.table, None, other_programming(differs)) if differs else m)
     return found
 
 
@@ -319,7 +319,7 @@ def _pass_gate(m: Member, barrier: Gate) -> Member:
     """Leave out sessions of learned policies while the gate is shut."""
     if m.trajectory is None or barrier.is_open or blinding.arm(m.session, SYSTEM).controller not in LEARNED:
         return m
-    return Member(m.session, m.table, None, f"session of a learned policy, and these are not learned from: {wording.gate_grounds(barrier)}")
+    return Member(m.session, m.table, None, f"session of a learned policy, and these are not learned from: {gate_grounds(barrier)}")
 
 
 def _row(snapshot_id: int, m: Member) -> SnapshotSession:
@@ -348,3 +348,12 @@ def _digest(s: SessionTrajectory) -> str:
     if s.stopped_as is not None:
         digest.update(f"|stopped as {s.stopped_as}".encode())
     return digest.hexdigest()
+
+
+def other_programming(differs: Sequence[Difference]) -> str:
+    """Say why a session is excluded that ran under another programming than the participant's newest."""
+    parts = [f"{d.of} and not {d.other} on {f'the {d.hemisphere} ' if d.hemisphere else ''}program {d.program}" for d in differs]
+    return (
+        f"it ran under another programming than the participant's newest session: {'; '.join(parts)}. The same fraction is another dose "
+        "there; a clinician may pool both in the settings"
+    )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 
-from app.learning import wording
 from app.learning.deps import CurrentSweep, SweepViewed
 from app.learning.schemas import ALGORITHM_NAMES
 from app.learning.sweeps import comparison, parallel
@@ -36,8 +35,8 @@ def sweep_page(request: Request, sweep: CurrentSweep, db: Db) -> HTMLResponse:
         baselines=sorted(sweep.baselines["rows"], key=lambda row: -row["score"]),
         held_out=sweep.baselines["held_out_sessions"],
         charts=comparison.charts(sweep),
-        parallel=parallel.parallel(found, wording.STANDINGS),
-        standings=wording.STANDINGS,
+        parallel=parallel.parallel(found),
+        standings=parallel.STANDINGS,
         looks=parallel.LOOKS,
         algorithm_names=ALGORITHM_NAMES,
         held_near=comparison.held_near,

@@ -34,6 +34,17 @@ class Standing(StrEnum):
     """It was not estimated, or the sessions cannot order policies."""
 
 
+STANDINGS = {
+    Standing.RETIRED: "retired",
+    Standing.BELOW_TRIED: "below what the random controller tried",
+    Standing.NO_SESSION_NEAR: "no session near",
+    Standing.BEYOND_MARGIN: "probably beyond a margin",
+    Standing.ABOVE_CDBS: "estimated above cDBS",
+    Standing.NOT_ABOVE_CDBS: "not above cDBS with confidence",
+    Standing.UNTOLD: "cannot tell",
+}
+
+
 LOOKS = {
     Standing.ABOVE_CDBS: ("good", ""),
     Standing.NOT_ABOVE_CDBS: ("accent", ""),
@@ -93,11 +104,11 @@ def standing(candidate: Candidate) -> Standing:
     return Standing.ABOVE_CDBS if candidate.gain.low > 0 else Standing.NOT_ABOVE_CDBS
 
 
-def parallel(candidates: Sequence[Candidate], words: dict[Standing, str]) -> Parallel | None:
+def parallel(candidates: Sequence[Candidate]) -> Parallel | None:
     """Draw the figure of a sweep; None of fewer policies than can be compared.
 
     Args:
-        candidates: best first, as the page lists them. words: of each standing.
+        candidates: best first, as the page lists them.
     """
     if len(candidates) < LEAST:
         return None
@@ -105,8 +116,8 @@ def parallel(candidates: Sequence[Candidate], words: dict[Standing, str]) -> Par
     stands = [standing(c) for c in candidates]
     shown = [s for s in LOOKS if s in stands]
     columns = ["Policy", *(a.name for a in axes), "Stands"]
-    rows = [[c.policy.name, *(a.cells[k] for a in axes), words[stands[k]]] for k, c in enumerate(candidates)]
-    return Parallel(_figure(candidates, axes, stands, words), shown, columns, rows)
+    rows = [[c.policy.name, *(a.cells[k] for a in axes), STANDINGS[stands[k]]] for k, c in enumerate(candidates)]
+    return Parallel(_figure(candidates, axes, stands), shown, columns, rows)
 
 
 def _axes(candidates: Sequence[Candidate]) -> list[Axis]:
@@ -158,7 +169,7 @@ def _number(name: str, values: Sequence[float | None], logarithmic: bool = False
     )
 
 
-def _figure(candidates: Sequence[Candidate], axes: Sequence[Axis], stands: Sequence[Standing], words: dict[Standing, str]) -> Markup:
+def _figure(candidates: Sequence[Candidate], axes: Sequence[Axis], stands: Sequence[Standing]) -> Markup:
     plane = Plane(LEFT, TOP, W - LEFT - RIGHT, H - TOP - BOTTOM, (0.0, max(len(axes) - 1, 1)), (0.0, 1.0))
     for k, column in enumerate(axes):
         plane.line([(k, 0.0), (k, 1.0)], "border", 1.0)
@@ -168,7 +179,7 @@ def _figure(candidates: Sequence[Candidate], axes: Sequence[Axis], stands: Seque
     for which in reversed(range(len(candidates))):
         tone, dash = LOOKS[stands[which]]
         plane.line([(k, a.places[which]) for k, a in enumerate(axes)], tone, 1.8, dash)
-        named = f"{candidates[which].policy.name}: {words[stands[which]]}"
+        named = f"{candidates[which].policy.name}: {STANDINGS[stands[which]]}"
         for k, a in enumerate(axes):
             if (place := a.places[which]) is not None:
                 plane.dot(k, place, tone, words=f"{named}; {a.name} {_cell(a.cells[which])}")
