@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field, create_model
+from pydantic import Field, create_model, model_validator
 
 from app.platform.web.schemas import Int, Model, Number
 from ml.outcomes import OUTCOMES, Outcome
@@ -16,6 +16,18 @@ if TYPE_CHECKING:
 else:
     OutcomeField = Literal[tuple(o.field for o in OUTCOMES)]
     DerivedField = Literal[tuple(o.field for o in OUTCOMES if o.derived)]
+
+
+class _WholeValues(Model):
+    """Outcomes that are whole numbers may be written with decimals that say nothing, as spreadsheets write them: 8.0."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_decimals(cls, values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        whole = {o.field: values.get(o.field) for o in OUTCOMES if o.whole}
+        return values | {field: int(v) for field, v in whole.items() if isinstance(v, float) and v.is_integer()}
 
 
 def fields_model(name: str, field_of: Callable[[Outcome], Mapping[str, Any]], base: type[Model] = Model) -> type[Model]:
@@ -55,7 +67,7 @@ if TYPE_CHECKING:
         version: int
 
 else:
-    EnteredOutcomes = fields_model("EnteredOutcomes", _entered)
+    EnteredOutcomes = fields_model("EnteredOutcomes", _entered, _WholeValues)
     StoredOutcomes = fields_model("StoredOutcomes", _stored)
     StatedMargins = fields_model("StatedMargins", _stated_margin)
     _Version = create_model("_Version", __base__=Model, version=(int, ...))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import NoneType, UnionType
@@ -144,6 +145,10 @@ def _answer(name: str, text: str) -> str:
     return f"{name}={text.strip()}"
 
 
+_NO_DECIMALS = re.compile(r"(?<=\d)[.,]0{0,2}$")
+"""Decimals that say nothing, as spreadsheets write them: 8.0, 8,00. Three zeros may be thousands, and are refused."""
+
+
 def _value(text: str, annotation: Any, required: bool) -> Any:
     kinds = _kinds(annotation)
     text = text.strip()
@@ -159,7 +164,7 @@ def _value(text: str, annotation: Any, required: bool) -> Any:
         raise ValueError("give a value")
     if int in kinds:
         try:
-            return int(text)
+            return int(_NO_DECIMALS.sub("", text))
         except ValueError:
             raise ValueError(f"'{text}' is no whole number") from None
     if float in kinds:
