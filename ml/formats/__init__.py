@@ -64,6 +64,17 @@ HINT = (
 )
 
 
+_OTHER_ARCHIVES = (
+    ("gzip", 0, b"\x1f\x8b"),
+    ("bzip2", 0, b"BZh"),
+    ("xz", 0, b"\xfd7zXZ\0"),
+    ("7-Zip", 0, b"7z\xbc\xaf\x27\x1c"),
+    ("RAR", 0, b"Rar!\x1a\x07"),
+    ("tar", 257, b"ustar"),
+)
+"""Archives that are not unpacked: name, place and bytes of their mark. Sources: RFC 1952, POSIX, and the formats' specifications."""
+
+
 def sniff(path: Source) -> FileKind:
     """Detect the kind of a file by its content, whatever its name and extension.
 
@@ -77,6 +88,10 @@ def sniff(path: Source) -> FileKind:
         zipped = head.startswith((b"PK\x03\x04", b"PK\x05\x06")) or zipfile.is_zipfile(stream)
     if not head:
         raise UndecodableFile("the file is empty", "file", HINT)
+    for archive, place, mark in _OTHER_ARCHIVES:
+        if head.startswith(mark, place):
+            hint = "Unpack it, zip the session's folder and upload that. A single report or table needs no archive."
+            raise UndecodableFile(f"this is a {archive} archive, and only zip archives are unpacked", "first bytes", hint)
     if head.startswith(b"PAR1"):
         return "parquet"
     if zipped:

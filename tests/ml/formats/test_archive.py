@@ -1,14 +1,20 @@
 from __future__ import annotations
 
+import bz2
+import gzip
+import io
+import lzma
 import stat
 import struct
+import tarfile
 import tracemalloc
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ml.formats import ArchiveLimits, DecodeOptions, UndecodableFile, decode
+from ml.formats import ArchiveLimits, DecodeOptions, UndecodableFile, decode, sniff
 from ml.formats.archive import FolderFiles, ZipFiles
 from ml.formats.identity import redact
 
@@ -147,3 +153,29 @@ def test_an_archive_of_archives_says_what_to_do(tmp_path):
         redact(path, tmp_path / "clean.zip", "rcs", b"a key of the clinic's own")
     assert refused.value.hint.startswith("It holds 2 other archives, which are not opened: unpack it and upload what is inside.")
     assert "Ada" not in str(refused.value)
+
+
+def tar_archive(mode: str) -> bytes:
+    sink = io.BytesIO()
+    with tarfile.open(fileobj=sink, mode=mode) as archive:  # type: ignore[call-overload]
+        archive.addfile(tarfile.TarInfo("RawDataTD.json"))
+    return sink.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("gzip", gzip.compress(b"[]")),
+        ("gzip", tar_archive("w:gz")),
+        ("bzip2", bz2.compress(b"[]")),
+        ("xz", lzma.compress(b"[]")),
+        ("tar", tar_archive("w")),
+        ("7-Zip", b"7z\xbc\xaf\x27\x1c\0\x04" + bytes(24)),
+        ("RAR", b"Rar!\x1a\x07\x01\0" + bytes(24)),
+    ],
+)
+def test_an_archive_that_is_not_unpacked_is_named_with_what_to_do(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / "session").write_bytes(content)
+    with pytest.raises(UndecodableFile, match=f"this is a {name} archive") as refused:
+        sniff(tmp_path / "session")
+    assert "zip the session's folder" in refused.value.hint
