@@ -121,8 +121,20 @@ def test_an_evaluation_cancelled_in_the_middle_of_a_fit_ends_promptly_and_leaves
     client: TestClient, policy: int, workers: Workers, ended: Ended, preset: str, methods: list[str], middle_of: list[str]
 ) -> None:
     worker = workers.start()
-    job = client.post(JOBS, json={"kind": "evaluate", "preset": preset, "methods": methods}).json()["id"]
-    wait(lambda: all(0.02 < step(client, job, key)["progress"] < 1.0 for key in middle_of), 90.0)
+    for seed in range(5):  # on a busy machine one fit may end before the other begins
+        job = client.post(JOBS, json={"kind": "evaluate", "preset": preset, "methods": methods, "seed": seed}).json()["id"]
+        far: list[float] = []
+
+        def looked(job: str = job, far: list[float] = far) -> bool:
+            far[:] = [step(client, job, key)["progress"] for key in middle_of]
+            return min(far) > 0.02 or max(far) == 1.0
+
+        wait(looked, 90.0)
+        if max(far) < 1.0:
+            break
+        client.post(f"/api/v1/jobs/{job}/cancel")
+        ended(job, 60.0)
+    assert max(far) < 1.0, "the fits never ran at once"
     children = [child for key in middle_of if (child := workers.computing(worker, key)) is not None]
     assert len(children) == len(middle_of)
     family = [*children, *(below for child in children for below in child.children(recursive=True))]
