@@ -188,7 +188,9 @@ def request_session(db: Annotated[Session, Depends(get_db)]) -> Iterator[Session
         db.commit()
     except DBAPIError as error:
         if wrote or passing(error) is None:
-            raise  # after reading alone the answer is right, also where the database has gone meanwhile
+            raise
+        # after reading alone the answer is right
+        log.warning("the database went away before a request that only read had ended: %s", type(error.orig).__name__)
 
 
 _MAY_HAVE_WRITTEN = "may have written"

@@ -75,9 +75,9 @@ Day = Annotated[date, AfterValidator(sensible_day)]
 """A day of the calendar."""
 RowId = Annotated[int, Field(ge=1, le=2**31 - 1)]
 Text = Annotated[str, Field(pattern=r"^[^\x00]*$")]
+"""Text without the zero character, which PostgreSQL cannot hold."""
 CodeOf = Annotated[str, BeforeValidator(lambda row: getattr(row, "code", row))]
 """The code of a row that has one, such as a participant, for an answer."""
-"""Text without the zero character, which PostgreSQL cannot hold."""
 
 
 class Model(BaseModel):

@@ -131,10 +131,10 @@ class ForkedProcesses(ChildProcesses):
     def _forget(self) -> None:
         if self._to_server is not None:
             self._to_server.close()
-        if self._server is not None:
-            self._server.kill()
-            self._server.wait()
-        self._to_server = self._server = None
+        server, self._to_server, self._server = self._server, None, None
+        if server is not None:
+            server.kill()
+            server.wait()
 
 
 class ForkedChild:
