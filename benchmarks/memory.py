@@ -1,6 +1,6 @@
-"""Memory of an idle demo by process, and beside that of another checkout.
+"""Memory of an idle demo by process.
 
-    python benchmarks/memory.py [--quick] [--than /path/to/checkout]
+    python benchmarks/memory.py [--quick]
 
 A real `betaloop demo` in a new folder: its study is uploaded, its rankings are made, and when nothing has run for IDLE_S its processes are
 measured. `--quick` cancels the rankings once the first training has begun, which loads what a worker ever loads for one.
@@ -53,17 +53,11 @@ class Used:
 
 @dataclass(frozen=True)
 class Demo:
-    """A running demo: its process, data folder, address and checkout."""
+    """A running demo: its process, data folder and address."""
 
     process: psutil.Popen
     folder: Path
     base: str
-    checkout: Path
-
-    def command(self, *arguments: str) -> list[str]:
-        """A command of betaloop in the demo's checkout."""
-        own = self.checkout / ".venv" / "bin" / "python"
-        return [str(own) if own.exists() else sys.executable, "-m", "app.cli", *arguments]
 
     def said(self) -> str:
         """What it printed so far."""
@@ -76,28 +70,30 @@ class Demo:
         return False
 
 
-def environment(folder: Path, checkout: Path) -> dict[str, str]:
-    """Environment of a demo: its data folder and checkout, and of the caller's settings those of PASSED_ON alone."""
+def command(*arguments: str) -> list[str]:
+    """Name a command of betaloop."""
+    return [sys.executable, "-m", "app.cli", *arguments]
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Return the environment of a demo: its data folder, and of the caller's settings those of PASSED_ON alone."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("BETALOOP_") or k in PASSED_ON}
-    return kept | {"BETALOOP_DATA_DIR": str(folder), "PYTHONPATH": str(checkout)}
+    return kept | {"BETALOOP_DATA_DIR": str(folder), "PYTHONPATH": str(ROOT)}
 
 
 @contextmanager
-def demo(checkout: Path) -> Iterator[Demo]:
-    """A demo of a checkout, stopped at the end, with its data removed."""
+def demo() -> Iterator[Demo]:
+    """Run a demo; stop it at the end and remove its data."""
     with tempfile.TemporaryDirectory(prefix="betaloop-memory-", dir="/tmp", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         folder.chmod(0o711)  # PostgreSQL runs as a user of its own where root starts it
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
-        one = Demo(None, folder, f"http://127.0.0.1:{port}", checkout)
         with (folder / "said.txt").open("w") as out:
-            process = psutil.Popen(
-                one.command("demo", "--port", str(port)), cwd=checkout, env=environment(folder, checkout), stdout=out, stderr=out
-            )
+            process = psutil.Popen(command("demo", "--port", str(port)), cwd=ROOT, env=environment(folder), stdout=out, stderr=out)
         try:
-            yield Demo(process, folder, one.base, checkout)
+            yield Demo(process, folder, f"http://127.0.0.1:{port}")
         finally:
             process.send_signal(signal.SIGTERM)
             process.wait(120)
@@ -116,7 +112,7 @@ def wait_for(one: Demo, what: str, condition: object, seconds: float) -> None:
 def finish_jobs(one: Demo, cancel: bool) -> None:
     """Wait until every ranking has ended; or cancel them once a training of the first reports progress."""
     done = subprocess.run(
-        one.command("token", "create", ADMIN, "--name", "memory"), cwd=one.checkout, env=environment(one.folder, one.checkout),
+        command("token", "create", ADMIN, "--name", "memory"), cwd=ROOT, env=environment(one.folder),
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     token = done.stdout.split()[-1]
@@ -169,19 +165,19 @@ def measure(one: Demo) -> list[Used]:
     return sorted([*own, together], key=lambda used: -used.pss_mb)
 
 
-def measured(checkout: Path, quick: bool) -> list[Used]:
-    """Start a demo of a checkout, let it work, and measure it when it is idle."""
-    with demo(checkout) as one:
+def measure_demo(quick: bool) -> list[Used]:
+    """Start a demo, let it work, and measure it when it is idle."""
+    with demo() as one:
         wait_for(one, "the study", one.loaded, STARTED_S)
         finish_jobs(one, quick)
         time.sleep(IDLE_S)
         return measure(one)
 
 
-def show(title: str, found: list[Used]) -> float:
-    """Print the table of one checkout; returns the sum of PSS, MB."""
+def show(found: list[Used]) -> float:
+    """Print the table; return the sum of PSS, MB."""
     total, private = sum(used.pss_mb for used in found), sum(used.private_mb for used in found)
-    print(f"{title}\n{'process':<28}{'PSS MB':>9}{'private MB':>12}")
+    print(f"{'process':<28}{'PSS MB':>9}{'private MB':>12}")
     for used in [*found, Used("together", total, private)]:
         print(f"{used.name:<28}{used.pss_mb:>9.0f}{used.private_mb:>12.0f}")
     return total
@@ -190,14 +186,9 @@ def show(title: str, found: list[Used]) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="cancel the rankings once the first training has begun")
-    parser.add_argument("--than", type=Path, help="another checkout, measured in the same way before this one")
     options = parser.parse_args()
     figures: dict[str, float | bool] = {}
-    if options.than:
-        figures["than_mb"] = round(show(str(options.than), measured(options.than.resolve(), options.quick)))
-    figures["total_mb"] = total = round(show("this checkout", measured(ROOT, options.quick)))
-    if options.than:
-        figures["ratio"] = round(total / figures["than_mb"], 3)
+    figures["total_mb"] = total = round(show(measure_demo(options.quick)))
     print(json.dumps(figures | {"meets_aim": total <= MOST_MB}))
 
 

@@ -4,13 +4,13 @@
     python benchmarks/null_studies.py --only level [--seed 1]
     python benchmarks/null_studies.py [--studies 2000] [--seed 0] [--workers 2] [--keep FOLDER] [--json FILE]
 
-A study is one participant's visits with sessions of one controller and of cDBS. Every scenario adds to the noise of sessions what visits
-bring: days that differ, a controller that does better on some days and worse on others (its average effect being what is tested), drift
-over the day, ties, arms of different size, missing values, arms on different visits. The paper's test (all sessions as independent) is
-printed beside the primary one, and so is Student's t of the visits' contrasts alone, which the primary test is for metrics without a floor
-or a ceiling. Where the controller's effect differs between days, the same studies are made again with an effect that has no average in
-the latent value alone; of rating and tremor, which saturate, that is no null of the metric's average, and how often the interval misses
-that average is printed too. CPU seconds of one thread.
+A study is one participant's visits with sessions of one controller and of cDBS. Every scenario adds what visits bring: days that differ, a
+controller that does better on some days and worse on others, drift over the day, ties, arms of different size, missing values, arms on
+different visits. The average effect is what is tested. The paper's test (all sessions as independent) is printed next to the primary one.
+
+Where the controller's effect differs between days, the same studies are made again with an effect that has no average in the latent value
+alone. Rating and tremor saturate, so that for them this is no null of the metric's average. How often the interval misses that average is
+printed too. CPU seconds of one thread.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import json
 import os
 import re
 import sys
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -30,7 +29,6 @@ from typing import Any
 import numpy as np
 from support.null_worlds import (
     BOUNDED,
-    MARGINS,
     METRICS,
     MINUTES,
     WORLDS,
@@ -41,20 +39,16 @@ from support.null_worlds import (
     margin_studies,
     measure,
     metric_average,
-    nothing_to_test,
     show_margin,
 )
 
-from app.analysis.primary.verdict import judged_outcome
-from ml.outcomes import OUTCOMES
 from ml.statistics.association import within_visits
 from ml.statistics.effects import cliffs_delta, energy_saving
-from ml.statistics.noninferiority import assess
 from ml.statistics.ranksum import as_in_the_paper
 from ml.statistics.within_visits.averages import primary
-from ml.statistics.within_visits.contrasts import Average, Measurements, Unavailable, average, visit_contrasts
+from ml.statistics.within_visits.contrasts import Average, Measurements, Unavailable
 from ml.statistics.within_visits.mixed_models import linear_comparison, minutes_comparison, ordinal_comparison
-from ml.statistics.within_visits.stratified import aligned_rank_test, shift_interval, van_elteren
+from ml.statistics.within_visits.stratified import shift_interval, van_elteren
 
 out = sys.stdout.write
 ALPHA, LEVEL = 0.05, 0.95
@@ -75,11 +69,6 @@ def naive(data: Measurements) -> tuple[bool | None, bool | None]:
 def error(number: int, level: float = ALPHA) -> float:
     """Monte Carlo standard error of a share that is `level`."""
     return float(np.sqrt(level * (1 - level) / number))
-
-
-def student(data: Measurements) -> Average | Unavailable:
-    """Student's t of the visits' contrasts alone, whatever the metric: the primary test of before."""
-    return primary(replace(data, bounded=False), LEVEL)
 
 
 def rejects(found: Average | Unavailable) -> bool:
@@ -111,10 +100,10 @@ def skewed_studies(name: str, studies: int, seed: int) -> Tally:
     tally, own = Tally(), {metric: metric_average(WORLDS[name], metric) for metric in BOUNDED}
     for _, metric, data in drawn(name, studies, False, seed):
         if metric in own:
-            for label, found in (("primary", primary(data, LEVEL)), ("student", student(data))):
-                tally.add((name, metric, f"latent null {label}"), rejects(found))
-                missed = isinstance(found, Average) and not found.low <= own[metric] <= found.high
-                tally.add((name, metric, f"own average {label}"), missed)
+            found = primary(data, LEVEL)
+            tally.add((name, metric, "latent null primary"), rejects(found))
+            missed = isinstance(found, Average) and not found.low <= own[metric] <= found.high
+            tally.add((name, metric, "own average primary"), missed)
     return tally
 
 
@@ -127,10 +116,9 @@ def levels(name: str, studies: int, seed: int) -> Tally:
 
 
 def add_primary(name: str, metric: str, data: Measurements, tally: Tally) -> None:
-    """The primary test, and Student's t alone where that is another one."""
+    """Count a study by the primary test."""
     found = primary(data, LEVEL)
     tally.add((name, metric, "primary"), rejects(found))
-    tally.add((name, metric, "student"), rejects(student(data) if metric in BOUNDED else found))
     tally.add((name, metric, "primary cover"), found.low <= 0 <= found.high if isinstance(found, Average) else None)
 
 
@@ -151,8 +139,8 @@ def one_null(name: str, metric: str, data: Measurements, tally: Tally, study: in
         link = within_visits(x, data.value, data.visit, LEVEL)
         tally.add((name, metric, "slope cover"), None if isinstance(link, Unavailable) else link.low <= 0 <= link.high)
     if study % 20 == 0:
-        for label, test in (("van elteren", van_elteren(data)), ("aligned", aligned_rank_test(data))):
-            tally.add((name, metric, label), None if isinstance(test, Unavailable) else test.p_value < ALPHA)
+        test = van_elteren(data)
+        tally.add((name, metric, "van elteren"), None if isinstance(test, Unavailable) else test.p_value < ALPHA)
         shift = shift_interval(data, LEVEL)
         tally.add((name, metric, "shift cover"), None if isinstance(shift, Unavailable) else shift.low <= 0 <= shift.high)
         model = mixed(metric, data)
@@ -172,8 +160,7 @@ def mixed(metric: str, data: Measurements) -> Average | None:
 
 
 def power_studies(visits: int, studies: int, seed: int) -> Tally:
-    """Power of the primary test, of Student's t alone, of the exact one within visits and of the paper's, for an effect of one standard
-    deviation of a session."""
+    """Count what the primary test, the exact one within visits and the paper's find of an effect of one standard deviation of a session."""
     tally = Tally()
     for slope in (0.0, 0.5):
         world, rng = World(visits=visits, each=4, slope=slope), np.random.default_rng(visits + 1_000_000 * seed)
@@ -184,7 +171,6 @@ def power_studies(visits: int, studies: int, seed: int) -> Tally:
                 data = measure(metric, z, design, world, rng)
                 key = f"{visits} visits, day x dose {slope:g}, {metric}"
                 tally.add((key, "primary"), rejects(primary(data, LEVEL)))
-                tally.add((key, "student"), rejects(student(data)))
                 if metric == "grasp":
                     exact = van_elteren(data)
                     tally.add((key, "van elteren"), not isinstance(exact, Unavailable) and exact.p_value < ALPHA)
@@ -206,53 +192,10 @@ def cell(work: Part, argument: str | int, studies: int, seed: int, folder: Path 
     return tally
 
 
-def degenerate() -> int:
-    """Studies that hold nothing to test: how many got an answer other than a typed one. Any crash ends the benchmark."""
-    wrong = 0
-    for data in nothing_to_test().values():
-        answers = [average(visit_contrasts(data)), primary(data), cliffs_delta(data), energy_saving(data), linear_comparison(data)]
-        typed = isinstance(answers[1], Unavailable) and isinstance(answers[4], Unavailable)
-        wrong += not typed
-    return wrong
-
-
-def speed() -> dict[str, float]:
-    """CPU milliseconds of everything a page shows for four participants of 200 sessions: three controllers, five metrics each."""
-    rng = np.random.default_rng(0)
-    visit = np.repeat(np.arange(10), 20)
-    controller = np.concatenate([rng.permutation(np.resize([0, 1, 0, 2, 0, 3], 20)) for _ in range(10)])
-    spent = {"paper": 0.0, "primary": 0.0, "exact": 0.0, "interval of the shift": 0.0, "non-inferiority": 0.0, "mixed": 0.0}
-    for _ in range(4):
-        z = rng.standard_normal((len(METRICS), 200)) + rng.standard_normal((len(METRICS), 10))[:, visit]
-        for tested in (1, 2, 3):
-            rows = (controller == 0) | (controller == tested)
-            design = visit[rows], controller[rows] == tested, np.tile(np.arange(20.0), 10)[rows]
-            data = {m: measure(m, z[k][rows], design, World(), rng) for k, m in enumerate(METRICS)}
-            stopped = np.zeros(rows.sum(), dtype=bool)
-            outcomes = [o for m in OUTCOMES if (o := judged_outcome(m, data[m.key], stopped, MARGINS.of(m), None)) is not None]
-            for label, work in (
-                ("paper", lambda d=data: [naive(v) for v in d.values()]),
-                ("primary", lambda d=data: [(primary(v), cliffs_delta(v)) for v in d.values()]),
-                ("exact", lambda d=data: [van_elteren(v) for v in d.values()]),
-                ("interval of the shift", lambda d=data: [shift_interval(v) for v in d.values()]),
-                ("non-inferiority", lambda d=data, o=outcomes, s=stopped: assess(o, d["energy"], s)),
-                ("mixed", lambda d=data: [mixed(m, v) for m, v in d.items()]),
-            ):
-                start = time.process_time()
-                work()
-                spent[label] += 1000 * (time.process_time() - start)
-    out(
-        "\nCPU ms for 4 participants x 200 sessions, 3 controllers, 5 metrics: "
-        + ", ".join(f"{k} {v:.0f}" for k, v in spent.items())
-        + "\n"
-    )
-    return {f"ms_{label.replace(' ', '_')}": value for label, value in spent.items()}
-
-
 def show_null(tally: Tally, studies: int) -> dict[str, float]:
     """The table of null studies and its worst cells; a cell is a scenario and metrics of one law (the continuous ones, rating, tremor)."""
     out(f"null studies, {studies} of each scenario; share rejected at {ALPHA:g} (worst cell), intervals of {LEVEL:g} (range of cells)\n")
-    labels = ("primary", "student", "van elteren", "aligned", "naive")
+    labels = ("primary", "van elteren", "naive")
     intervals = ("primary", "delta", "saving", "slope", "mixed", "shift", "naive")
     out(f"{'':<22}" + "".join(f"{label:>12}" for label in labels) + "".join(f"{label:>13}" for label in intervals) + "\n")
     for name in WORLDS:
@@ -285,23 +228,22 @@ def show_null(tally: Tally, studies: int) -> dict[str, float]:
 
 def show_skewed(tally: Tally) -> None:
     """Studies whose null is one of the latent value alone."""
-    out("the effect differs between days, without an average in the latent value: average in the metric | share rejected, primary and t |")
-    out(" share of intervals that miss the average in the metric, primary and t\n")
+    out("the effect differs between days, without an average in the latent value: average in the metric | share rejected |")
+    out(" share of intervals that miss the average in the metric\n")
     for name in SKEWED:
         for metric in BOUNDED:
-            labels = [f"{kind} {test}" for kind in ("latent null", "own average") for test in ("primary", "student")]
-            shares = [tally.share(name, metric, label)[0] for label in labels]
+            shares = [tally.share(name, metric, f"{kind} primary")[0] for kind in ("latent null", "own average")]
             own = metric_average(WORLDS[name], metric)
-            out(f"{name:<22}{metric:<8}{own:>8.2f} |{shares[0]:>8.4f}{shares[1]:>8.4f} |{shares[2]:>8.4f}{shares[3]:>8.4f}\n")
+            out(f"{name:<22}{metric:<8}{own:>8.2f} |{shares[0]:>8.4f} |{shares[1]:>8.4f}\n")
     out("\n")
 
 
 def show_power(tally: Tally) -> None:
     """What is found of an effect."""
     out("\npower for an effect of one standard deviation of a session, 4 sessions of either arm a visit:")
-    out(" primary, t alone, van Elteren, the paper's\n")
+    out(" primary, van Elteren, the paper's\n")
     for key in dict.fromkeys(k[0] for k in tally.counts if len(k) == 2):
-        labels = ("primary", "student", "van elteren", "naive")
+        labels = ("primary", "van elteren", "naive")
         out(f"  {key:<36}" + "".join(f"{tally.share(key, label)[0]:>8.3f}" for label in labels) + "\n")
 
 
@@ -338,8 +280,6 @@ def main() -> None:
         figures |= show_margin(tally)
     if only in (None, "power"):
         show_power(tally)
-    if only is None:
-        figures |= {"degenerate_answers_wrong": float(degenerate())} | speed()
     figures["cpu_s"] = sum(os.times()[:4])
     out(json.dumps(figures, indent=1) + "\n")
     if arguments.json:

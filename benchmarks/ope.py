@@ -3,10 +3,9 @@
     python benchmarks/ope.py --quick                          three worlds of part A, few simulated sessions
     python benchmarks/ope.py --part A --out FOLDER            60 worlds, data by both designs; resumable
     python benchmarks/ope.py --part B --out FOLDER            the same to report on; each run is counted in looks.json
-    python benchmarks/ope.py --participants --out FOLDER      the four detailed participants, paper's design
 
 Nothing is fitted or chosen by true returns; they are computed to measure with. Finished cells are lines of FOLDER/cells-*.jsonl, and a run
-that is started again skips them. CPU seconds of one thread. `page` is the order of the ranking page of 0.1.0; `days alone` is a perfect
+that is started again skips them. CPU seconds of one thread. `days alone` is a perfect
 method that knows the days of the data and no others; `tested` tests the candidates themselves in as many sessions as the data hold.
 """
 
@@ -26,20 +25,18 @@ from typing import Any
 import torch
 from support.cells import Cells
 from support.looks import LookError, look, said
-from support.ope_cases import CDBS, DESIGNS, MATCHED, STEPS, Case, participant_case, virtual_case
+from support.ope_cases import CDBS, DESIGNS, MATCHED, Case, virtual_case
 from support.ope_report import figures, report
-from support.page_order import NEEDED, page_order
 
 from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate, Estimator
 from ml.ope.registry import POSTERIOR, estimators
 from ml.population.virtual import WORLDS_PER_PART
+from ml.population.virtual.world import STEPS
 
-PAGE = "page"
 HEADLINE = POSTERIOR
 CHEAP = (POSTERIOR, "linear", "impulse", "fqe", "wdr", "dlmm", "pdis", "wis", "cwpdis")
 DEAR = ("dlsm", "dual_dice")
-PARTICIPANTS = ("P1", "P2", "P3", "P4")
 DLSM_EVERY = 6
 """The DLSM and DualDICE run on every sixth world: they cost more than all others together."""
 QUICK_WORLDS, QUICK_TRUTH, TRUTH = 3, 80, 300
@@ -47,7 +44,7 @@ QUICK_WORLDS, QUICK_TRUTH, TRUTH = 3, 80, 300
 
 @dataclass(frozen=True)
 class Task:
-    """One world or participant to measure, with the cells that are known of it."""
+    """One world to measure, with the cells that are known of it."""
 
     name: str
     truth_sessions: int
@@ -61,54 +58,33 @@ def measure(task: Task) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
     cells: list[dict[str, Any]] = []
     truth = task.known.get(f"{task.name}/truth")
-    case = case_of(task, truth)
+    case = virtual_case(task.name[0], int(task.name[1:]), task.truth_sessions, truth)
     if truth is None:
         cells.append({"key": f"{task.name}/truth", **case.truth})
     for design in task.designs:
         wanted = tuple(m for m in task.methods if f"{task.name}/{design}/{m}" not in task.known)
         if wanted:
-            # the page chooses between what its methods say, so they are all made again where it is wanted
-            again = tuple(m for m in task.methods if PAGE in wanted and m in NEEDED and m not in wanted)
-            cells += design_cells(case, design, (*wanted, *again))
+            cells += design_cells(case, design, wanted)
     return cells
-
-
-def case_of(task: Task, truth: dict[str, Any] | None) -> Case:
-    if task.name in PARTICIPANTS:
-        return participant_case(task.name, task.truth_sessions, truth)
-    return virtual_case(task.name[0], int(task.name[1:]), task.truth_sessions, truth)
 
 
 def design_cells(case: Case, design: str, methods: tuple[str, ...]) -> list[dict[str, Any]]:
-    """One cell per method, and the page's."""
+    """Fit and evaluate each method; one cell a method."""
     buffer, policies = case.data(design), {**case.candidates, **case.probes}
     chosen = {m: e for m, e in estimators(0, demo=True).items() if m in methods}
-    tables: dict[str, Mapping[str, Estimate]] = {}
-    cells = []
-    for method, estimator in chosen.items():
-        cells.append(_method_cell(case, design, method, estimator, buffer, policies, tables))
-    if PAGE not in methods:
-        return cells
-    start = time.process_time()
-    page = page_order(buffer, {m: t for m, t in tables.items() if m in NEEDED}, list(case.candidates), STEPS)
-    seconds = time.process_time() - start
-    known = {"method": page.method, "places": dict(page.places), "seconds": seconds}
-    cells.append({"key": f"{case.name}/{design}/{PAGE}", **_kept(case, page.estimates), **known})
-    return cells
+    return [_method_cell(case, design, method, estimator, buffer, policies) for method, estimator in chosen.items()]
 
 
-def _method_cell(
-    case: Case, design: str, method: str, estimator: Estimator, buffer: Any, policies: Any, tables: dict[str, Mapping[str, Estimate]]
-) -> dict[str, Any]:
+def _method_cell(case: Case, design: str, method: str, estimator: Estimator, buffer: Any, policies: Any) -> dict[str, Any]:
     start = time.process_time()
     try:
-        tables[method] = estimator.fit(buffer).evaluate(policies, STEPS)
+        table = estimator.fit(buffer).evaluate(policies, STEPS)
     except ValueError as error:
         return {"key": f"{case.name}/{design}/{method}", "failed": str(error), "seconds": time.process_time() - start}
-    return {"key": f"{case.name}/{design}/{method}", **_kept(case, tables[method]), "seconds": time.process_time() - start}
+    return {"key": f"{case.name}/{design}/{method}", **_measures(case, table), "seconds": time.process_time() - start}
 
 
-def _kept(case: Case, table: Mapping[str, Estimate]) -> dict[str, Any]:
+def _measures(case: Case, table: Mapping[str, Estimate]) -> dict[str, Any]:
     """What is measured of a method's estimates: those of the candidates, and its answers to sustained dose and to following beta."""
     dose = gain_over(table[case.low], table[CDBS])
     follow = gain_over(table[case.follows], table[MATCHED])
@@ -125,34 +101,25 @@ def _kept(case: Case, table: Mapping[str, Estimate]) -> dict[str, Any]:
 def tasks(chosen: argparse.Namespace, cells: Cells) -> list[Task]:
     """What is to be run, in order."""
     without = chosen.without.split(",")
-    methods = tuple(m for m in (*CHEAP, PAGE) if m not in without)
-    if chosen.participants:
-        return [Task(code, chosen.truth, methods, ("paper",), _of(cells, code)) for code in PARTICIPANTS[: 1 if chosen.quick else None]]
+    methods = tuple(m for m in CHEAP if m not in without)
+    dear = tuple(m for m in DEAR if m not in without)
     result = []
     for index in range(chosen.first, WORLDS_PER_PART, chosen.every)[: chosen.worlds]:
-        with_dlsm = chosen.dlsm and index % DLSM_EVERY == 0
         name = f"{chosen.part}{index:02d}"
-        result.append(
-            Task(
-                name, chosen.truth, (*(m for m in DEAR if m not in without), *methods) if with_dlsm else methods, DESIGNS, _of(cells, name)
-            )
-        )
+        known = {cell["key"]: cell for cell in cells.all(f"{name}/")}
+        all_methods = (*dear, *methods) if chosen.dlsm and index % DLSM_EVERY == 0 else methods
+        result.append(Task(name, chosen.truth, all_methods, DESIGNS, known))
     return result
-
-
-def _of(cells: Cells, name: str) -> dict[str, Any]:
-    return {cell["key"]: cell for cell in cells.all(f"{name}/")}
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--part", choices=("A", "B", "C"), default="A", help="A to develop on, B to report on, C once before a release")
     parser.add_argument("--release", help="the release that a run of part C belongs to")
-    parser.add_argument("--participants", action="store_true", help="the four detailed participants instead of the population")
-    parser.add_argument("--quick", action="store_true", help="three worlds or one participant, few simulated sessions, no DLSM or DualDICE")
+    parser.add_argument("--quick", action="store_true", help="three worlds, few simulated sessions, no DLSM or DualDICE")
     parser.add_argument("--worlds", type=int, default=WORLDS_PER_PART)
     parser.add_argument("--first", type=int, default=0, help="index of the first world")
-    parser.add_argument("--without", default="", help="methods to leave out, with commas; `page` leaves out the baseline")
+    parser.add_argument("--without", default="", help="methods to exclude, with commas")
     parser.add_argument(
         "--no-dlsm", dest="dlsm", action="store_false", help=f"else the DLSM and DualDICE run on every {DLSM_EVERY}th world"
     )
@@ -187,20 +154,19 @@ def run(planned: list[Task], cells: Cells, processes: int, minutes: float) -> No
 def main() -> None:
     """Print tables over worlds and, as the last line, one JSON object."""
     chosen = arguments()
-    kind = "participants" if chosen.participants else chosen.part
     try:
-        look("A" if chosen.participants else chosen.part, " ".join(["ope.py", *sys.argv[1:]]), chosen.release)
+        look(chosen.part, " ".join(["ope.py", *sys.argv[1:]]), chosen.release)
     except LookError as error:
         sys.exit(str(error))
     sys.stdout.write(f"{said()}\n")
     out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-ope-"))
     out.mkdir(parents=True, exist_ok=True)
-    cells = Cells(out / f"cells-{kind}{'-quick' if chosen.quick else ''}.jsonl")
+    cells = Cells(out / f"cells-{chosen.part}{'-quick' if chosen.quick else ''}.jsonl")
     planned = tasks(chosen, cells)
     run(planned, cells, chosen.processes, chosen.minutes)
     measured = [t.name for t in planned if cells.get(f"{t.name}/truth") is not None]
     summary = report(measured, cells, chosen.headline, out / "ope.svg", sys.stdout.write)
-    result = {"name": "ope", "figures": figures(summary, chosen.headline, PAGE), "ratios": {}, "baseline": "page order of 0.1.0"}
+    result = {"name": "ope", "figures": figures(summary, chosen.headline), "ratios": {}, "baseline": "true returns"}
     sys.stdout.write(json.dumps(result) + "\n")
 
 

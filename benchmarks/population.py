@@ -26,6 +26,7 @@ from support.looks import look, said
 from ml.ope.compare.metrics import accuracy
 from ml.ope.linear.estimator import LinearConfig, LinearModel
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
+from ml.population import PARTICIPANTS, run_session, run_sessions
 from ml.population.virtual import (
     MECHANISMS,
     WORLDS_PER_PART,
@@ -39,7 +40,9 @@ from ml.population.virtual import (
 )  # fmt: skip
 from ml.population.virtual.world import PAUSE_H, STEPS, visit_plan
 
-REQUIRED = 20_000
+REQUIRED, REQUIRED_COHORT = 20_000, 2000
+"""Sessions of a virtual patient per CPU minute; simulated seconds of a detailed participant per CPU second."""
+SETTLE_AND_LEAD_S = 2.0 * (5 + 10)
 DESIGNS = ("paper", "stratified", "ladder")
 VISITS = (1, 2, 3)
 POLICY = ProportionalPolicy(0.6, 1.6, 0.3, 5)
@@ -63,6 +66,18 @@ def speed() -> dict[str, float]:
     readable = float(np.mean([sessions_per_cpu_minute(k, 50, readable=True) for k in range(len(MECHANISMS))]))
     print(f"{'equations':<14}{readable:>26,.0f}   (readable twin, 50 sessions at a time)")
     return found | {"readable": readable}
+
+
+def cohort_speed() -> float:
+    """Measure simulated seconds per CPU second of the slowest detailed participant."""
+    run_session("P1", "random", seed=0, steps=2)  # compile
+    found = {}
+    for code in PARTICIPANTS:
+        started = time.process_time()
+        run_sessions(code, "random", seeds=np.arange(8), study_seed=np.arange(8), steps=STEPS)
+        found[code] = 8 * (2.0 * STEPS + SETTLE_AND_LEAD_S) / (time.process_time() - started)
+    print("simulated s per CPU s: " + ", ".join(f"{code} {speed:,.0f}" for code, speed in found.items()))
+    return min(found.values())
 
 
 def describe(part: str, indices: list[int], sessions: int) -> dict[str, float]:
@@ -152,14 +167,16 @@ def main() -> None:
     look(chosen.part, " ".join(["population.py", *sys.argv[1:]]))
     print(said())
     figures = {f"sessions_per_cpu_minute_{k}": round(v) for k, v in speed().items()}
+    figures["cohort_s_per_cpu_s"] = round(cohort_speed())
     every = list(range(WORLDS_PER_PART))
     result: dict[str, Any] = dict(figures) | describe(chosen.part, every[:: chosen.every] if chosen.quick else every, chosen.truth)
     if not chosen.quick:
         out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-population-"))
         out.mkdir(parents=True, exist_ok=True)
         result |= designs(chosen.part, every[:: chosen.every], chosen.truth, out / "designs.svg")
-    slowest = min(v for k, v in figures.items() if not k.endswith("readable"))
-    ratios = {"slowest_to_required": slowest / REQUIRED, "kernel_to_readable": slowest / figures["sessions_per_cpu_minute_readable"]}
+    slowest = min(v for k, v in figures.items() if k.startswith("sessions") and not k.endswith("readable"))
+    ratios = {"slowest_to_required": slowest / REQUIRED, "cohort_to_required": figures["cohort_s_per_cpu_s"] / REQUIRED_COHORT}
+    ratios |= {"kernel_to_readable": slowest / figures["sessions_per_cpu_minute_readable"]}
     print(
         json.dumps({"name": "population", "figures": result, "ratios": ratios, "baseline": {"required_sessions_per_cpu_minute": REQUIRED}})
     )

@@ -5,15 +5,12 @@
 `ddpg_vs_eager`: one DDPG update of `ml.rl.algorithms.ddpg` against the loop as usually written in PyTorch (below), 400x300, batches of
 64 and 256.
 `six_vs_eager`: six policies side by side against six such loops, batch 64.
-`ddpg_vs_d3rlpy`: one update against d3rlpy's DDPG at batch 256, where d3rlpy is installed (the `bench` extra).
-`ddpg_of_products`: share of the update's time that its matrix products alone take, in their own shapes, batch 256.
 `--six` trains six policies for 10 000 updates at batch 64 in two processes of three and distils them; wall and CPU seconds.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import multiprocessing
 import resource
@@ -96,67 +93,6 @@ def own_stepper(data: dict[str, Any], batch: int, members: int = 1) -> Callable[
     return step
 
 
-class Products:
-    """The matrix products of one network's passes and nothing else: its own shapes, layouts and operands, results into kept memory."""
-
-    def __init__(self, members: int, batch: int) -> None:
-        a, b = TEACHER_HIDDEN
-        self.layers = []
-        for inputs, outputs in ((WINDOW, a), (a, b), (b, 1)):
-            x, w, dy = (torch.rand(members, *shape) for shape in ((batch, inputs), (outputs, inputs), (batch, outputs)))
-            self.layers.append((x, w, dy, torch.empty_like(dy), torch.empty_like(w), torch.empty_like(x)))
-
-    def forward(self) -> None:
-        for x, w, _, y, _, _ in self.layers:
-            torch.bmm(x, w.transpose(1, 2), out=y)
-
-    def backward(self) -> None:
-        """By the weights of every layer, by the inputs of the second and third."""
-        for i, (x, w, dy, _, dw, dx) in enumerate(self.layers):
-            torch.bmm(dy.transpose(1, 2), x, out=dw)
-            if i > 0:
-                torch.bmm(dy, w, out=dx)
-
-    def back_to_the_action(self) -> None:
-        """The action joins at the second layer: only the last one is passed."""
-        _, w, dy, _, _, dx = self.layers[-1]
-        torch.bmm(dy, w, out=dx)
-
-
-def products_stepper(batch: int, members: int = 1) -> Callable[[], None]:
-    """The matrix products of one update of DDPG, in its order."""
-    target_actor, target_critic, critic, actor = (Products(members, batch) for _ in range(4))
-
-    def step() -> None:
-        target_actor.forward()
-        target_critic.forward()
-        critic.forward()
-        critic.backward()
-        actor.forward()
-        critic.forward()
-        critic.back_to_the_action()
-        actor.backward()
-
-    return step
-
-
-def d3rlpy_stepper(data: dict[str, Any], batch: int) -> Callable[[], None]:
-    """d3rlpy's DDPG: sampling and update, without its logging."""
-    import d3rlpy
-
-    rows = 300
-    episodes = [
-        d3rlpy.dataset.Episode(*(data[k][i : i + rows].numpy() for k in ("s", "a", "r")), terminated=False) for i in range(0, ROWS, rows)
-    ]
-    buffer = d3rlpy.dataset.ReplayBuffer(d3rlpy.dataset.InfiniteBuffer(), episodes=episodes)
-    factory = d3rlpy.models.VectorEncoderFactory(hidden_units=list(TEACHER_HIDDEN))
-    algo = d3rlpy.algos.DDPGConfig(
-        batch_size=batch, gamma=GAMMA, tau=TAU, actor_encoder_factory=factory, critic_encoder_factory=factory
-    ).create(device="cpu:0")
-    algo.build_with_dataset(buffer)
-    return lambda: algo.update(buffer.sample_transition_batch(batch)) and None
-
-
 def cpu_ms(step: Callable[[], None], steps: int) -> float:
     """CPU milliseconds per call."""
     start = time.process_time()
@@ -233,39 +169,22 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     data = {"s": torch.randn(ROWS, WINDOW), "a": torch.rand(ROWS, 1), "r": torch.randn(ROWS, 1), "s2": torch.randn(ROWS, WINDOW)}
-    has_d3rlpy = importlib.util.find_spec("d3rlpy") is not None
-
     figures: dict[str, Any] = {}
     ratios: dict[str, float] = {}
-    print(f"{'DDPG 400x300':<34}{'batch':>6}{'CPU ms/update':>16}{'updates/s':>12}{'of products':>14}")
+    print(f"{'DDPG 400x300':<34}{'batch':>6}{'CPU ms/update':>16}{'updates/s':>12}")
     for batch in BATCHES:
         eager = EagerDdpg(data)
-        steppers = {
-            "eager": lambda eager=eager, batch=batch: eager.step(batch),
-            "ours": own_stepper(data, batch),
-            "products": products_stepper(batch),
-        }
-        if has_d3rlpy:
-            steppers["d3rlpy"] = d3rlpy_stepper(data, batch)
+        steppers = {"eager": lambda eager=eager, batch=batch: eager.step(batch), "ours": own_stepper(data, batch)}
         if batch == SIX_BATCH:
             steppers["six of ours"] = own_stepper(data, batch, 6)
         medians = in_turn(steppers, options.steps, options.repeats)
         for name, ms in medians.items():
             each = ms / 6 if name == "six of ours" else ms  # per policy
             figures[f"{name.replace(' ', '_')}_batch{batch}_ms"] = ms
-            print(f"{name + ' (each)' * (each != ms):<34}{batch:>6}{each:>16.2f}{1e3 / each:>12.0f}{medians['products'] / each:>14.0%}")
+            print(f"{name + ' (each)' * (each != ms):<34}{batch:>6}{each:>16.2f}{1e3 / each:>12.0f}")
         ratios[f"ddpg_vs_eager_batch{batch}"] = medians["eager"] / medians["ours"]
-        ratios[f"ddpg_of_products_batch{batch}"] = medians["products"] / medians["ours"]
-        if has_d3rlpy:
-            ratios[f"ddpg_vs_d3rlpy_batch{batch}"] = medians["d3rlpy"] / medians["ours"]
         if batch == SIX_BATCH:
             ratios["six_vs_eager"] = 6 * medians["eager"] / medians["six of ours"]
-    ratios["ddpg_vs_eager"] = ratios[f"ddpg_vs_eager_batch{SIX_BATCH}"]
-    ratios["ddpg_of_products"] = ratios["ddpg_of_products_batch256"]
-    if has_d3rlpy:
-        ratios["ddpg_vs_d3rlpy"] = ratios["ddpg_vs_d3rlpy_batch256"]
-    else:
-        print("d3rlpy is not installed (the `bench` extra): ddpg_vs_d3rlpy was NOT measured")
     for name, ratio in ratios.items():
         print(f"{name:<34}{ratio:>6.2f}")
     if options.six:
@@ -279,8 +198,7 @@ def main() -> None:
             print(f"{size + ', ' + runtime:<34}{timing['median_us']:>12.1f}{timing['p99_us']:>12.1f}")
     ratios["student_vs_teacher_onnxruntime"] = figures["teacher_onnxruntime"]["median_us"] / figures["student_onnxruntime"]["median_us"]
 
-    baseline = "eager PyTorch DDPG" + ("; d3rlpy DDPG" if has_d3rlpy else "; d3rlpy is not installed")
-    print(json.dumps({"name": "rl", "figures": figures, "ratios": ratios, "baseline": baseline}))
+    print(json.dumps({"name": "rl", "figures": figures, "ratios": ratios, "baseline": "eager PyTorch DDPG"}))
 
 
 if __name__ == "__main__":

@@ -188,7 +188,7 @@ def tree() -> tuple[str, ...]:
 
 
 def named_paths(text: str) -> Iterator[tuple[str, str | None]]:
-    """(path, name in it) that a piece of code names: `ml/qoc.py`, `app/study`, `traces.py: step_table`, `dlsm*.py`."""
+    """(path, name in it) that a piece of code names: `ml/qoc.py`, `app/study`, `traces.py: step_table`, `rl*.py`."""
     folders = "|".join(map(re.escape, CODE_FOLDERS))
     for match in re.finditer(
         rf"(?<![\w/.$-])((?:{folders})/[\w./*-]+|[\w*-]+\.(?:{'|'.join(SUFFIXES)}))(?!\w|\.\w)(?::{{1,2}} ?([A-Za-z_]\w*))?", text
@@ -323,7 +323,7 @@ def test_what_does_not_exist_is_found(markdown: str, says: str) -> None:
         "`betaloop import PATH --participant CODE` and `betaloop` and `betaloop ingest redecode` · `resume`",
         "`make test`, `GET /api/v1/bundle-key`, `PATCH /proposals/{session_id}`, `POST …/confirm`, `/discard`, `/api/v1/openapi.json`",
         '```\ncurl $API/participants/P9/jobs -d \'{"kind": "pipeline"}\'\ncurl -X PUT $API/sessions/1/qoc\n```',
-        "BETALOOP_DATA_DIR `ml/mdp.py: step_reward` `mdp.py` `dlsm*.py` `app/study` `ml.mdp.MdpSettings` [x](docs/population/cohort.md)",
+        "BETALOOP_DATA_DIR `ml/mdp.py: step_reward` `mdp.py` `rl*.py` `app/study` `ml.mdp.MdpSettings` [x](docs/population/cohort.md)",
         "`sheet.html`, `/srv/betaloop`, `t_s <= 0`, `amplitude/cDBS`, `betaloop.study`",
     ],
 )

@@ -1,8 +1,6 @@
 """What three visits teach: six policies by the default sweep on virtual patients, the posterior's first of them, and the best by truth.
 
     python -m benchmarks.evaluation.learned --worlds 12 --out FOLDER             every fifth world of part A; resumable
-    python -m benchmarks.evaluation.learned --memory                             critics that see past amplitudes, and those that do not
-    python -m benchmarks.evaluation.learned --anchors both,all                   held near two amplitudes, or also near the best constant
     python -m benchmarks.evaluation.learned --updates 2000 --minutes 20          shorter trainings; no further world after so long
     python -m benchmarks.evaluation.learned --untrained --every 4 --worlds 15    the dose alone that the anchor `best` holds a policy near
     python -m benchmarks.evaluation.learned --quick                              one world, few updates and simulated sessions
@@ -31,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from app.learning.schemas import DEFAULT_SWEEP, Anchor, TrainParams
+from app.learning.schemas import DEFAULT_SWEEP, TrainParams
 from app.learning.sweeps.comparison import held_near
 from app.learning.training.compute import hold_out, supported_best, with_best_anchor
 from app.learning.training.configs import training_groups
@@ -47,28 +45,24 @@ from ml.trajectories import ReplayBuffer
 POLICIES, TRUTH, EVERY, SAVED = 6, 150, 5, 0.2
 QUICK_UPDATES, QUICK_TRUTH = 50, 40
 DESIGNS: tuple[DataDesign, ...] = ("stratified", "paper")
-ANCHORS: tuple[Anchor, ...] = ("both", "all")
 
 
 class Arm(NamedTuple):
     """How data are made and policies trained; not `trained`, the dose alone that they would be held near."""
 
     design: DataDesign
-    memory: bool
-    anchor: Anchor
     trained: bool = True
 
     @property
     def key(self) -> str:
         """Its name in files and lines."""
-        return f"{self.design} {'memory' if self.memory else 'window'} {self.anchor}" if self.trained else f"{self.design} untrained"
+        return self.design if self.trained else f"{self.design} untrained"
 
 
-def sweep(buffer: ReplayBuffer, arm: Arm, updates: int | None) -> dict[str, Policy]:
+def sweep(buffer: ReplayBuffer, updates: int | None) -> dict[str, Policy]:
     """Six policies as a sweep of the service trains them."""
     found: dict[str, Policy] = {}
-    asked = DEFAULT_SWEEP | {"critic_memory": arm.memory, "anchor": arm.anchor}
-    for group in training_groups(TrainParams(preset="quick", count=POLICIES, updates=updates, **asked), [None] * POLICIES):
+    for group in training_groups(TrainParams(preset="quick", count=POLICIES, updates=updates, **DEFAULT_SWEEP), [None] * POLICIES):
         given = with_best_anchor(group["configs"], buffer, margins=None)
         configs = [rl.algorithm(group["algorithm"]).config.from_json(one) for one in given]
         learnt, held = hold_out(buffer, wanted=True, every=max(1, configs[0].updates // 10))
@@ -89,7 +83,7 @@ def cell(w: World, arm: Arm, updates: int | None, truth: int) -> dict[str, Any]:
     if not is_responder({name: w.truth(policy, truth) for name, policy in simple_policies(w.settings, w.spread).items()}, cdbs):
         return {"responder": False, "policies": {}}
     buffer = w.data(arm.design)
-    policies = sweep(buffer, arm, updates) if arm.trained else anchor_alone(buffer)
+    policies = sweep(buffer, updates) if arm.trained else anchor_alone(buffer)
     gains = gains_over_cdbs(buffer, policies)
     rows = {}
     for name, policy in policies.items():
@@ -153,12 +147,8 @@ def differences(cells: dict[str, dict[str, Any]], others: dict[str, dict[str, An
 
 
 def arms(chosen: argparse.Namespace) -> list[Arm]:
-    """What is asked for."""
-    if chosen.untrained:
-        return [Arm(d, False, "best", trained=False) for d in DESIGNS if d in chosen.designs.split(",")]
-    memories = (False, True) if chosen.memory else (bool(DEFAULT_SWEEP["critic_memory"]),)
-    anchors = [a for a in ANCHORS if a in chosen.anchors.split(",")]
-    return [Arm(d, m, a) for d in DESIGNS if d in chosen.designs.split(",") for m in memories for a in anchors]
+    """List the arms that the options name."""
+    return [Arm(d, trained=not chosen.untrained) for d in DESIGNS if d in chosen.designs.split(",")]
 
 
 def trained(chosen: argparse.Namespace, of: list[Arm]) -> dict[str, dict[str, dict[str, Any]]]:
@@ -190,8 +180,6 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=12)
     parser.add_argument("--every", type=int, default=EVERY, help="take every so manyth world")
     parser.add_argument("--designs", default="stratified", help="with commas: stratified, paper")
-    parser.add_argument("--anchors", default=DEFAULT_SWEEP["anchor"], help="with commas: both, all")
-    parser.add_argument("--memory", action="store_true", help="critics that see past amplitudes, and those that do not")
     parser.add_argument("--untrained", action="store_true", help="the dose alone that policies would be held near")
     parser.add_argument("--updates", type=int, help="of every training; those of the preset by default")
     parser.add_argument("--minutes", type=float, default=1e9, help="start no further training after so many minutes")

@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 from benchmarks.support.cells import Cells
 from benchmarks.support.figure import Point, draw_curves
 from benchmarks.support.looks import look, said
-from benchmarks.support.ope_cases import CDBS, STEPS, virtual_case
+from benchmarks.support.ope_cases import CDBS, virtual_case
 from ml.designs import near_session
 from ml.mdp import step_reward
 from ml.ope.estimate import Estimate
@@ -54,7 +54,7 @@ from ml.ope.registry import estimators
 from ml.policies.policy import ConstantPolicy, Policy
 from ml.population.virtual import WORLDS_PER_PART, World, visit_days, world
 from ml.population.virtual.sessions import Days
-from ml.population.virtual.world import Part
+from ml.population.virtual.world import STEPS, Part
 from ml.qoc import Margins, Qoc
 from ml.statistics.bootstrap import percentile_interval
 from ml.trajectories import Hold, ReplayBuffer, SessionTrajectory

@@ -27,14 +27,14 @@ import torch
 
 from benchmarks.support.cells import Cells
 from benchmarks.support.looks import look, said
-from benchmarks.support.ope_cases import CDBS, DESIGNS, STEPS, Case, virtual_case
+from benchmarks.support.ope_cases import CDBS, DESIGNS, Case, virtual_case
 from ml.ope.compare.metrics import spearman
 from ml.ope.posterior.estimator import build
 from ml.ope.posterior.verdict import Levels, verdict
 from ml.outcomes import PREDICTED
 from ml.population.virtual import WORLDS_PER_PART, DataDesign, World, world
 from ml.population.virtual.sessions import Days
-from ml.population.virtual.world import MARGINS, VISITS, visit_plan
+from ml.population.virtual.world import MARGINS, STEPS, VISITS, visit_plan
 from ml.qoc import Margins, Qoc
 from ml.trajectories import ReplayBuffer
 

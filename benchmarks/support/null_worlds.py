@@ -152,21 +152,6 @@ def tremor_effect(world: World, points: float) -> float:
     return float(brentq(lambda e: tremor(e, float(np.hypot(alone, world.slope))) - tremor(0.0, alone) - points, -20.0, 20.0))
 
 
-def nothing_to_test() -> dict[str, Measurements]:
-    """Studies that hold nothing to test."""
-    visit, arms = np.repeat(np.arange(5), 4), np.tile([False, True], 10)
-    nan = np.full(20, np.nan)
-    return {
-        "all tied": Measurements.of(np.ones(20), visit, arms),
-        "one session": Measurements.of([1.0], [1], [True]),
-        "nothing": Measurements.of([], [], []),
-        "no value": Measurements.of(nan, visit, arms),
-        "one visit": Measurements.of(np.arange(20.0), np.zeros(20), arms),
-        "one arm": Measurements.of(np.arange(20.0), visit, np.zeros(20)),
-        "arms apart": Measurements.of(np.arange(20.0), visit, visit % 2 == 0),
-    }
-
-
 class Tally:
     """Shares of studies, each with its number."""
 

@@ -1,4 +1,4 @@
-"""What the evaluation benchmark measures on: a world or a participant with its data, its policies and what is true of them."""
+"""Cases of the evaluation benchmarks: a virtual patient with its data, its policies and their true returns."""
 
 from __future__ import annotations
 
@@ -10,15 +10,11 @@ import numpy as np
 
 from ml.policies.policy import ConstantPolicy, Policy
 from ml.population.virtual import Truth, is_responder, simple_policies, world
-from ml.population.virtual.world import STEPS, VISITS, visit_plan
+from ml.population.virtual.world import VISITS, visit_plan
 from ml.trajectories import ReplayBuffer
-
-from .ope_policies import fixed_policies
-from .simulators import WORLDS as SIMULATORS
 
 CDBS, MATCHED = "cDBS", "matched constant"
 DESIGNS = ("stratified", "paper")
-PARTICIPANT_VISITS = 3
 
 
 @dataclass(frozen=True)
@@ -75,40 +71,6 @@ def virtual_case(part: str, index: int, sessions: int, known: dict[str, Any] | N
     return Case(f"{part}{index:02d}", candidates, {**probes, MATCHED: matched}, low, follows, truth, lambda d: w.data(d))  # type: ignore[arg-type]
 
 
-def participant_case(code: str, sessions: int, known: dict[str, Any] | None = None) -> Case:
-    """A detailed participant with data by the paper's design; the keys of `truth` as above, without a responder."""
-    simulator = SIMULATORS[code]()
-    candidates = fixed_policies(simulator.settings.xi_beta)
-    probes = {CDBS: ConstantPolicy(1.0), MATCHED: ConstantPolicy(0.6)}
-    truth = known
-    if truth is None:
-        found = {n: simulator.truth(p, sessions) for n, p in (candidates | probes).items()}
-        there = {n: simulator.truth_on_days(p, 0, PARTICIPANT_VISITS, sessions // 2) for n, p in candidates.items()}
-        flat = float(np.ptp([found[n].total for n in candidates])) < 2 * float(np.mean([t.standard_error for t in found.values()]))
-
-        def pair(first: str, second: str) -> list[float]:
-            error = float(np.hypot(found[first].standard_error, found[second].standard_error))
-            return [found[first].total - found[second].total, error]
-
-        truth = {
-            "policies": {
-                n: {"total": [t.total, t.standard_error], "returns_sd": t.standard_error * np.sqrt(sessions)} for n, t in found.items()
-            },
-            "on_days": {n: {"total": [t.total, t.standard_error]} for n, t in there.items() if t is not None},
-            "dose": pair("constant 0.40", CDBS),
-            "follow": pair("proportional fast", MATCHED),
-            "responder": True,
-            "mechanism": "participant",
-            "silent": False,
-            "flat": flat,
-            "sessions": len(simulator.data(0, PARTICIPANT_VISITS).sessions),
-        }
-    return Case(code, candidates, probes, "constant 0.40", "proportional fast", truth, lambda _: simulator.data(0, PARTICIPANT_VISITS))
-
-
 def _difference(first: Truth, second: Truth) -> list[float]:
     gap = first.returns - second.returns
     return [float(gap.mean()), float(gap.std(ddof=1) / np.sqrt(gap.size))]
-
-
-__all__ = ["CDBS", "DESIGNS", "MATCHED", "STEPS", "Case", "participant_case", "virtual_case"]

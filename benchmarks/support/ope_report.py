@@ -16,7 +16,7 @@ from .worlds_figure import draw_worlds
 
 DESIGNS = ("stratified", "paper")
 ORACLES = ("days alone", "tested")
-METHODS = ("posterior", "page", "linear", "impulse", "fqe", "wdr", "dlmm", "pdis", "wis", "cwpdis", "dual_dice", "dlsm")
+METHODS = ("posterior", "linear", "impulse", "fqe", "wdr", "dlmm", "pdis", "wis", "cwpdis", "dual_dice", "dlsm")
 METRICS = ("rank", "regret", "sharpe", "mae", "interval score", "width", "coverage", "worst first")
 SHOWN = (*METRICS, "supported")
 LOW_IS_WORSE = ("rank", "sharpe", "coverage", "supported")
@@ -105,8 +105,7 @@ def _add(row: Row, name: str, truth: dict[str, Any], cell: dict[str, Any], candi
     if "failed" in cell:
         row.failed += 1
         return
-    places = [cell["places"][n] for n in candidates] if "places" in cell else None
-    row.add(name, world_scores(v, [cell["estimates"][n] for n in candidates], cdbs, places))
+    row.add(name, world_scores(v, [cell["estimates"][n] for n in candidates], cdbs))
     dose = Told(*cell["dose"], *truth["dose"])
     row.dose.append(dose)
     row.follow.append(Told(*cell["follow"], *truth["follow"]))
@@ -189,8 +188,8 @@ def _at(row: Row, name: str, metric: str) -> float:
     return float("nan") if value is None else value
 
 
-def figures(summary: Summary, headline: str, page: str) -> dict[str, float | None]:
-    """The figures of the last line: of the headline's method with the new design, with the paper's (`_paper`), and the baseline."""
+def figures(summary: Summary, headline: str) -> dict[str, float | None]:
+    """The figures of the last line: of the headline's method with the stratified design, and with the paper's (`_paper`)."""
     result: dict[str, float | None] = {}
     for design, suffix in (("stratified", ""), ("paper", "_paper")):
         row = summary.get((design, headline), Row())
@@ -207,5 +206,4 @@ def figures(summary: Summary, headline: str, page: str) -> dict[str, float | Non
             "worst_first_confident": row.summary("worst first")["mean"],
         }
         result |= {"n_worlds" + suffix: float(len(row.worlds))} | {k + suffix: v for k, v in named.items()}
-    result["rank_mean_0_1_0"] = summary.get(("paper", page), Row()).summary("rank")["mean"]
     return {k: None if v is None or math.isnan(v) else v for k, v in result.items()}

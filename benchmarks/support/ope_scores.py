@@ -54,36 +54,32 @@ def interval_score(low: np.ndarray, high: np.ndarray, truth: np.ndarray) -> np.n
     return (high - low) + penalty * np.maximum(low - truth, 0) + penalty * np.maximum(truth - high, 0)
 
 
-def world_scores(
-    truth: Sequence[float], estimates: Sequence[Mapping[str, Any]], cdbs: float, places: Sequence[int] | None = None
-) -> dict[str, float | None]:
+def world_scores(truth: Sequence[float], estimates: Sequence[Mapping[str, Any]], cdbs: float) -> dict[str, float | None]:
     """Metrics over all candidates of one world and, with " supported" behind their names, over those that the method supports.
 
     The latter are None below three of them, and where their true returns do not differ.
 
     Args:
         truth: true returns on new days, [P]. estimates: `value, low, high, supported` of each. cdbs: true return of cDBS.
-        places: order that a page gives, 1 is first; the order of the values by default.
     """
     supported = np.array([bool(e.get("supported", True)) for e in estimates])
-    v, order = np.asarray(truth, dtype=np.float64), None if places is None else -np.asarray(places, dtype=np.float64)
-    whole = _scores(v, estimates, cdbs, order)
+    v = np.asarray(truth, dtype=np.float64)
+    whole = _scores(v, estimates, cdbs)
     few = supported.sum() < FEWEST_SUPPORTED or np.ptp(v[supported]) == 0
     chosen = [e for e, kept in zip(estimates, supported, strict=True) if kept]
-    part = dict.fromkeys(whole) if few else _scores(v[supported], chosen, cdbs, None if order is None else order[supported])
+    part = dict.fromkeys(whole) if few else _scores(v[supported], chosen, cdbs)
     return {**whole, **{f"{metric} supported": value for metric, value in part.items()}, "supported": float(supported.mean())}
 
 
-def _scores(v: np.ndarray, estimates: Sequence[Mapping[str, Any]], cdbs: float, order: np.ndarray | None) -> dict[str, float]:
-    """Metrics over candidates of true returns [P]; their order is that of the estimates unless it is given."""
+def _scores(v: np.ndarray, estimates: Sequence[Mapping[str, Any]], cdbs: float) -> dict[str, float]:
+    """Score candidates of true returns [P], ordered by their estimates."""
     said, low, high = (np.array([e[k] for e in estimates], dtype=np.float64) for k in ("value", "low", "high"))
-    order = said if order is None else order
     spread = float(np.ptp(v))
-    top = np.argsort(-order, kind="stable")
+    top = np.argsort(-said, kind="stable")
     first, best = int(top[0]), v[top[:TOP]]
     missed = not low[first] <= v[first] <= high[first]
     return {
-        "rank": spearman(v, order) or 0.0,
+        "rank": spearman(v, said) or 0.0,
         "regret": float(v.max() - v[first]) / spread,
         "sharpe": min(max(best.max() - cdbs, 0.0) / max(float(best.std()), 1e-9), LARGEST_SHARPE),
         "mae": float(np.abs(said - v).mean()) / spread,

@@ -1,4 +1,4 @@
-"""The evaluation benchmark's own arithmetic: scores in closed form, the count of looks, the page's order, and figures out of cells."""
+"""The evaluation benchmark's own arithmetic: scores in closed form, the count of looks, and figures out of cells."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from ml.ope.compare.skill import HeldOut, Prediction, skills
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
@@ -48,12 +46,6 @@ def test_a_confident_reversal_is_named_and_costs_the_range(module):
     assert found["interval score"] == pytest.approx((2 + (20 * 9 * 2) / 3) / 10)
     wide = module("support.ope_scores").world_scores([0.0, 5.0, 10.0], rows([10.0, 5.0, 0.0], 10.0), cdbs=5.0)
     assert wide["worst first"] == 0
-
-
-def test_a_pages_order_counts_before_its_values(module):
-    found = module("support.ope_scores").world_scores([0.0, 5.0, 10.0], rows([9.0, 1.0, 2.0]), cdbs=0.0, places=[3, 2, 1])
-    assert found["rank"] == 1
-    assert found["regret"] == 0
 
 
 def test_unsupported_candidates_count_in_all_and_not_among_supported(module):
@@ -120,71 +112,28 @@ def cells_of(name, values, flat=False):
             "responder": True, "silent": False, "flat": flat, "sessions": 6,
         },
         f"{name}/paper/linear": method,
-        f"{name}/paper/page": method | {"places": {"a": 1, "b": 2, "c": 3}, "method": "linear"},
-        f"{name}/stratified/page": method | {"places": {"a": 3, "b": 2, "c": 1}, "method": "linear"},
+        f"{name}/paper/posterior": method | {"estimates": dict(zip("cba", rows(values), strict=True))},
+        f"{name}/stratified/posterior": method,
     }  # fmt: skip
 
 
-def test_figures_come_from_the_headline_and_the_baseline_from_the_papers_page(module, tmp_path):
+def test_figures_come_from_the_headline_with_both_designs(module, tmp_path):
     cells = Known(cells_of("A00", [0.0, 5.0, 10.0]) | cells_of("A01", [0.0, 5.0, 10.0], flat=True))
     text: list[str] = []
     made = module("support.ope_report")
-    summary = made.report(["A00", "A01"], cells, "page", tmp_path / "ope.svg", text.append)
-    figures = made.figures(summary, "page", "page")
+    summary = made.report(["A00", "A01"], cells, "posterior", tmp_path / "ope.svg", text.append)
+    figures = made.figures(summary, "posterior")
     contract = (
         "n_worlds", "rank_mean", "rank_worst_decile", "regret_mean", "mae_mean", "coverage", "median_width", "interval_score",
         "dose_sign_right", "dose_sign_unknown", "worst_first_confident",
     )  # fmt: skip
-    assert set(figures) == {c + s for c in contract for s in ("", "_paper")} | {"rank_mean_0_1_0"}
-    assert (figures["n_worlds"], figures["rank_mean"], figures["rank_mean_paper"], figures["rank_mean_0_1_0"]) == (1, 1, -1, -1)
+    assert set(figures) == {c + s for c in contract for s in ("", "_paper")}
+    assert (figures["n_worlds"], figures["rank_mean"], figures["rank_mean_paper"]) == (1, 1, -1)
     assert (figures["dose_sign_right"], figures["dose_sign_unknown"], figures["mae_mean"]) == (1, 0, 0)
     assert "A01" in "".join(text)
     assert (tmp_path / "ope.svg").read_text().startswith("<svg")
     dots = (tmp_path / "ope-worlds.svg").read_text()
-    # one world each: the baseline with both designs, linear, and both oracles with both; the flat world stands nowhere
+    # one world each: the posterior with both designs, linear, and both oracles with both; the flat world is excluded
     assert dots.count("<circle") == 7
-    assert "page, paper" in dots
+    assert "posterior, paper" in dots
     assert json.dumps(figures)
-
-
-def test_the_page_puts_unsupported_candidates_last_whatever_their_values(module):
-    from ml.ope.registry import estimators
-    from ml.policies.policy import ConstantPolicy
-    from ml.population.virtual import world
-
-    buffer = world("A", 2).data("paper", visits=1)
-    policies = {"in": ConstantPolicy(0.7), "below": ConstantPolicy(0.15), "high": ConstantPolicy(0.95)}
-    tables = {"linear": estimators(0, demo=True)["linear"].fit(buffer).evaluate(policies, 300)}
-    page = module("support.page_order").page_order(buffer, tables, list(policies), 300)
-    assert page.method == "linear"
-    assert not page.estimates["below"].supported
-    assert page.places["below"] == 3
-    assert {*page.places.values()} == {1, 2, 3}
-
-
-def held(errors):
-    """Predictions of four controllers that return 0, 10, 20 and 30, off by these errors."""
-    rows = tuple(Prediction(m, str(c), 2, 10.0 * c + e, 10.0 * c, 1.0, True) for m, own in errors.items() for c, e in enumerate(own))
-    return HeldOut(tuple(sorted(skills(rows), key=lambda s: s.difference_error)), rows, {})
-
-
-def test_the_lead_over_the_usual_first_is_the_mean_over_pairs_with_a_jackknife_over_controllers(module):
-    errors = {"linear": [0.0, 4.0, -2.0, 1.0], "fqe": [0.0, 1.0, 0.0, 1.0]}
-    rows, lead = held(errors).predictions, module("support.page_order").lead
-
-    def by_hand(names):
-        pairs = [(i, j) for i in names for j in names if i < j]
-        return np.mean([abs(errors["linear"][i] - errors["linear"][j]) - abs(errors["fqe"][i] - errors["fqe"][j]) for i, j in pairs])
-
-    left = np.array([by_hand([c for c in range(4) if c != out]) for out in range(4)])
-    gain, error = lead(rows, "linear", "fqe")
-    assert gain == pytest.approx(by_hand(range(4)))
-    assert error == pytest.approx(np.sqrt(3 / 4 * np.sum((left - left.mean()) ** 2)))
-    assert lead(rows[:2] + rows[4:], "linear", "fqe") == (0.0, float("inf"))
-
-
-def test_a_method_takes_the_place_of_the_usual_first_only_by_more_than_a_standard_error(module):
-    most_skilful = module("support.page_order").most_skilful
-    assert most_skilful(held({"linear": [0.0, 8.0, -6.0, 9.0], "fqe": [0.0] * 4})) == "fqe"
-    assert most_skilful(held({"linear": [0.0, 1.0, 0.0, 0.0], "fqe": [0.5, 0.0, 0.0, 0.0]})) == "linear"
-    assert most_skilful(held({"linear": [0.0, 8.0], "fqe": [0.0, 0.0]})) is None, "two controllers are too few"

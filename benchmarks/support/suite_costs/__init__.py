@@ -1,1 +1,0 @@
-"""What `benchmarks/suite.py` gives to pytest."""
