@@ -15,7 +15,6 @@ import typer
 
 from app.accounts import commands as accounts
 from app.accounts.permissions import SYSTEM
-from app.accounts.studies import commands as studies
 from app.evaluation.ranking import commands as ranking
 from app.ingest import commands as ingest
 from app.overview.package import commands as package
@@ -43,7 +42,7 @@ study_app = typer.Typer(no_args_is_help=True, help="Whole studies.")
 app.add_typer(accounts.user_app, name="user")
 app.add_typer(accounts.token_app, name="token")
 app.add_typer(study_app, name="study")
-studies.register(study_app, accounts.user_app)
+accounts.register(study_app, accounts.user_app)
 closing.register(study_app)
 app.add_typer(participant_app, name="participant")
 simulation.register(study_app)
@@ -96,7 +95,7 @@ def serve(
     """Serve the web pages and the REST interface. Jobs need a worker beside it (`betaloop worker`)."""
     import uvicorn
 
-    from app.accounts.sign_on.provider import configured, provider
+    from app.accounts.sign_on_provider import configured, provider
     from app.ingest.uploads.interrupted import keep_resuming
     from app.main import create_app
     from app.platform.audit.chain import keep_sealing

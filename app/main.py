@@ -37,90 +37,90 @@ log = structlog.get_logger()
 
 DESCRIPTION = "/api/v1/openapi.json"
 
-API_MODULES = (
-    "app.accounts.studies.api",
-    "app.study.api",
-    "app.study.participation.api",
-    "app.study.margins.api",
-    "app.study.characteristics.api",
-    "app.study.doses.api",
-    "app.study.adverse_events.api",
-    "app.study.data_queries.api",
-    "app.study.recordings.api",
-    "app.ingest.uploads.api",
-    "app.ingest.proposals.api",
-    "app.ingest.quarantine.api",
-    "app.ingest.mappings.api",
-    "app.learning.policies.api",
-    "app.learning.snapshots.api",
-    "app.learning.gate.api",
-    "app.learning.sweeps.api",
-    "app.evaluation.ranking.api",
-    "app.evaluation.replay.api",
-    "app.pipeline.api",
-    "app.planning.plans.api",
-    "app.planning.bundles.api",
-    "app.planning.releases.api",
-    "app.planning.visit_day.api",
-    "app.planning.slots.api",
-    "app.analysis.primary.api",
-    "app.analysis.metrics.api",
-    "app.analysis.pooled.api",
-    "app.analysis.evaluations.api",
-    "app.analysis.energy.api",
-    "app.analysis.biomarker.api",
-    "app.analysis.calibration.api",
-    "app.overview.samples.api",
-    "app.overview.signals.api",
-    "app.study.closing.api",
+API_ROUTERS = (
+    "app.accounts.studies_web:api",
+    "app.study.api:router",
+    "app.study.participation.api:router",
+    "app.study.margins.api:router",
+    "app.study.characteristics.api:router",
+    "app.study.doses.api:router",
+    "app.study.adverse_events.api:router",
+    "app.study.data_queries.api:router",
+    "app.study.recordings.api:router",
+    "app.ingest.uploads.api:router",
+    "app.ingest.proposals.api:router",
+    "app.ingest.quarantine.api:router",
+    "app.ingest.mappings.api:router",
+    "app.learning.policies.api:router",
+    "app.learning.snapshots.api:router",
+    "app.learning.gate.api:router",
+    "app.learning.sweeps.api:router",
+    "app.evaluation.ranking.api:router",
+    "app.evaluation.replay.api:router",
+    "app.pipeline.api:router",
+    "app.planning.plans.api:router",
+    "app.planning.bundles.api:router",
+    "app.planning.releases.api:router",
+    "app.planning.visit_day.api:router",
+    "app.planning.slots.api:router",
+    "app.analysis.primary.api:router",
+    "app.analysis.metrics.api:router",
+    "app.analysis.pooled.api:router",
+    "app.analysis.evaluations.api:router",
+    "app.analysis.energy.api:router",
+    "app.analysis.biomarker.api:router",
+    "app.analysis.calibration.api:router",
+    "app.overview.samples.api:router",
+    "app.overview.signals.api:router",
+    "app.study.closing.api:router",
 )
-PAGE_MODULES = (
-    "app.accounts.pages",
-    "app.accounts.sign_on.pages",
-    "app.accounts.studies.pages",
-    "app.study.enrolment.pages",
-    "app.study.settings.pages",
-    "app.study.margins.pages",
-    "app.study.participation.pages",
-    "app.study.closing.pages",
-    "app.study.characteristics.pages",
-    "app.study.doses.pages",
-    "app.study.adverse_events.pages",
-    "app.study.data_queries.pages",
-    "app.study.recordings.pages",
-    "app.study.visits.pages",
-    "app.study.sessions.pages",
-    "app.ingest.uploads.pages",
-    "app.ingest.proposals.pages",
-    "app.ingest.quarantine.pages",
-    "app.ingest.mappings.pages",
-    "app.learning.policies.pages",
-    "app.learning.gate.pages",
-    "app.learning.sweeps.pages",
-    "app.evaluation.ranking.pages",
-    "app.evaluation.replay.pages",
-    "app.evaluation.policies.pages",
-    "app.pipeline.pages",
-    "app.pipeline.next_generation.pages",
-    "app.planning.plans.pages",
-    "app.planning.bundles.pages",
-    "app.planning.visit_day.pages",
-    "app.planning.slots.pages",
-    "app.analysis.primary.pages",
-    "app.analysis.metrics.pages",
-    "app.analysis.pooled.pages",
-    "app.analysis.evaluations.pages",
-    "app.analysis.energy.pages",
-    "app.analysis.biomarker.pages",
-    "app.analysis.calibration.pages",
-    "app.overview.overview",
-    "app.overview.trail.pages",
-    "app.overview.participant",
-    "app.overview.search",
-    "app.overview.reference",
-    "app.overview.saved",
-    "app.overview.package.pages",
-    "app.overview.signals.pages",
+PAGE_ROUTERS = (
+    "app.accounts.pages:router",
+    "app.accounts.sign_on_web:pages",
+    "app.accounts.studies_web:pages",
+    "app.study.enrolment.pages:router",
+    "app.study.settings.pages:router",
+    "app.study.margins.pages:router",
+    "app.study.participation.pages:router",
+    "app.study.closing.pages:router",
+    "app.study.characteristics.pages:router",
+    "app.study.doses.pages:router",
+    "app.study.adverse_events.pages:router",
+    "app.study.data_queries.pages:router",
+    "app.study.recordings.pages:router",
+    "app.study.visits.pages:router",
+    "app.study.sessions.pages:router",
+    "app.ingest.uploads.pages:router",
+    "app.ingest.proposals.pages:router",
+    "app.ingest.quarantine.pages:router",
+    "app.ingest.mappings.pages:router",
+    "app.learning.policies.pages:router",
+    "app.learning.gate.pages:router",
+    "app.learning.sweeps.pages:router",
+    "app.evaluation.ranking.pages:router",
+    "app.evaluation.replay.pages:router",
+    "app.evaluation.policies.pages:router",
+    "app.pipeline.pages:router",
+    "app.pipeline.next_generation.pages:router",
+    "app.planning.plans.pages:router",
+    "app.planning.bundles.pages:router",
+    "app.planning.visit_day.pages:router",
+    "app.planning.slots.pages:router",
+    "app.analysis.primary.pages:router",
+    "app.analysis.metrics.pages:router",
+    "app.analysis.pooled.pages:router",
+    "app.analysis.evaluations.pages:router",
+    "app.analysis.energy.pages:router",
+    "app.analysis.biomarker.pages:router",
+    "app.analysis.calibration.pages:router",
+    "app.overview.overview:router",
+    "app.overview.trail.pages:router",
+    "app.overview.participant:router",
+    "app.overview.search:router",
+    "app.overview.reference:router",
+    "app.overview.saved:router",
+    "app.overview.package.pages:router",
+    "app.overview.signals.pages:router",
 )
 
 
@@ -133,10 +133,17 @@ class _Static(StaticFiles):
         return response
 
 
-def _watched(module: str) -> list[Any]:
-    """What routes of a module depend on beside their own: analyses tell the audit trail who looked at results. Other routes that show some
+def router_of(name: str) -> APIRouter:
+    """Load a router by its name: `module:router`."""
+    module, _, router = name.partition(":")
+    found: APIRouter = getattr(import_module(module), router)
+    return found
+
+
+def _watched(router: str) -> list[Any]:
+    """What routes of a router depend on beside their own: analyses tell the audit trail who looked at results. Other routes that show some
     name it themselves."""
-    return [ResultsViewed] if module.startswith("app.analysis.") else []
+    return [ResultsViewed] if router.startswith("app.analysis.") else []
 
 
 def create_app() -> FastAPI:
@@ -155,11 +162,11 @@ def _built() -> FastAPI:
     )  # fmt: skip
     web.install(app, judge)
     api = APIRouter(prefix="/api/v1")
-    for name in API_MODULES:
-        api.include_router(import_module(name).router, dependencies=_watched(name))
+    for name in API_ROUTERS:
+        api.include_router(router_of(name), dependencies=_watched(name))
     app.include_router(api)
-    for name in PAGE_MODULES:
-        app.include_router(import_module(name).router, include_in_schema=False, dependencies=_watched(name))
+    for name in PAGE_ROUTERS:
+        app.include_router(router_of(name), include_in_schema=False, dependencies=_watched(name))
     app.include_router(_service_routes())
     app.mount("/static/plotly", CompressedFiles(packages=[(plotly.__name__, "package_data")]))
     app.mount("/static", _Static(directory=STATIC))

@@ -95,7 +95,7 @@ PROMISES = [
          f"{SIGNATURES}::test_a_record_that_was_tampered_with_does_not_stand"),
     ),
     *_of(
-        "accounts/signing",
+        "accounts/sign_on",
         ("a signature asks for the password", "        confirm_password(caller.user_id, password, code)\n", "        pass\n",
          f"{SIGNATURES}::test_a_wrong_password_signs_nothing_and_cannot_be_guessed_without_limit"),
         ("a signature asks for the second factor", "confirm_password(caller.user_id, password, code)",
@@ -105,14 +105,14 @@ PROMISES = [
          f"{SIGNED}::test_a_fresh_sign_on_stands_for_the_password_of_one_signature"),
     ),
     *_of(
-        "accounts/sign_on/service",
-        ("one login stands for one signature", "if not repository.use_login(db, link, identity.asked_at):", "if False:",
+        "accounts/sign_on",
+        ("one login stands for one signature", "if not use_login(db, link, identity.asked_at):", "if False:",
          f"{SIGNED}::test_one_login_at_the_provider_stands_for_one_signature"),
         ("nobody else confirms", "if row is None or link.user_id != caller.user_id:", "if row is None:",
          f"{SIGNED}::test_nobody_else_confirms_and_an_old_sign_on_does_not"),
         ("a closed account stays closed to the sign-on", "    if not user.active:\n", "    if False:\n",
          f"{SIGN_ON}::test_a_closed_account_stays_closed"),
-        ("an account belongs to one person there", "if repository.link_of_user(db, user.id, identity.issuer):", "if False:",
+        ("an account belongs to one person there", "if link_of_user(db, user.id, identity.issuer):", "if False:",
          f"{SIGN_ON}::test_an_address_that_was_given_to_somebody_else_opens_no_account"),
         ("look-alikes of an address open no account", "and user.email == address.strip().lower() else None", "else None",
          f"{SIGN_ON}::test_look_alikes_of_an_address_open_no_account"),
@@ -185,7 +185,7 @@ PROMISES = [
     ),
     *_of(
         "accounts/second_factor",
-        ("a code works once", "    row.last_used_at = datetime.fromtimestamp(step * totp.STEP_S, UTC)\n", "",
+        ("a code works once", "    row.last_used_at = datetime.fromtimestamp(step * STEP_S, UTC)\n", "",
          f"{FACTOR}::test_signing_in_needs_a_code_that_was_not_used"),
         ("secrets of second factors are encrypted", "return nonce + AESGCM(_key()).encrypt(nonce, secret, str(user_id).encode())",
          "return nonce + secret", f"{FACTOR}::test_neither_the_database_nor_the_trail_holds_the_secret"),
@@ -216,7 +216,7 @@ PROMISES = [
          f"{LOCKS}::test_whatever_is_not_listed_is_closed_to_blinded_assessors"),
     ),
     *_of(
-        "accounts/studies/service",
+        "accounts/studies",
         ("nobody changes their own role", "    if user.id == caller.user_id:\n", "    if False:\n",
          f"{STUDIES}::test_nobody_changes_the_own_role_and_no_token_gives_one"),
         ("nobody blinds who works in a study of others", "if role is Role.BLINDED_ASSESSOR and not all(", "if False and not all(",
@@ -373,7 +373,7 @@ PROMISES = [
         at_start=True,
     ),
     *_of(
-        "accounts/browser",
+        "accounts/deps",
         ("one source fails a hundred times at most", "    if wait_s := failed_sign_ins.take(source):\n", "    if wait_s := 0:\n",
          f"{LIMITS}::test_many_accounts_tried_from_one_address_are_refused_in_words"),
         ("cookies are out of reach of scripts", "httponly=True", "httponly=False",

@@ -12,12 +12,11 @@ from sqlalchemy.orm import Session
 from starlette.datastructures import FormData
 
 from app.accounts import permissions as can
-from app.accounts import repository, second_factor, service, totp
-from app.accounts.addresses import normal_address
-from app.accounts.browser import SIGNED_OUT, count_try, failed_sign_ins, local_path, signed_in
-from app.accounts.deps import COOKIE, CurrentCaller
+from app.accounts import repository, second_factor, service
+from app.accounts.deps import COOKIE, SIGNED_OUT, CurrentCaller, count_try, failed_sign_ins, local_path, signed_in
 from app.accounts.passwords import AT_ONCE, MIN_PASSWORD
 from app.accounts.permissions import Caller
+from app.accounts.repository import normal_address
 from app.platform.database import Db, now, set_actor, transaction
 from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany, about
 from app.platform.web.bounded import Bounded
@@ -260,11 +259,11 @@ def _managed_user(db: Session, caller: Caller, user_id: int) -> User:
 def _factor(db: Session, user: User) -> dict[str, Any]:
     """Collect what the account's page shows of the second factor; the secret while it is being set up, in groups to type."""
     secret = second_factor.pending_secret(db, user.id)
-    shown = totp.base32(secret) if secret else ""
+    shown = second_factor.base32(secret) if secret else ""
     return {
         "on": second_factor.wanted(db, user.id),
         "secret": " ".join(shown[i : i + 4] for i in range(0, len(shown), 4)),
-        "address": totp.address(secret, user.email) if secret else "",
+        "address": second_factor.address(secret, user.email) if secret else "",
         "recovery": second_factor.RECOVERY_CODES,
         "recovery_left": second_factor.recovery_codes_left(db, user.id),
     }

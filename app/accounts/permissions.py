@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
@@ -138,7 +139,7 @@ class Caller:
 
     @property
     def is_blinded(self) -> bool:
-        """True where the caller is a blinded assessor anywhere: then only what `app.accounts.blinded` lists is open to them."""
+        """True where the caller is a blinded assessor anywhere: then only what `app.accounts.permissions` lists is open to them."""
         return any(g.role is Role.BLINDED_ASSESSOR for g in self.grants)
 
     @property
@@ -149,3 +150,43 @@ class Caller:
 
 
 SYSTEM = Caller(label="system", user_id=None, grants=(), is_system=True)
+
+
+# Pages and routes open to a blinded assessor. Everything else is closed, so that a new page or route cannot give a controller away by
+# mistake.
+
+OPEN = (
+    ("GET", "/"),
+    ("GET", "/account"),
+    ("POST", "/account/.*"),
+    ("POST", "/sign-out"),
+    ("GET", "(/api/v1)?/participants"),
+    ("GET", "(/api/v1)?/participants/[^/]+"),
+    ("GET", "(/api/v1)?/participants/[^/]+/visits"),
+    ("GET", "(/api/v1)?/participants/[^/]+/analyses(/.*)?"),
+    ("GET", "(/api/v1)?/analyses(/.*)?"),
+    ("GET", "/trial-time"),
+    ("GET", "/glossary"),
+    ("GET", "/energy-saved"),
+    ("GET", "/api-reference"),
+    ("GET", "/api/v1/openapi.json"),
+    ("GET", "(/api/v1)?/visits/[0-9]+"),
+    ("GET", "/api/v1/visits/[0-9]+/(sessions|locks)"),
+    ("GET", "(/api/v1)?/sessions/[0-9]+"),
+    ("GET", "/api/v1/sessions/[0-9]+/(qoc|outcomes|trace)"),
+    ("PUT", "/api/v1/sessions/[0-9]+/qoc"),
+    ("POST", "/sessions/[0-9]+/qoc"),
+    ("POST", "/api/v1/participants/[^/]+/adverse-events"),
+    ("GET", "/visit-day/(key|[0-9]+)"),
+    ("POST", "/visit-day/[0-9]+"),
+    ("GET", "/api/v1/visits/[0-9]+/day(/entries)?"),
+    ("POST", "/api/v1/visits/[0-9]+/day/entries"),
+)
+"""Method and path, as a regular expression. What these show of a visit that is not locked goes through `app.study.blinding`."""
+
+_PATTERNS = [(method, re.compile(path)) for method, path in OPEN]
+
+
+def is_open(method: str, path: str) -> bool:
+    """Decide whether a blinded assessor may call this."""
+    return any(m == ("GET" if method == "HEAD" else method) and p.fullmatch(path) for m, p in _PATTERNS)

@@ -6,19 +6,67 @@ none.
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import hmac
 import secrets
 from datetime import UTC, datetime
 
+import pyotp
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from sqlalchemy.orm import Session
 
-from app.accounts import totp
 from app.platform.database import now
 from app.platform.errors import Conflict, Invalid
 from app.settings import get_settings
 from app.tables.accounts import SecondFactor, User
+
+# One-time codes by time (RFC 6238) with the settings of every authenticator app: SHA-1, six digits, steps of 30 s.
+
+STEP_S = 30
+SECRET_BYTES = 20
+_DRIFT_STEPS = 1
+"""Steps by which a phone's clock may be off."""
+
+
+def new_secret() -> bytes:
+    """Draw a random secret."""
+    return secrets.token_bytes(SECRET_BYTES)
+
+
+def code_of(secret: bytes, step: int) -> str:
+    """Compute the code of a time step."""
+    return _codes(secret).generate_otp(step)
+
+
+def step_at(unix_s: float) -> int:
+    """Compute the time step of a moment."""
+    return int(unix_s // STEP_S)
+
+
+def matching_step(secret: bytes, code: str, unix_s: float, after: int = -1) -> int | None:
+    """Find the time step of a code. Steps up to `after` are excluded, so that no code works twice; None where it fits no other."""
+    typed = "".join(code.split())
+    found = None
+    for step in range(step_at(unix_s) - _DRIFT_STEPS, step_at(unix_s) + _DRIFT_STEPS + 1):
+        if step > after and hmac.compare_digest(code_of(secret, step).encode(), typed.encode()):
+            found = step
+    return found
+
+
+def base32(secret: bytes) -> str:
+    """Write the secret as an app takes it by hand."""
+    return base64.b32encode(secret).decode().rstrip("=")
+
+
+def address(secret: bytes, email: str) -> str:
+    """Build the `otpauth` address that sets an app up."""
+    return _codes(secret).provisioning_uri(name=email, issuer_name="betaloop")
+
+
+def _codes(secret: bytes) -> pyotp.TOTP:
+    return pyotp.TOTP(base32(secret), interval=STEP_S)
+
 
 RECOVERY_CODES = 10
 _NONCE_BYTES = 12
@@ -33,7 +81,7 @@ def begin(db: Session, user: User) -> bytes:
     row = db.get(SecondFactor, user.id)
     if row is not None and row.confirmed_at is not None:
         raise Conflict("You have a second factor already.", "Remove it first to set up another.")
-    secret = totp.new_secret()
+    secret = new_secret()
     if row is None:
         db.add(SecondFactor(user_id=user.id, sealed_secret=_seal(secret, user.id), recovery=[]))
     else:
@@ -107,11 +155,11 @@ def _locked(db: Session, user_id: int) -> SecondFactor | None:
 
 
 def _takes_code(row: SecondFactor, code: str) -> bool:
-    used = -1 if row.last_used_at is None else totp.step_at(row.last_used_at.timestamp())
-    step = totp.matching_step(_secret(row), code, now().timestamp(), used)
+    used = -1 if row.last_used_at is None else step_at(row.last_used_at.timestamp())
+    step = matching_step(_secret(row), code, now().timestamp(), used)
     if step is None:
         return False
-    row.last_used_at = datetime.fromtimestamp(step * totp.STEP_S, UTC)
+    row.last_used_at = datetime.fromtimestamp(step * STEP_S, UTC)
     return True
 
 

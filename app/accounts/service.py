@@ -13,9 +13,9 @@ from pwdlib import PasswordHash
 from sqlalchemy.orm import Session
 
 from app.accounts import repository, second_factor
-from app.accounts.addresses import LONGEST_ADDRESS, normal_address
 from app.accounts.passwords import MIN_PASSWORD, FewAtOnce, place, weakness
 from app.accounts.permissions import MANAGE_ACCOUNTS, READ_AUDIT, Caller, Grant
+from app.accounts.repository import LONGEST_ADDRESS, normal_address
 from app.platform.audit import record, record_once
 from app.platform.database import now, set_actor, transaction
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized, about

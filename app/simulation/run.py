@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from sqlalchemy import text
 
-from app.accounts import repository as accounts_repository
+from app.accounts import repository
 from app.accounts import service as accounts
 from app.accounts.permissions import SYSTEM, Caller
 from app.platform.database import get_engine, new_session, now, transaction
@@ -56,7 +56,7 @@ def simulate(design: Design, console: Console | None = None, slots: int | None =
 
 def _account() -> Caller:
     with transaction("simulated study") as db:
-        user = accounts_repository.user_by_email(db, ACCOUNT)
+        user = repository.user_by_email(db, ACCOUNT)
         if user is None:
             user = accounts.add_user(db, ACCOUNT, Role.CLINICIAN, secrets.token_urlsafe(32), name="Simulated clinician")
         return accounts.caller_of(user)
@@ -66,7 +66,7 @@ def _signer() -> Signer:
     """Find or add the second person, with a new password for this run."""
     password = secrets.token_urlsafe(32)
     with transaction("simulated study") as db:
-        user = accounts_repository.user_by_email(db, SIGNER)
+        user = repository.user_by_email(db, SIGNER)
         if user is None:
             user = accounts.add_user(db, SIGNER, Role.CLINICIAN, password, name="Simulated second clinician")
         else:

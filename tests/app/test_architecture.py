@@ -143,15 +143,56 @@ def is_query(call: tuple[bool, str]) -> bool:
     return name in (QUERY_METHODS if method else QUERY_NAMES)
 
 
-def test_only_repositories_ask_the_database() -> None:
-    # both hold an advisory lock on a connection of their own, which outlives the transactions of the work that it guards
-    allowed = {"app/ingest/uploads/in_progress.py", "app/simulation/run.py"}
-    found = {
-        path
-        for path, text in sources("app").items()
-        if not path.startswith(("app/platform/", "app/tables/")) and not path.endswith("/repository.py") and any(map(is_query, calls(text)))
-    }
-    assert found == allowed
+RULES_WITH_QUERIES = """
+accounts/sign_on accounts/studies
+""".split()  # noqa: SIM905
+"""Small features that keep their rules and their queries in one file."""
+LOCKS = {"app/ingest/uploads/in_progress.py", "app/simulation/run.py"}
+"""Both hold an advisory lock on a connection of their own, which outlives the transactions of the work that it guards."""
+
+
+def decisions(function: ast.AST) -> set[str]:
+    """Name what a function refuses or asks permission for, but that it has not found a row."""
+    raised = {ast.unparse(n.exc).partition("(")[0] for n in ast.walk(function) if isinstance(n, ast.Raise) and n.exc}
+    asked = {name for _, name in calls(ast.unparse(function)) if name == "may" or name.startswith("require")}
+    return raised - {"NotFound"} | asked
+
+
+def queries_that_decide(text: str) -> set[str]:
+    """Name the functions of a source text that ask the database and decide something."""
+    functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
+    return {f.name for f in functions if any(map(is_query, calls(ast.unparse(f)))) and decisions(f)}
+
+
+def test_only_queries_ask_the_database() -> None:
+    asking = {path: text for path, text in sources("app").items() if any(map(is_query, calls(text)))}
+    found = {path for path in asking if not path.startswith(("app/platform/", "app/tables/")) and not path.endswith("/repository.py")}
+    assert found == {f"app/{name}.py" for name in RULES_WITH_QUERIES} | LOCKS
+
+
+WEB = re.compile(r"(.*_)?web|api|pages|deps")
+"""Names of modules with routes, pages, and what their paths name."""
+
+
+def test_rules_and_queries_never_use_routes_and_pages() -> None:
+    from tests.architecture.measure import imports
+
+    text = {path.removesuffix(".py").replace("/", "."): text for path, text in sources("app").items()}
+    web = {name for name in text if WEB.fullmatch(name.rpartition(".")[2]) or "APIRouter(" in text[name]} - {"app.main"}
+    # a command may do what a route does; the other one refuses a file before a route has read it
+    users = web | {"app.main", "app.ingest.uploads.early_refusal"} | {name for name in text if name.endswith("commands")}
+    assert {"app.accounts.deps", "app.accounts.studies_web"} <= web
+    assert {f"{a} -> {b}" for a, b in imports() if b in web and a not in users} == set()
+
+
+def test_a_query_beside_rules_decides_nothing() -> None:
+    found = {name: queries_that_decide((ROOT / f"app/{name}.py").read_text()) for name in RULES_WITH_QUERIES}
+    assert {name: functions for name, functions in found.items() if functions} == {}
+
+
+@pytest.mark.parametrize(("line", "decides"), [("raise NotFound()", False), ("raise Invalid('no')", True), ("require(caller)", True)])
+def test_a_query_that_decides_is_seen(line: str, decides: bool) -> None:
+    assert bool(queries_that_decide(f"def row(db):\n    found = db.scalar(select(A))\n    {line}")) is decides
 
 
 def test_the_session_commits_and_nothing_else_but_what_must_in_the_middle() -> None:
@@ -162,7 +203,7 @@ def test_the_session_commits_and_nothing_else_but_what_must_in_the_middle() -> N
         "app/ingest/uploads/service.py",
         "app/ingest/uploads/in_progress.py",  # ends the statement of its lock, on a connection of its own
         "app/ingest/quarantine/service.py",  # bytes are erased only after the decision is safe
-        "app/accounts/sign_on/service.py",  # a refusal stands in the trail whatever becomes of the request
+        "app/accounts/sign_on.py",  # a refusal stands in the trail whatever becomes of the request
         # a failed sign-in counts whatever becomes of the request; so does when a session or token was last used
         "app/accounts/service.py",
         "app/overview/trail/commands.py",  # an export is in the trail before its first row is written, whatever becomes of the rest
@@ -211,13 +252,11 @@ def test_every_local_link_in_a_template_leads_to_a_page() -> None:
 
 def page_paths() -> set[str]:
     """Paths of every page and of every route of the interface."""
-    from importlib import import_module
-
     from fastapi.routing import iter_route_contexts
 
-    from app.main import API_MODULES, PAGE_MODULES
+    from app.main import API_ROUTERS, PAGE_ROUTERS, router_of
 
     def routes(name: str) -> Iterable[str]:
-        return (context.path for context in iter_route_contexts(import_module(name).router.routes) if context.path)
+        return (context.path for context in iter_route_contexts(router_of(name).routes) if context.path)
 
-    return {p for name in PAGE_MODULES for p in routes(name)} | {f"/api/v1{p}" for name in API_MODULES for p in routes(name)}
+    return {p for name in PAGE_ROUTERS for p in routes(name)} | {f"/api/v1{p}" for name in API_ROUTERS for p in routes(name)}

@@ -21,7 +21,7 @@ MARGINS, RELEASES = "tests/app/study/test_margin_signatures.py", "tests/app/plan
 
 PEOPLE: list[Promise] = [
     *of(
-        "accounts/studies/prefixes",
+        "accounts/studies",
         ("codes of another study are refused before they are looked up", "    if any(code.lower()",
          "    if False and any(code.lower()",
          f"{PREFIXES}::test_who_enrols_learns_no_code_of_another_study"),
@@ -29,12 +29,12 @@ PEOPLE: list[Promise] = [
          f"{PREFIXES}::test_who_enrols_learns_no_code_of_another_study"),
         ("no prefix is the beginning of another", "        if lower.startswith(theirs.lower()) or", "        if False and",
          f"{PREFIXES}::test_prefixes_that_cannot_be_told_apart_or_are_in_use_are_refused"),
-        ("a prefix waits for whoever enrols", "    repository.lock_codes(db, exclusively=False)\n", "",
+        ("a prefix waits for whoever enrols", "    lock_codes(db, exclusively=False)\n", "",
          f"{PREFIXES}::test_a_prefix_waits_for_whoever_enrols"),
     ),
     *of(
-        "accounts/studies/api",
-        ("no token gives a role", '    caller.require_browser()\n    given = service.grant(', "    given = service.grant(",
+        "accounts/studies_web",
+        ("no token gives a role", '    caller.require_browser()\n    given = studies_rules.grant(', "    given = studies_rules.grant(",
          f"{MEMBERS}::test_no_token_gives_or_ends_a_role_and_a_stranger_sees_nobody"),
     ),
     *of(
@@ -77,7 +77,7 @@ PEOPLE: list[Promise] = [
          f"{TOKENS}::test_the_present_password_cannot_be_guessed_without_limit"),
     ),
     *of(
-        "accounts/addresses",
+        "accounts/repository",
         ("padded spellings are one address", ".strip().casefold()).lower().strip()", ".casefold()).lower()",
          f"{ACCOUNTS}::test_padded_and_look_alike_spellings_are_one_address"),
     ),
@@ -96,10 +96,10 @@ PEOPLE: list[Promise] = [
         ("a lost second factor is removed", "        db.delete(row)\n", "        pass\n",
          f"{FACTOR}::test_an_administrator_of_the_machine_removes_a_lost_one"),
     ),
-    *of("accounts/totp", ("codes are those of RFC 6238", "generate_otp(step)", "generate_otp(step + 1)",
+    *of("accounts/second_factor", ("codes are those of RFC 6238", "generate_otp(step)", "generate_otp(step + 1)",
         f"{FACTOR}::test_codes_are_those_of_the_standard")),
     *of(
-        "accounts/sign_on/provider",
+        "accounts/sign_on_provider",
         ("only an address that was verified signs on", 'claims.get("email_verified") is True', "True",
          f"{SIGN_ON}::test_nobody_without_an_account_is_let_in_and_none_is_made"),
     ),

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from sqlalchemy.orm import Session
 
-from app.accounts import signing
+from app.accounts import sign_on
 from app.accounts.permissions import Caller
 from app.platform.errors import Conflict, Forbidden
 from app.platform.signatures import repository, service
@@ -39,7 +39,7 @@ def sign_plan(
                 f"Session {item.position} of plan {plan.id} has no limits in mA.", "Draft the visit anew, so that its limits are set first."
             )
     content = signed_content(visit, plan, policies)
-    return signing.sign(db, caller, password, kind=KIND, subject_id=plan.id, meaning=MEANING, content=content, code=code)
+    return sign_on.sign(db, caller, password, kind=KIND, subject_id=plan.id, meaning=MEANING, content=content, code=code)
 
 
 def signature_of(db: Session, visit: Visit, plan: Plan, policies: Mapping[int, Policy]) -> tuple[SignatureState, Signature | None]:

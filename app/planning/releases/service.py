@@ -9,7 +9,7 @@ from typing import Any, Final
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
-from app.accounts import signing
+from app.accounts import sign_on
 from app.accounts.permissions import Caller
 from app.learning.policies.service import onnx_of
 from app.planning.bundles import service as bundles
@@ -91,7 +91,7 @@ def release(
         "ramp_ma_per_s": manifest.ramp_ma_per_s,
     }
     content = signed_content(db, participant, policy) | {"limits": signed}
-    row = signing.sign(db, caller, password, kind=KIND, subject_id=policy.id, meaning=MEANING, content=content, code=code)
+    row = sign_on.sign(db, caller, password, kind=KIND, subject_id=policy.id, meaning=MEANING, content=content, code=code)
     return Release(SignatureState.STANDS, row)
 
 

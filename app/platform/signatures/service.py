@@ -31,7 +31,7 @@ class SignatureState(StrEnum):
 
 @dataclass(frozen=True)
 class Signer:
-    """A person whose password was checked a moment ago; `app.accounts.signing` makes them, and nothing else should."""
+    """A person whose password was checked a moment ago; `app.accounts.sign_on` makes them, and nothing else should."""
 
     user_id: int
     label: str

@@ -6,7 +6,7 @@ import secrets
 from pathlib import Path
 from typing import Final
 
-from app.accounts import repository as accounts_repository
+from app.accounts import repository
 from app.accounts import service as accounts
 from app.platform.database import transaction
 from app.settings import written_once
@@ -26,6 +26,6 @@ def add_accounts(data_dir: Path) -> str:
     word = password(data_dir)
     with transaction("demo") as db:
         for email, role in ACCOUNTS.items():
-            if accounts_repository.user_by_email(db, email) is None:
+            if repository.user_by_email(db, email) is None:
                 accounts.add_user(db, email, role, word)
     return word

@@ -16,7 +16,7 @@ from typing import Any, Final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from app.accounts import repository as accounts_repository
+from app.accounts import repository
 from app.accounts import service as accounts
 from app.learning.policies.learned_earlier import Learned, add_learned
 from app.learning.snapshots.service import take_snapshot
@@ -159,7 +159,7 @@ class Participant:
         """Store the policies that were learned before a visit, on a snapshot of the sessions until then."""
         buffer = self.learnt_on(generation)
         with transaction(ENGINEER) as db:
-            user = accounts_repository.user_by_email(db, ENGINEER)
+            user = repository.user_by_email(db, ENGINEER)
             assert user is not None
             caller = accounts.caller_of(user)
             participant = study.participant_by_code(db, self.code, caller)

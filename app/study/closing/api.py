@@ -6,11 +6,10 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path
 
+from app.accounts import studies
 from app.accounts.deps import CurrentCaller
-from app.accounts.studies import service as studies
-from app.accounts.studies.deps import ManagedStudy
-from app.accounts.studies.schemas import EndingReason, SiteOut, StudyOut
-from app.accounts.studies.serializers import site_out, study_out
+from app.accounts.studies import EndingReason, SiteOut, StudyOut, site_out, study_out
+from app.accounts.studies_web import ManagedStudy
 from app.platform.database import Db
 from app.platform.web.schemas import problems
 from app.study.closing import service

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
+from app.accounts import studies
 from app.accounts.permissions import SYSTEM
-from app.accounts.studies import service as studies
 from app.platform.database import transaction
 from app.platform.terminal import ACTOR, AsJson, Why, show
 from app.study.closing import service

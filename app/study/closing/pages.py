@@ -5,9 +5,9 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
+from app.accounts import studies
 from app.accounts.deps import CurrentCaller
-from app.accounts.studies import service as studies
-from app.accounts.studies.pages import changed, reason_of
+from app.accounts.studies_web import changed, reason_of
 from app.platform.database import Db
 from app.platform.web.forms import FormValues
 from app.study.closing import service

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from sqlalchemy.orm import Session
 
+from app.accounts import studies
 from app.accounts.permissions import Caller
-from app.accounts.studies import service as studies
 from app.platform.jobs import service as jobs
 from app.study import repository
 from app.tables.accounts import Study

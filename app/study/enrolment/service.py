@@ -6,8 +6,8 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
+from app.accounts import studies
 from app.accounts.permissions import Caller
-from app.accounts.studies import prefixes
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import repository, wording
@@ -36,7 +36,7 @@ def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
     site = _site(db, draft.site, caller)
     caller.require(can.WRITE_STUDY, site.study_id, site.id)
     refuse_ended(site)
-    asked = codes.questions(prefixes.require_own(db, site.study, draft.code), now().date())
+    asked = codes.questions(studies.require_own(db, site.study, draft.code), now().date())
     if asked and not draft.is_study_code:
         told = wording.code_questions(draft.code, asked)
         raise Invalid(told, wording.CODE_HINT, questions=[{"code": q.value, "text": wording.CODE_QUESTIONS[q]} for q in asked])

@@ -58,7 +58,7 @@ def lock_margins(
             for it. code: of the second factor.
 
     Raises:
-        Invalid: no reason. Forbidden: the caller approves no plans of this participant, or as `app.accounts.signing`, as TooMany is.
+        Invalid: no reason. Forbidden: the caller approves no plans of this participant, or as `app.accounts.sign_on`, as TooMany is.
             Conflict: newer margins are there, or these are locked already.
     """
     study.require(caller, can.SET_MARGINS, participant)

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from sqlalchemy.orm import Session
 
-from app.accounts import signing
+from app.accounts import sign_on
 from app.accounts.permissions import Caller
 from app.platform.signatures import repository as signatures
 from app.platform.signatures.service import SignatureState, state_of
@@ -19,9 +19,9 @@ MEANING: Final = "margins fixed before the sessions that they judge"
 
 
 def sign_lock(db: Session, participant: Participant, lock: MarginsLock, caller: Caller, password: str, code: str) -> Signature:
-    """Sign a lock over the values of its margins and levels. Raises as `app.accounts.signing.sign`."""
+    """Sign a lock over the values of its margins and levels. Raises as `app.accounts.sign_on.sign`."""
     content = signed_content(participant, lock)
-    return signing.sign(db, caller, password, kind=KIND, subject_id=lock.id, meaning=MEANING, content=content, code=code)
+    return sign_on.sign(db, caller, password, kind=KIND, subject_id=lock.id, meaning=MEANING, content=content, code=code)
 
 
 def signatures_of_locks(db: Session, participant: Participant) -> dict[int, tuple[SignatureState, Signature | None]]:

@@ -35,7 +35,7 @@ def lock(db: Session, visit: Visit, reason: str, caller: Caller, password: str, 
 
     Raises:
         Conflict: it is locked already, or sessions wait for confirmation. Invalid: no reason. Forbidden, TooMany: as
-            `app.accounts.signing`.
+            `app.accounts.sign_on`.
     """
     waiting = [s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id]
     if waiting:

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from sqlalchemy.orm import Session
 
-from app.accounts import signing
+from app.accounts import sign_on
 from app.accounts.permissions import SYSTEM, Caller
 from app.platform.errors import Invalid
 from app.platform.signatures import repository as signatures
@@ -37,9 +37,9 @@ _CONDITIONS = (
 
 
 def sign_lock(db: Session, visit: Visit, lock: VisitLock, caller: Caller, password: str, code: str) -> Signature:
-    """Sign a lock over the visit's data as they are. Raises as `app.accounts.signing.sign`."""
+    """Sign a lock over the visit's data as they are. Raises as `app.accounts.sign_on.sign`."""
     content = signed_content(db, visit, lock)
-    return signing.sign(db, caller, password, kind=KIND, subject_id=lock.id, meaning=MEANING, content=content, code=code)
+    return sign_on.sign(db, caller, password, kind=KIND, subject_id=lock.id, meaning=MEANING, content=content, code=code)
 
 
 def signatures_of_locks(db: Session, visit: Visit) -> dict[int, tuple[SignatureState, Signature | None]]:

@@ -15,8 +15,8 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts import repository, service
-from app.accounts.addresses import normal_address
 from app.accounts.permissions import MANAGE_ACCOUNTS, PERMISSIONS, READ, READ_ARMS, SIGN_PLAN, WRITE_STUDY, Caller, Grant
+from app.accounts.repository import normal_address
 from app.platform.database import new_session
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized
 from app.tables.accounts import Role

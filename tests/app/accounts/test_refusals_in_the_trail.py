@@ -8,8 +8,8 @@ import pytest
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.accounts import second_factor, service, totp
-from app.accounts.signing import sign
+from app.accounts import second_factor, service
+from app.accounts.sign_on import sign
 from app.platform.errors import Forbidden, TooMany, Unauthorized
 from app.tables.accounts import Role, User
 from app.tables.audit import AuditEvent
@@ -60,7 +60,7 @@ def test_a_wrong_password_at_a_signature_is_in_the_trail(db: Session, ada: User)
 
 def test_a_wrong_code_at_a_signature_is_in_the_trail(db: Session, ada: User) -> None:
     secret = second_factor.begin(db, ada)
-    second_factor.confirm(db, ada, totp.code_of(secret, totp.step_at(time.time())))
+    second_factor.confirm(db, ada, second_factor.code_of(secret, second_factor.step_at(time.time())))
     db.commit()
     with pytest.raises(Forbidden):
         service.confirm_password(ada.id, PASSWORD)

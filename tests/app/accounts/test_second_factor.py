@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
 from app import cli
-from app.accounts import second_factor, service, signing, totp
+from app.accounts import second_factor, service, sign_on
 from app.platform.database import new_session
 from app.platform.errors import Forbidden, Invalid, Unauthorized
 from app.tables.accounts import Role, User
@@ -31,21 +31,21 @@ RFC_SECRET = b"12345678901234567890"
     [(59, "94287082"), (1111111109, "07081804"), (1111111111, "14050471"), (1234567890, "89005924"), (2000000000, "69279037")],
 )
 def test_codes_are_those_of_the_standard(unix_s: int, code: str) -> None:
-    assert totp.code_of(RFC_SECRET, totp.step_at(unix_s)) == code[2:]
-    assert totp.matching_step(RFC_SECRET, code[2:], unix_s) == totp.step_at(unix_s)
+    assert second_factor.code_of(RFC_SECRET, second_factor.step_at(unix_s)) == code[2:]
+    assert second_factor.matching_step(RFC_SECRET, code[2:], unix_s) == second_factor.step_at(unix_s)
 
 
 def test_a_clock_may_be_a_step_off_and_no_code_works_twice() -> None:
-    code = totp.code_of(RFC_SECRET, 100)
-    assert [totp.matching_step(RFC_SECRET, code, 30 * step) for step in (98, 99, 100, 101, 102)] == [None, 100, 100, 100, None]
-    assert totp.matching_step(RFC_SECRET, f" {code[:3]} {code[3:]} ", 3000) == 100
-    assert totp.matching_step(RFC_SECRET, code, 3000, after=100) is None
+    code = second_factor.code_of(RFC_SECRET, 100)
+    assert [second_factor.matching_step(RFC_SECRET, code, 30 * step) for step in (98, 99, 100, 101, 102)] == [None, 100, 100, 100, None]
+    assert second_factor.matching_step(RFC_SECRET, f" {code[:3]} {code[3:]} ", 3000) == 100
+    assert second_factor.matching_step(RFC_SECRET, code, 3000, after=100) is None
     for wrong in ("", "000000", code + "0", "ü" * 6):
-        assert totp.matching_step(RFC_SECRET, wrong, 3000) is None
+        assert second_factor.matching_step(RFC_SECRET, wrong, 3000) is None
 
 
 def code_now(secret: bytes, later: int = 0) -> str:
-    return totp.code_of(secret, totp.step_at(time.time()) + later)
+    return second_factor.code_of(secret, second_factor.step_at(time.time()) + later)
 
 
 @pytest.fixture
@@ -82,8 +82,8 @@ def test_signatures_and_a_new_password_need_a_code(db: Session, ada: tuple[User,
     user, secret, codes = ada
     signed = {"kind": "plan", "subject_id": 7, "meaning": "approved", "content": {"order": ["cdbs"]}}
     with pytest.raises(Forbidden, match="second factor"):
-        signing.sign(db, service.caller_of(user), PASSWORD, **signed)  # type: ignore[arg-type]
-    assert signing.sign(db, service.caller_of(user), PASSWORD, **signed, code=codes[0]).signer == EMAIL  # type: ignore[arg-type]
+        sign_on.sign(db, service.caller_of(user), PASSWORD, **signed)  # type: ignore[arg-type]
+    assert sign_on.sign(db, service.caller_of(user), PASSWORD, **signed, code=codes[0]).signer == EMAIL  # type: ignore[arg-type]
     db.commit()
     with pytest.raises(Forbidden, match="second factor"):
         service.change_own_password(db, user.id, PASSWORD, "another long one of words", "123456")

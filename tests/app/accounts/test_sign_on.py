@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 
 from app import cli
 from app.accounts import service as accounts
-from app.accounts.sign_on import provider as ours
-from app.accounts.sign_on import service
-from app.accounts.sign_on.provider import Identity
+from app.accounts import sign_on
+from app.accounts import sign_on_provider as ours
+from app.accounts.sign_on_provider import Identity
 from app.platform.database import new_session, now
 from app.settings import get_settings
 from app.tables.accounts import Role, User
@@ -232,13 +232,13 @@ def test_a_begin_ends_after_ten_minutes_and_cannot_be_made_up(browser: TestClien
         remember(browser, made_up)
         assert browser.get(back).status_code == 403
     later = time.time() + 601
-    monkeypatch.setattr("app.accounts.sign_on.pages.time.time", lambda: later)
+    monkeypatch.setattr("app.accounts.sign_on_web.time.time", lambda: later)
     remember(browser, begun)
     assert browser.get(back).status_code == 403
 
 
 def test_refusals_of_one_address_come_to_an_end(browser: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("app.accounts.browser.failed_sign_ins._most", lambda: 5)
+    monkeypatch.setattr("app.accounts.deps.failed_sign_ins._most", lambda: 5)
     back = sent_back(browser, "/sign-on")
     begun = browser.cookies["betaloop_sign_on"]
     codes = []
@@ -263,7 +263,7 @@ def test_a_refusal_there_and_a_provider_that_is_away_are_said(browser: TestClien
 def test_a_provider_that_is_away_uses_up_no_tries(
     browser: TestClient, hospital: theirs.Provider, ada: User, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("app.accounts.browser.failed_sign_ins._most", lambda: 5)
+    monkeypatch.setattr("app.accounts.deps.failed_sign_ins._most", lambda: 5)
     back = sent_back(browser, "/sign-on")
     begun = browser.cookies["betaloop_sign_on"]
 
@@ -335,7 +335,7 @@ def test_somebody_who_signed_on_there_long_ago_is_asked_again(browser: TestClien
 def test_an_account_belongs_to_exactly_the_address_that_is_vouched_for(db: Session, ada: User, vouched: str | None, same: bool) -> None:
     accounts.add_user(db, "strasse@clinic.example", Role.VIEWER, PASSWORD)
     db.commit()
-    found = service._user_of(db, vouched)
+    found = sign_on._user_of(db, vouched)
     assert (found is not None) is same
     if found is not None and vouched is not None:
         assert found.email == vouched.strip().lower()
@@ -356,11 +356,11 @@ def test_two_first_sign_ons_of_one_person_at_once_are_one_link(ada: User, db: Se
 
     def second() -> None:
         with new_session() as own:
-            opened.append(service.sign_on(own, who))
+            opened.append(sign_on.sign_on(own, who))
             own.commit()
 
     with new_session() as first:
-        opened.append(service.sign_on(first, who))
+        opened.append(sign_on.sign_on(first, who))
         other = threading.Thread(target=second)
         other.start()
         other.join(1.0)

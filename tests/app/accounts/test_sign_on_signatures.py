@@ -12,9 +12,9 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
+from app.accounts import sign_on
 from app.accounts.permissions import CONFIRMED_FOR, Caller
-from app.accounts.sign_on import service
-from app.accounts.signing import sign
+from app.accounts.sign_on import sign
 from app.platform.database import new_session, now, set_actor
 from app.platform.errors import Forbidden
 from app.platform.web.templates import _environment
@@ -86,11 +86,11 @@ def test_a_confirmation_runs_out_and_is_of_one_browser_session(browser: TestClie
         beside = accounts.caller_of_cookie(other, token)
         assert beside is not None
         with pytest.raises(Forbidden):
-            service.use_confirmation(other, beside)
+            sign_on.use_confirmation(other, beside)
     db.execute(text("update sign_in set confirmed_at = :at"), {"at": now() - CONFIRMED_FOR})
     db.commit()
     with new_session() as other, pytest.raises(Forbidden, match="sign within 5 minutes"):
-        service.use_confirmation(other, confirmed)
+        sign_on.use_confirmation(other, confirmed)
 
 
 def test_nobody_else_confirms_and_an_old_sign_on_does_not(browser: TestClient, hospital: theirs.Provider, ada: User, db: Session) -> None:

@@ -11,7 +11,7 @@ from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from app.accounts import service
-from app.accounts.browser import failed_sign_ins
+from app.accounts.deps import failed_sign_ins
 from app.platform.errors import Forbidden, TooMany, Unauthorized, passing
 from app.tables.accounts import Role, User
 

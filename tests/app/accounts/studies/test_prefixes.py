@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from app import cli
 from app.accounts import service as accounts
-from app.accounts.studies import prefixes, repository
+from app.accounts import studies
 from app.platform.database import transaction
 from app.platform.errors import Conflict
 from app.tables.accounts import Role, Site, Study
@@ -126,13 +126,13 @@ def test_only_who_administers_all_studies_gives_a_prefix(client: TestClient) -> 
 def test_a_prefix_waits_for_whoever_enrols(client: TestClient, fresh_database: str) -> None:
     """Between the look at prefixes and the new code no study can claim the code's beginning."""
     with transaction("first") as enrolling, transaction("second") as claiming:
-        main = repository.study_by_code(enrolling, "main")
+        main = studies.study_by_code(enrolling, "main")
         assert main is not None
-        assert prefixes.require_own(enrolling, main, "P9") == "P9"
+        assert studies.require_own(enrolling, main, "P9") == "P9"
         claiming.connection().exec_driver_sql("set lock_timeout = '200ms'")
         other = Study(code="late", name="Late")
         claiming.add(other)
         claiming.flush()
         with pytest.raises(Exception, match="lock timeout"):
-            prefixes.claim(claiming, other, "P")
+            studies.claim(claiming, other, "P")
         claiming.rollback()

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from app import cli
 from app.accounts import service as accounts
 from app.accounts.permissions import SYSTEM
-from app.accounts.studies.service import grant, study_to_manage
+from app.accounts.studies import grant, study_to_manage
 from app.platform.database import transaction
 from app.tables.accounts import Role
 from tests.conftest import PASSWORD

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
 from app.accounts.permissions import SYSTEM, Caller
-from app.accounts.signing import sign
+from app.accounts.sign_on import sign
 from app.platform.errors import Forbidden, TooMany
 from app.platform.signatures.repository import signatures_of
 from app.platform.signatures.service import content_hash, covers

@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from structlog.testing import capture_logs
 
 from app.accounts import repository as accounts
-from app.accounts.studies import repository as studies
+from app.accounts import studies
 from app.study import repository as study
 
 AT_ONCE = 4

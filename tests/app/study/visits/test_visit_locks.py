@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 
-from app.accounts.blinded import is_open
+from app.accounts.permissions import is_open
 from tests.conftest import PASSWORD
 
 Upload = Callable[..., int]

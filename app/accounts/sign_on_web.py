@@ -15,16 +15,15 @@ from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
 from app.accounts import service as accounts
-from app.accounts.browser import SIGNED_OUT, count_try, failed_sign_ins, local_path, signed_in
-from app.accounts.deps import COOKIE, CurrentCaller
-from app.accounts.sign_on import service
-from app.accounts.sign_on.provider import RETURN_PATH, Begun, Identity, ProviderAway, Refused, configured, provider
+from app.accounts import sign_on
+from app.accounts.deps import COOKIE, SIGNED_OUT, CurrentCaller, count_try, failed_sign_ins, local_path, signed_in
+from app.accounts.sign_on_provider import RETURN_PATH, Begun, Identity, ProviderAway, Refused, configured, provider
 from app.platform.database import set_actor, transaction
 from app.platform.errors import BetaloopError, NotFound, TooMany, Unauthorized
 from app.platform.web.templates import render
 from app.settings import get_settings
 
-router = APIRouter(prefix="/sign-on")
+pages = APIRouter(prefix="/sign-on")
 
 BEGUN = "betaloop_sign_on"
 BEGUN_FOR_S = 600
@@ -41,14 +40,14 @@ class _Way:
     confirms: bool
 
 
-@router.get("")
+@pages.get("")
 def begin(request: Request, next: str = "/") -> Response:
     """Send the browser to the provider."""
     _require_configured()
     return _sent_off(local_path(next), confirms=False, fresh=SIGNED_OUT in request.cookies)
 
 
-@router.get("/confirm")
+@pages.get("/confirm")
 def begin_to_confirm(caller: CurrentCaller, next: str = "/") -> Response:
     """Send the browser to the provider, which asks its user once more who they are: instead of the password of a signature."""
     _require_configured()
@@ -56,7 +55,7 @@ def begin_to_confirm(caller: CurrentCaller, next: str = "/") -> Response:
     return _sent_off(local_path(next), confirms=True, fresh=True)
 
 
-@router.get("/return")
+@pages.get("/return")
 def come_back(request: Request) -> Response:
     """Receive the browser that the provider sends back."""
     _require_configured()
@@ -76,7 +75,7 @@ def come_back(request: Request) -> Response:
     return answer
 
 
-@router.get("/end")
+@pages.get("/end")
 def end() -> Response:
     """Send the browser to where its session at the provider ends too."""
     _require_configured()
@@ -107,7 +106,7 @@ def _arrived(request: Request, way: _Way, identity: Identity) -> Response:
     with transaction() as db:
         set_actor(db, "unknown", request_id=request.state.request_id)
         if not way.confirms:
-            token = service.sign_on(db, identity)
+            token = sign_on.sign_on(db, identity)
             answer = signed_in(token, way.target)
             answer.delete_cookie(SIGNED_OUT, path=_PATH)
             return answer
@@ -115,7 +114,7 @@ def _arrived(request: Request, way: _Way, identity: Identity) -> Response:
         if caller is None:
             raise Unauthorized("Your session has ended meanwhile.", "Sign in again.")
         set_actor(db, caller.label, caller.user_id, request.state.request_id)
-        service.confirm(db, caller, identity)
+        sign_on.confirm(db, caller, identity)
     return RedirectResponse(way.target, 303)
 
 

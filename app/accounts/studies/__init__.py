@@ -1,1 +1,0 @@
-"""Studies, their sites, and who works in them in which role."""
