@@ -18,6 +18,7 @@ from statistics import median
 
 from sqlalchemy import create_engine, text
 from sqlalchemy.orm import Session
+from support.results import run_benchmark
 
 
 def per_write_ms(db, rows: int, together: bool) -> float:  # type: ignore[no-untyped-def]
@@ -78,4 +79,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from support.results import run_benchmark
 
 from ml.formats import DecodeOptions
 from ml.formats.rcs.beta import time_domain_stretches
@@ -170,4 +171,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

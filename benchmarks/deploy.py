@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from support.results import run_benchmark
 
 from ml.deploy.appraisal import battery_gain
 from ml.deploy.bundle import build_bundle, open_bundle
@@ -234,4 +235,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

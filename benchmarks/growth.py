@@ -22,6 +22,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from support.results import run_benchmark
+
 if TYPE_CHECKING:
     from ml.policies.policy import Policy
     from ml.trajectories import ReplayBuffer
@@ -138,4 +140,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -32,6 +32,7 @@ import numpy as np
 import psutil
 from installed.installation import STARTED_S, Installation, installation
 from installed.writers import client as caller
+from support.results import run_benchmark
 
 from ml.formats import DecodeOptions, decode
 from ml.formats.rcs import decode_rcs, redact_rcs_zip
@@ -289,4 +290,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

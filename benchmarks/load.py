@@ -27,6 +27,7 @@ import httpx2 as httpx
 import numpy as np
 from installed.installation import PASSWORD, STARTED_S, Installation, installation, times_slower
 from installed.writers import PEOPLE, Acknowledged, Study, client, make_study, table, what_is_wrong
+from support.results import run_benchmark
 
 BETWEEN_PAGES_S, BETWEEN_UPLOADS_S = 5.0, 10.0
 P95_S = 1.0
@@ -197,4 +198,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

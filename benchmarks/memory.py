@@ -28,6 +28,7 @@ from pathlib import Path
 
 import httpx2 as httpx
 import psutil
+from support.results import run_benchmark
 
 from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
@@ -193,4 +194,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -19,7 +19,6 @@ import argparse
 import json
 import os
 import re
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -41,6 +40,7 @@ from support.null_worlds import (
     metric_average,
     show_margin,
 )
+from support.results import emit, run_benchmark
 
 from ml.statistics.association import within_visits
 from ml.statistics.effects import cliffs_delta, energy_saving
@@ -50,7 +50,6 @@ from ml.statistics.within_visits.contrasts import Average, Measurements, Unavail
 from ml.statistics.within_visits.mixed_models import linear_comparison, minutes_comparison, ordinal_comparison
 from ml.statistics.within_visits.stratified import shift_interval, van_elteren
 
-out = sys.stdout.write
 ALPHA, LEVEL = 0.05, 0.95
 CONTINUOUS = ("grasp", "beta", "energy")
 LAWS = (CONTINUOUS, ("rating",), ("tremor",))
@@ -194,22 +193,22 @@ def cell(work: Part, argument: str | int, studies: int, seed: int, folder: Path 
 
 def show_null(tally: Tally, studies: int) -> dict[str, float]:
     """The table of null studies and its worst cells; a cell is a scenario and metrics of one law (the continuous ones, rating, tremor)."""
-    out(f"null studies, {studies} of each scenario; share rejected at {ALPHA:g} (worst cell), intervals of {LEVEL:g} (range of cells)\n")
+    emit(f"null studies, {studies} of each scenario; share rejected at {ALPHA:g} (worst cell), intervals of {LEVEL:g} (range of cells)\n")
     labels = ("primary", "van elteren", "naive")
     intervals = ("primary", "delta", "saving", "slope", "mixed", "shift", "naive")
-    out(f"{'':<22}" + "".join(f"{label:>12}" for label in labels) + "".join(f"{label:>13}" for label in intervals) + "\n")
+    emit(f"{'':<22}" + "".join(f"{label:>12}" for label in labels) + "".join(f"{label:>13}" for label in intervals) + "\n")
     for name in WORLDS:
         rates = [max(tally.pooled(name, law, label)[0] for law in LAWS) for label in labels]  # NaN of what was not made
-        out(f"{name:<22}" + "".join(f"{r:>12.3f}" for r in rates))
+        emit(f"{name:<22}" + "".join(f"{r:>12.3f}" for r in rates))
         for label in intervals:
             shares = [share for law in LAWS for share, n in [tally.pooled(name, law, f"{label} cover")] if n]
-            out(f"{f'{min(shares):.3f}-{max(shares):.3f}' if shares else '-':>13}")
-        out("\n")
+            emit(f"{f'{min(shares):.3f}-{max(shares):.3f}' if shares else '-':>13}")
+        emit("\n")
     rejected = [(name, law, *tally.pooled(name, law, "primary")) for name in WORLDS for law in LAWS]
     rejected += [(f"{n}, latent", (m,), *tally.share(n, m, "latent null primary")) for n in SKEWED for m in BOUNDED]
     above = [(n, law, r) for n, law, r, number in rejected if r > ALPHA + 2 * error(number)]
-    out(f"cells of the primary test above its level by more than two errors: {len(above)} of {len(rejected)}")
-    out(f" (chance alone: {0.0228 * len(rejected):.1f}) {', '.join(f'{n}/{law[0]} {r:.4f}' for n, law, r in above)}\n\n")
+    emit(f"cells of the primary test above its level by more than two errors: {len(above)} of {len(rejected)}")
+    emit(f" (chance alone: {0.0228 * len(rejected):.1f}) {', '.join(f'{n}/{law[0]} {r:.4f}' for n, law, r in above)}\n\n")
     worst, number = max(r[2:] for r in rejected)
     judged = ("primary", "delta", "saving", "slope")
     covers = [tally.pooled(name, law, f"{label} cover") for name in WORLDS for law in LAWS for label in judged]
@@ -228,23 +227,23 @@ def show_null(tally: Tally, studies: int) -> dict[str, float]:
 
 def show_skewed(tally: Tally) -> None:
     """Studies whose null is one of the latent value alone."""
-    out("the effect differs between days, without an average in the latent value: average in the metric | share rejected |")
-    out(" share of intervals that miss the average in the metric\n")
+    emit("the effect differs between days, without an average in the latent value: average in the metric | share rejected |")
+    emit(" share of intervals that miss the average in the metric\n")
     for name in SKEWED:
         for metric in BOUNDED:
             shares = [tally.share(name, metric, f"{kind} primary")[0] for kind in ("latent null", "own average")]
             own = metric_average(WORLDS[name], metric)
-            out(f"{name:<22}{metric:<8}{own:>8.2f} |{shares[0]:>8.4f} |{shares[1]:>8.4f}\n")
-    out("\n")
+            emit(f"{name:<22}{metric:<8}{own:>8.2f} |{shares[0]:>8.4f} |{shares[1]:>8.4f}\n")
+    emit("\n")
 
 
 def show_power(tally: Tally) -> None:
     """What is found of an effect."""
-    out("\npower for an effect of one standard deviation of a session, 4 sessions of either arm a visit:")
-    out(" primary, van Elteren, the paper's\n")
+    emit("\npower for an effect of one standard deviation of a session, 4 sessions of either arm a visit:")
+    emit(" primary, van Elteren, the paper's\n")
     for key in dict.fromkeys(k[0] for k in tally.counts if len(k) == 2):
         labels = ("primary", "van elteren", "naive")
-        out(f"  {key:<36}" + "".join(f"{tally.share(key, label)[0]:>8.3f}" for label in labels) + "\n")
+        emit(f"  {key:<36}" + "".join(f"{tally.share(key, label)[0]:>8.3f}" for label in labels) + "\n")
 
 
 def main() -> None:
@@ -281,10 +280,10 @@ def main() -> None:
     if only in (None, "power"):
         show_power(tally)
     figures["cpu_s"] = sum(os.times()[:4])
-    out(json.dumps(figures, indent=1) + "\n")
+    emit(json.dumps(figures, indent=1) + "\n")
     if arguments.json:
         arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -27,6 +27,7 @@ from support.cells import Cells
 from support.looks import LookError, look, said
 from support.ope_cases import CDBS, DESIGNS, MATCHED, Case, virtual_case
 from support.ope_report import figures, report
+from support.results import run_benchmark
 
 from ml.ope.compare.gain import gain_over
 from ml.ope.estimate import Estimate, Estimator
@@ -171,4 +172,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -36,6 +36,7 @@ from sqlalchemy import event, func, select, text
 from support.large_study.entries import callers, complete
 from support.large_study.raw_samples import raw_samples
 from support.large_study.rows import EMAIL, PASSWORD, Extent, add_account, add_participant
+from support.results import run_benchmark
 
 from app.accounts.permissions import SYSTEM
 from app.learning.repository import candidates
@@ -343,4 +344,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from support.figure import draw
 from support.looks import look, said
+from support.results import run_benchmark
 
 from ml.ope.compare.metrics import accuracy
 from ml.ope.linear.estimator import LinearConfig, LinearModel
@@ -183,4 +184,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from support.results import run_benchmark
 from torch import nn
 
 from ml.mdp import MdpSettings
@@ -202,4 +203,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -35,6 +35,7 @@ from pathlib import Path
 import psutil
 from installed.installation import STARTED_S, Installation, TooLate, installation, times_slower, utc
 from installed.writers import PEOPLE, Study, Writers, live_jobs, make_study, what_is_wrong
+from support.results import run_benchmark
 
 KINDS = ("web", "worker", "child", "postmaster")
 HEALTHY_S = 10.0
@@ -314,4 +315,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -28,6 +27,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.special import ndtr
+from support.results import emit, run_benchmark
 
 from app.analysis.evidence.facts import Facts
 from app.analysis.primary.verdict import LockedMargins, verdicts
@@ -41,7 +41,6 @@ from ml.statistics.multiplicity import hommel
 from ml.statistics.noninferiority import Assessment, Inferior, NonInferiorAndSaving
 from ml.statistics.within_visits.contrasts import Average, Unavailable
 
-out = sys.stdout.write
 STEPS_PER_MINUTE = 30
 LEVELS = (0.75, 0.5, 0.3)
 """Constant fractions of the cDBS amplitude: from what hardly differs to what surely harms."""
@@ -219,14 +218,14 @@ def main() -> None:
     codes = [asked.only] if asked.only else list(PARTICIPANTS)
     asks = [q for code in codes for q in kept(code, day, seeds, asked.visits, asked.keep)]
     concluded = [q for q in asks if q.concluded]
-    out(f"{asked.visits} visits of {len(day.places[True])} sessions of the controller and {len(day.places[False])} of cDBS, ")
-    out(f"{asked.session_minutes:g} minutes each\nparticipant  level  non-inferior and saving  inferior  inconclusive  false  bound\n")
+    emit(f"{asked.visits} visits of {len(day.places[True])} sessions of the controller and {len(day.places[False])} of cDBS, ")
+    emit(f"{asked.session_minutes:g} minutes each\nparticipant  level  non-inferior and saving  inferior  inconclusive  false  bound\n")
     for code in codes:
         for level in LEVELS:
             mine = [q for q in asks if (q.participant, q.level) == (code, level)]
             count, known = Counter(q.concluded for q in mine), sum(bool(q.bound) for q in mine)
-            out(f"{code:11}  {level:5.2f}  {count[GOOD]:23}  {count[BAD]:8}  {count[OPEN]:12}  ")
-            out(f"{sum(q.true is False for q in mine):5}  {known:5}\n")
+            emit(f"{code:11}  {level:5.2f}  {count[GOOD]:23}  {count[BAD]:8}  {count[OPEN]:12}  ")
+            emit(f"{sum(q.true is False for q in mine):5}  {known:5}\n")
     figures = {
         "questions": len(asks),
         "concluded": len(concluded) / len(asks),
@@ -235,10 +234,10 @@ def main() -> None:
         "bound": sum(bool(q.bound) for q in asks) / len(asks),
         "cpu_s": round(time.process_time() - started, 1),
     }
-    out(json.dumps(figures) + "\n")
+    emit(json.dumps(figures) + "\n")
     if asked.json:
         asked.json.write_text(json.dumps(figures, indent=2) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

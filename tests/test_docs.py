@@ -245,7 +245,8 @@ def wrong_options(markdown: str) -> list[str]:
         found += [f"line {code.number}: no option {o}" for o in alone if o not in every_option() and f'"{o}"' not in scripts]
         if script := re.search(r"(benchmarks/[\w/]+\.py|-m benchmarks\.[\w.]+)(.*)", code.text):
             file = ROOT / (script[1] if "/" in script[1] else script[1].removeprefix("-m ").replace(".", "/") + ".py")
-            source = file.read_text() if file.exists() else ""
+            # every script takes the options of what runs it
+            source = file.read_text() + (ROOT / "benchmarks/support/results.py").read_text() if file.exists() else ""
             missing = [o for o in re.findall(r"(?<![\w-])--[a-z][a-z-]*", script[2]) if source and f'"{o}"' not in source]
             found += [f"line {code.number}: {script[1]} has no {option}" for option in missing]
     return found

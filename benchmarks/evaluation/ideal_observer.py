@@ -25,6 +25,7 @@ import numpy as np
 from benchmarks.support.cells import Cells
 from benchmarks.support.observer import observe, patient_alike, returns_of
 from benchmarks.support.ope_cases import DESIGNS
+from benchmarks.support.results import run_benchmark
 from ml.ope.compare.metrics import spearman
 from ml.population.virtual import WORLDS_PER_PART, World, world
 
@@ -117,4 +118,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -35,6 +35,7 @@ from app.learning.training.compute import hold_out, supported_best, with_best_an
 from app.learning.training.configs import training_groups
 from benchmarks.support.cells import Cells
 from benchmarks.support.looks import look, said
+from benchmarks.support.results import run_benchmark
 from ml import rl
 from ml.ope.posterior.gains import PosteriorGain, gains_over_cdbs
 from ml.ope.posterior.verdict import Levels
@@ -200,4 +201,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -42,6 +42,7 @@ from benchmarks.support.cells import Cells
 from benchmarks.support.figure import Point, draw_curves
 from benchmarks.support.looks import look, said
 from benchmarks.support.ope_cases import CDBS, virtual_case
+from benchmarks.support.results import run_benchmark
 from ml.designs import near_session
 from ml.mdp import step_reward
 from ml.ope.estimate import Estimate
@@ -394,4 +395,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -28,6 +28,7 @@ import torch
 from benchmarks.support.cells import Cells
 from benchmarks.support.looks import look, said
 from benchmarks.support.ope_cases import CDBS, DESIGNS, Case, virtual_case
+from benchmarks.support.results import run_benchmark
 from ml.ope.compare.metrics import spearman
 from ml.ope.posterior.estimator import build
 from ml.ope.posterior.verdict import Levels, verdict
@@ -147,4 +148,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -7,7 +7,6 @@ Steps, bounds, margins, scales and values of failures are those of the service (
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from ml.qoc import Margins
 from ml.statistics.noninferiority import LEAST_VISITS, Inconclusive, NonInferiorAndSaving, assess
 from ml.statistics.within_visits.contrasts import Measurements
 
-out = sys.stdout.write
+from .results import emit
 
 RESOLUTION = measurements.RESOLUTION
 BOUNDED = tuple(sorted(measurements.BOUNDED))
@@ -252,13 +251,13 @@ def _share(share: float) -> str:
 
 def show_margin(tally: Tally) -> dict[str, float]:
     """Non-inferiority at the margin and where nothing is lost."""
-    out("non-inferiority shown: grasp, rating, tremor exactly at its margin (an error)")
-    out(" | nothing lost (power), of it with the saving shown\n")
+    emit("non-inferiority shown: grasp, rating, tremor exactly at its margin (an error)")
+    emit(" | nothing lost (power), of it with the saving shown\n")
     asked = {k: c for k, c in tally.counts.items() if len(k) == 5}
     for key in sorted(dict.fromkeys(k[:3] for k in asked), key=lambda k: (int(k[0].split()[0]), k)):
         wrong = [tally.share(*key, at, "non-inferior")[0] for at in KEYS]
         right = [tally.share(*key, "nothing", label)[0] for label in ("non-inferior", "and saving")]
-        out(f"  {', '.join(key):<50}{' |'.join(''.join(map(_share, shares)) for shares in (wrong, right))}\n")
+        emit(f"  {', '.join(key):<50}{' |'.join(''.join(map(_share, shares)) for shares in (wrong, right))}\n")
     errors = {k: c for k, c in asked.items() if k[3] != "nothing" and k[4] == "non-inferior"}
     cases: dict[tuple[str, str, bool], list[list[int]]] = {}  # of one number of visits and outcome, the same for all outcomes or of tremor
     for (visits, where, _, at, _), count in errors.items():

@@ -28,6 +28,7 @@ def test_every_script_can_be_run_in_its_quick_form(script: Path) -> None:
     source = script.read_text()
     assert re.search(r'^if __name__ == "__main__":$', source, re.MULTILINE), "a module without a main part belongs into benchmarks/support"
     assert "--quick" in options(source)
+    assert source.endswith("    run_benchmark(main)\n"), "without it `--write NAME` writes no page of docs/results"
 
 
 def test_what_scripts_share_is_no_script() -> None:
