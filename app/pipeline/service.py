@@ -28,7 +28,14 @@ class Started(NamedTuple):
 
 
 def start_job(
-    db: Session, participant: Participant, kind: str, params: Mapping[str, Any], caller: Caller, *, again: bool = False
+    db: Session,
+    participant: Participant,
+    kind: str,
+    params: Mapping[str, Any],
+    caller: Caller,
+    *,
+    again: bool = False,
+    repeats: Job | None = None,
 ) -> Started:
     """Put a job of this participant on the queue, unless the same one is there: a request that is sent twice starts one job.
 
@@ -49,7 +56,7 @@ def start_job(
         for live in jobs.live_of(db, participant.id):
             if live.kind == kind and (wanted.one_at_a_time or _same(db, participant, live, checked)):
                 return Started(live, False)
-    job = jobs.submit(db, kind, participant.id, checked, caller.label)
+    job = jobs.submit(db, kind, participant.id, checked, caller.label, repeats)
     for requirement in wanted.requires:
         requirement(db, participant.id, checked)
     return Started(job, True)
@@ -70,7 +77,7 @@ def _same(db: Session, participant: Participant, live: Job, params: BaseModel) -
 
 
 def retry_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
-    """Start a new job with the same params, whichever else is at work.
+    """Start a new job with the same params, whichever else is at work. It takes over the results that its steps would compute again.
 
     Raises:
         Conflict: the job has not ended, or another one repeats it. NotFound: it is another participant's.
@@ -78,7 +85,7 @@ def retry_job(db: Session, participant: Participant, job: Job, caller: Caller) -
     study.require(caller, can.RUN_JOBS, participant)
     study.require_own(participant, job, f"job {job.id}")
     job = jobs.repeatable(db, job)
-    return start_job(db, participant, job.kind, job.params, caller, again=True).job
+    return start_job(db, participant, job.kind, job.params, caller, again=True, repeats=job).job
 
 
 def cancel_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:

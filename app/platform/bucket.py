@@ -61,7 +61,7 @@ class Bucket:
         if not url.startswith("s3://") or len(url) < 6:
             raise RuntimeError(f"BETALOOP_FILES_URL is {url}: give s3://BUCKET or s3://BUCKET/PREFIX.")
         self._root = url.removeprefix("s3://").rstrip("/")
-        waits = {"connect_timeout": 10, "read_timeout": 60, "retries": {"max_attempts": 3, "mode": "standard"}}
+        waits = {"connect_timeout": 5, "read_timeout": 10, "retries": {"max_attempts": 2, "mode": "standard"}}
         try:
             # listings are not kept: other machines write too
             self._fs: Any = fsspec.filesystem(
@@ -69,6 +69,8 @@ class Bucket:
             )
         except ImportError as error:
             raise RuntimeError("Files in a bucket need the packages of betaloop[s3].") from error
+        # its own tries come on top of those above, and a bucket that hangs would hold its caller for minutes
+        self._fs.retries = 1
 
     def size(self, sha256: str) -> int | None:
         """Return the size of an object in bytes; None where there is none."""

@@ -61,6 +61,8 @@ class Job(Base):
     result: Mapped[dict[str, Any] | None]
     error: Mapped[str | None] = mapped_column(Text)
     code_version: Mapped[str] = mapped_column(String(80))
+    repeats: Mapped[str | None] = mapped_column(ForeignKey("job.id"))
+    """The job that had ended and that this one repeats."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
     started_at: Mapped[datetime | None]

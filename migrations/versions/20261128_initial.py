@@ -514,6 +514,8 @@ def upgrade() -> None:
         sa.Column("finished_at", sa.DateTime(timezone=True), nullable=True),
         sa.Column("updated_at", sa.DateTime(timezone=True), server_default=sa.text("now()"), nullable=False),
         sa.Column("cancel_requested_at", sa.DateTime(timezone=True), nullable=True),
+        sa.Column("repeats", sa.String(length=36), nullable=True),
+        sa.ForeignKeyConstraint(["repeats"], ["job.id"], name=op.f("fk_job_repeats_job")),
         sa.CheckConstraint("(finished_at is not null) = (status in ('succeeded', 'failed', 'cancelled'))", name=op.f("ck_job_finished")),
         sa.CheckConstraint("status in ('queued', 'running', 'succeeded', 'failed', 'cancelled')", name=op.f("ck_job_status")),
         sa.CheckConstraint("progress >= 0 and progress <= 1", name=op.f("ck_job_progress")),

@@ -24,6 +24,7 @@ from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
 from tests.app.every_route import World
 from tests.conftest import Template, close_connections, copy_database, copy_of, drop_database, own_database
+from tests.s3_server import CREDENTIALS, Server
 
 ROOT = Path(__file__).resolve().parents[2]
 Upload = Callable[..., int]
@@ -212,3 +213,14 @@ def statements() -> Iterator[list[str]]:
     event.listen(get_engine(), "before_cursor_execute", note)
     yield asked
     event.remove(get_engine(), "before_cursor_execute", note)
+
+
+@pytest.fixture(scope="module")
+def s3_server() -> Iterator[Server]:
+    """An S3 server for the tests of one file."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in CREDENTIALS.items():
+            patch.setenv(name, value)
+        running = Server()
+        yield running
+        running.stop()

@@ -19,6 +19,7 @@ from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
+from app.platform.bucket import StoreAway
 from app.platform.database import now, set_actor, transaction
 from app.platform.jobs import repository
 from app.platform.jobs.children.supervisor import ChildMessages
@@ -30,6 +31,8 @@ log = logging.getLogger(__name__)
 
 Value = TypeVar("Value")
 _RETRY_S = (0.2, 5.0)
+_CHECK_S = 0.2
+WAITS_FOR_FILES = "waits for the store of files"
 MOST_UNFINISHED = 0.99
 """Share that a step or a job shows at most before it has ended: its computation may be done, its results are not stored yet."""
 
@@ -131,7 +134,11 @@ class Ledger:
                 self._step_event(db, job, step)
                 return step.result
 
-        return self._persist(write)
+        return persist(write, self.check, lambda: self.tell(key, WAITS_FOR_FILES))
+
+    def tell(self, key: str, message: str) -> None:
+        """Say what a step does now."""
+        self.record(key, ChildMessages(message=message))
 
     def fail_step(self, key: str, message: str, trace: str) -> None:
         """Mark a step as failed; the traceback goes to the job's log."""
@@ -194,24 +201,43 @@ def _outcome(step: JobStep) -> StepOutcome | None:
     return None
 
 
-def persist(action: Callable[[], Value], check: Callable[[], None]) -> Value:
-    """Do something with the database, and when it is away, wait for it: a restart of the database fails no job.
+def persist(action: Callable[[], Value], check: Callable[[], None], files_away: Callable[[], None] = lambda: None) -> Value:
+    """Do something with the database or the store of files. While one of them is away, wait for it: its restart fails no job.
 
     Args:
         action: a whole transaction, which may be repeated.
         check: called before every attempt; raises to give up.
+        files_away: called when the store of files is away.
     """
-    pause, longest = _RETRY_S
+    pauses = longer_pauses()
     while True:
         check()
         try:
             return action()
+        except StoreAway:
+            files_away()
+            pause(next(pauses), check)
         except DBAPIError as error:
             if not _worth_repeating(error):
                 raise
-            log.warning("the database is away, trying again in %.1f s (%s)", pause, type(error.orig).__name__)
-            time.sleep(pause * random.uniform(0.5, 1.0))  # noqa: S311 - apart from each other, not secret
-            pause = min(2 * pause, longest)
+            log.warning("the database is away, trying again soon (%s)", type(error.orig).__name__)
+            pause(next(pauses), check)
+
+
+def longer_pauses() -> Iterator[float]:
+    """Yield the seconds before each further try: ever more, up to a limit, and apart from those of other waiters."""
+    seconds, longest = _RETRY_S
+    while True:
+        yield seconds * random.uniform(0.5, 1.0)  # noqa: S311 - apart from each other, not secret
+        seconds = min(2 * seconds, longest)
+
+
+def pause(seconds: float, check: Callable[[], None]) -> None:
+    """Wait, and look meanwhile whether to give up: `check` raises."""
+    until = time.monotonic() + seconds
+    while (left := until - time.monotonic()) > 0:
+        time.sleep(min(left, _CHECK_S))
+        check()
 
 
 def _worth_repeating(error: DBAPIError) -> bool:

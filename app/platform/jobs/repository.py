@@ -63,6 +63,14 @@ def of_kind(db: Session, participant_id: int, kind: str) -> Sequence[Job]:
     return db.scalars(query.order_by(Job.created_at, Job.id)).all()
 
 
+def jobs_before(db: Session, job: Job) -> list[str]:
+    """List the ids of the jobs that a job repeats, the latest first."""
+    found: list[str] = []
+    while (earlier := db.get_one(Job, found[-1]).repeats if found else job.repeats) is not None:
+        found.append(earlier)
+    return found
+
+
 def step(db: Session, job_id: str, key: str) -> JobStep:
     """Load a step of a job; it must have been declared."""
     return db.scalars(select(JobStep).where(JobStep.job_id == job_id, JobStep.key == key)).one()

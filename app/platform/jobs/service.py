@@ -38,7 +38,9 @@ def checked_params(kind: str, params: Mapping[str, Any]) -> BaseModel:
         raise Invalid(f"These params do not fit the job kind {kind!r}: {places}.", errors=errors) from error
 
 
-def submit(db: Session, kind: str, participant_id: int | None, params: dict[str, Any] | BaseModel, created_by: str) -> Job:
+def submit(
+    db: Session, kind: str, participant_id: int | None, params: dict[str, Any] | BaseModel, created_by: str, repeats: Job | None = None
+) -> Job:
     """Make a job and put it on the queue, both in the caller's transaction.
 
     Args:
@@ -47,6 +49,7 @@ def submit(db: Session, kind: str, participant_id: int | None, params: dict[str,
         participant_id: whose data it works on.
         params: checked by the kind's schema.
         created_by: the user who asks for it; the audit trail names them with everything that the job writes.
+        repeats: a job that has ended: the results of its steps are taken over where code and params are the same.
 
     Raises:
         UnknownKind: there is no such kind.
@@ -64,6 +67,7 @@ def submit(db: Session, kind: str, participant_id: int | None, params: dict[str,
         params=checked,
         code_version=code_version(),
         created_by=created_by,
+        repeats=None if repeats is None else repeats.id,
     )
     db.add(job)
     db.flush()
@@ -98,7 +102,7 @@ def cancel(db: Session, job: Job, by: str) -> Job:
 def retry(db: Session, job: Job, by: str) -> Job:
     """Start a new job of the same kind with the same params. Raises as `repeatable` does."""
     job = repeatable(db, job)
-    return submit(db, job.kind, job.participant_id, job.params, by)
+    return submit(db, job.kind, job.participant_id, job.params, by, job)
 
 
 def repeatable(db: Session, job: Job) -> Job:

@@ -6,7 +6,7 @@ import json
 import logging
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,14 @@ from sqlalchemy.orm import Session
 
 from app.platform.database import new_session
 from app.platform.errors import BetaloopError
-from app.platform.jobs import registry, repository
+from app.platform.jobs import registry, repository, service
 from app.platform.jobs.children.child import ChildLimits
 from app.platform.jobs.children.forked import ForkedProcesses
 from app.platform.jobs.children.slots import Slots
-from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall
+from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall, take_over
 from app.platform.jobs.context import JobContext, StepOutcome
 from app.platform.jobs.errors import JobCancelled, WorkerStopping
-from app.platform.jobs.ledger import Ledger, persist
+from app.platform.jobs.ledger import WAITS_FOR_FILES, Ledger, longer_pauses, pause, persist
 from app.settings import get_settings, private_folder
 from app.tables.jobs import Job, JobStatus
 
@@ -56,6 +56,8 @@ class JobSteps:
     requests: StopRequests
     children: ChildProcesses
     slots: Slots
+    repeated: Sequence[str] = ()
+    """Ids of the jobs that this one repeats, the latest first."""
 
     def declare(self, key: str, title: str, weight: float) -> None:
         """Make the step's row unless it is there."""
@@ -68,21 +70,35 @@ class JobSteps:
             return known
         settings = get_settings()
         limits = ChildLimits(settings.job_memory_mb, niceness=settings.job_niceness)
-        call = ComputeCall(name, registry.compute_reference(name), checked, self.workdir(key), limits)
-        with self.slots.hold(self.ledger.job_id, self.requests.check):
-            if skip():
-                return {"ok": False, "skipped": True}
-            for attempt in range(1 + KILLED_RETRIES):
-                if (known := self.ledger.begin(key)) is not None:
-                    return known
-                outcome = self.children.run(call, lambda messages: self.ledger.record(key, messages), self.requests.check)
-                if outcome["ok"] or outcome["cause"] != "killed" or attempt == KILLED_RETRIES:
-                    break
-                log.warning("step %s of job %s: %s It is tried once more", key, self.ledger.job_id, outcome["message"])
+        call = ComputeCall(name, registry.compute_reference(name), checked, self.workdir(key), limits, service.code_version())
+        if any(take_over(call, _workdir(earlier, key)) for earlier in self.repeated):
+            log.info("step %s of job %s has the result of the job that this one repeats", key, self.ledger.job_id)
+        pauses = longer_pauses()
+        while True:
+            with self.slots.hold(self.ledger.job_id, self.requests.check):
+                if skip():
+                    return {"ok": False, "skipped": True}
+                outcome = self._run(key, call)
+            if outcome.get("cause") != "away":
+                break
+            # other steps may do without files: they get the slot
+            self.ledger.tell(key, WAITS_FOR_FILES)
+            pause(next(pauses), self.requests.check)
         if outcome["ok"]:
             return {"ok": True, "result": self.ledger.commit_step(key, lambda _: outcome["result"])}
-        self.ledger.fail_step(key, outcome["message"], outcome["log"])
+        self.ledger.fail_step(key, outcome["message"], outcome.get("log", ""))
         return {"ok": False, "message": outcome["message"]}
+
+    def _run(self, key: str, call: ComputeCall) -> StepOutcome:
+        """Run a step's child; one that was killed from outside is tried again."""
+        for attempt in range(1 + KILLED_RETRIES):
+            if (known := self.ledger.begin(key)) is not None:
+                return known
+            outcome = self.children.run(call, lambda messages: self.ledger.record(key, messages), self.requests.check)
+            if outcome["ok"] or outcome["cause"] != "killed" or attempt == KILLED_RETRIES:
+                break
+            log.warning("step %s of job %s: %s It is tried once more", key, self.ledger.job_id, outcome["message"])
+        return outcome
 
     def transact(self, key: str, fn: Callable[[Session], dict[str, Any]]) -> StepOutcome:
         """Run a function in a database transaction together with its record."""
@@ -97,7 +113,8 @@ class JobSteps:
 
     def workdir(self, key: str) -> Path:
         """Return the folder of a step; the parts of a key are joined so that no step's folder is within another's."""
-        return private_folder(private_folder(get_settings().jobs_dir) / self.ledger.job_id) / key.replace("/", "__")
+        private_folder(private_folder(get_settings().jobs_dir) / self.ledger.job_id)
+        return _workdir(self.ledger.job_id, key)
 
 
 class JobRunner:
@@ -159,11 +176,11 @@ class JobRunner:
 
     def _run(self, job_id: str, requests: StopRequests) -> None:
         check = _check_abandoned(requests)
-        job = persist(lambda: _job(job_id), check)
+        job, repeated = persist(lambda: _job(job_id), check)
         ledger = Ledger(job_id, job.created_by, self._worker, check)
         if not ledger.open():
             return
-        steps = JobSteps(ledger, requests, self._children, self._slots)
+        steps = JobSteps(ledger, requests, self._children, self._slots, repeated)
         context = JobContext(job_id, job.kind, job.participant_id, job.params, job.created_by, steps)
         try:
             if job.cancel_requested_at is not None:
@@ -180,6 +197,10 @@ class JobRunner:
             ledger.close(JobStatus.FAILED, error=worded(error), trace="" if expected else _trace(error))
 
 
+def _workdir(job_id: str, key: str) -> Path:
+    return get_settings().jobs_dir / job_id / key.replace("/", "__")
+
+
 def worded(error: Exception) -> str:
     """Phrase an error in one line for the user."""
     if isinstance(error, BetaloopError):
@@ -188,9 +209,10 @@ def worded(error: Exception) -> str:
     return f"{type(error).__name__}: {text.splitlines()[0]}" if text else type(error).__name__
 
 
-def _job(job_id: str) -> Job:
+def _job(job_id: str) -> tuple[Job, list[str]]:
     with new_session() as db:
-        return repository.get(db, job_id)
+        job = repository.get(db, job_id)
+        return job, repository.jobs_before(db, job)
 
 
 def _check_abandoned(requests: StopRequests) -> Callable[[], None]:

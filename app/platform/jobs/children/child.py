@@ -22,6 +22,7 @@ import time
 import traceback
 from contextlib import suppress
 from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,8 +43,9 @@ _OOM_SCORE = "500"
 _AUTOGROUP, _AUTOGROUP_TRIES = Path("/proc/self/autogroup"), 50
 _AUTOGROUPS_ON = Path("/proc/sys/kernel/sched_autogroup_enabled")
 
-Cause = Literal["memory", "time", "full", "killed", "error"]
-"""Reason for a missing result: the call reached its limit of memory or time, the disk is full, its process was killed, or it raised."""
+Cause = Literal["memory", "time", "full", "away", "killed", "error"]
+"""Reason for a missing result: the call reached its limit of memory or time, its process was killed, or it raised. Or the disk is full, or
+the store of files is away."""
 LEAST_ROOM = 1 << 16
 """Bytes: a disk with less is full."""
 NO_ROOM = 28
@@ -159,6 +161,8 @@ def _lacked_memory(error: Exception) -> bool:
 def _cause(error: Exception, workdir: Path) -> Cause:
     if _lacked_memory(error):
         return "memory"
+    if isinstance(error, BetaloopError) and error.status == HTTPStatus.SERVICE_UNAVAILABLE:
+        return "away"  # compute functions use no database
     if isinstance(error, OSError) and error.errno is not None:
         return "full" if error.errno in FULL else "error"
     # numpy and torch do not say why they could not write

@@ -36,13 +36,14 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_
 
 @dataclass(frozen=True)
 class ComputeCall:
-    """One call of a compute function: its name, and where it is, as `module:function`."""
+    """One call of a compute function: its name, where it is, as `module:function`, and the version of the code that runs it."""
 
     name: str
     reference: str
     params: dict[str, Any]
     workdir: Path
     limits: ChildLimits
+    code_version: str = ""
 
     @property
     def sha256(self) -> str:
@@ -188,10 +189,24 @@ def _prepare(call: ComputeCall) -> None:
         shutil.rmtree(call.workdir)
     private_folder(call.workdir)
     content = {"function": call.reference, "params": call.params, "params_sha256": call.sha256, "limits": asdict(call.limits)}
+    content["code_version"] = call.code_version
     write_atomically(params, json.dumps(content, allow_nan=False).encode())
     result = call.workdir / "result.json"
     if result.exists() and stored_result(call.workdir, call.sha256) is None:
         result.unlink()  # of a failed attempt
+
+
+def take_over(call: ComputeCall, left: Path) -> bool:
+    """Copy the folder that the same call of another job left with its result; True where the same code made it of the same params."""
+    if call.workdir.exists() or stored_result(left, call.sha256) is None:
+        return False
+    if json.loads((left / "params.json").read_bytes()).get("code_version") != call.code_version:
+        return False
+    draft = call.workdir.with_name(f".{call.workdir.name}")
+    shutil.rmtree(draft, ignore_errors=True)  # of a copy that was cut short
+    shutil.copytree(left, draft)
+    draft.rename(call.workdir)
+    return True
 
 
 def _listen(process: Child, pipe: int, memory_mb: int, record: Callable[[ChildMessages], None], check: Callable[[], None]) -> bool:

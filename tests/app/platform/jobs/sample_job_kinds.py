@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
+from app.platform import files
 from app.platform.jobs import JobContext, JobError, JobKind, StepReport, register, write_atomically
 from app.platform.jobs.worker import Pace, run_worker
 from app.platform.web.schemas import Text
@@ -139,6 +140,39 @@ def _store_and_break(db: Session) -> dict[str, Any]:
     raise JobError("The buffer is empty.", "Upload a session.")
 
 
+class FilesParams(BaseModel):
+    """The file to read, what to write, and a file without which the job fails after both."""
+
+    sha256: Text
+    content: Text = "written"
+    needs: Text | None = None
+
+
+def read_file(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Read a stored file."""
+    return {"size": len(files.read(params["sha256"])), "pid": os.getpid()}
+
+
+def needs_file(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Fail where a file is missing."""
+    if params["needs"] and not Path(params["needs"]).exists():
+        raise JobError("The file is not there.", "Make it.")
+    return {}
+
+
+def run_files(job: JobContext) -> dict[str, Any]:
+    """Store a file in a transaction, read one in a child, then need another."""
+    written = job.transact("write", lambda db: {"sha256": files.store(db, job.params["content"].encode()).sha256})
+    read = job.compute("read", "read_file", {"sha256": job.params["sha256"]})
+    job.compute("need", "needs_file", {"needs": job.params["needs"]})
+    return {"written": written["sha256"], **read}
+
+
+def run_read(job: JobContext) -> dict[str, Any]:
+    """Read a file in a child."""
+    return job.compute("read", "read_file", {"sha256": job.params["sha256"]})
+
+
 def _kill_worker(db: Session) -> dict[str, Any]:
     os.kill(os.getpid(), signal.SIGKILL)
     return {}
@@ -152,6 +186,16 @@ for name, schema in (("count", CountParams), ("fail", FailParams)):
             params=schema,
             orchestration=f"sample_job_kinds:run_{name}",
             compute={name: f"sample_job_kinds:{name}"},
+        )
+    )
+for name in ("files", "read"):
+    register(
+        JobKind(
+            name=name,
+            title=name.capitalize(),
+            params=FilesParams,
+            orchestration=f"sample_job_kinds:run_{name}",
+            compute={name: f"sample_job_kinds:{name}" for name in ("read_file", "needs_file")},
         )
     )
 
