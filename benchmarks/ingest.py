@@ -35,10 +35,11 @@ from installed.writers import client as caller
 from support.results import run_benchmark
 
 from ml.formats import DecodeOptions, decode
-from ml.formats.rcs import decode_rcs, redact_rcs_zip
+from ml.formats.rcs.folder import decode_rcs
 from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
 from ml.formats.rcs.packets.scan import scan
 from ml.formats.rcs.packets.streams import read_time_domain
+from ml.formats.rcs.redact import redact_rcs_zip
 from ml.formats.tables.redact import redact_table
 from ml.population import rcs_session_zip, run_session, session_table_csv
 

@@ -22,8 +22,8 @@ from app.study.sessions import conditions
 from app.study.traces import unpack
 from app.tables.recordings import Recording, Trace
 from app.tables.sessions import SessionSegment, StudySession
+from ml.formats import TraceLog
 from ml.formats.beta import ERROR_STREAM
-from ml.formats.recording import TraceLog
 
 BETA = "beta"
 NEURAL = (BETA, "band_power")

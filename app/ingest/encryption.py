@@ -10,7 +10,7 @@ from cryptography.fernet import Fernet
 
 from app.platform.files import CHUNK, draft_path
 from app.settings import get_settings
-from ml.formats.source import Source
+from ml.formats import Source
 
 
 def _cipher() -> Fernet:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 from app.tables.participants import SettingsVersion
-from ml.formats.recording import DecodedFile, TraceLog, TraceSource
+from ml.formats import DecodedFile, TraceLog, TraceSource
 from ml.formats.tables.numbers import unit_name
 
 

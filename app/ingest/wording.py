@@ -11,6 +11,7 @@ from app.platform.web.numbers import stated
 from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern
 from app.tables.recordings import Recording
 from app.tables.uploads import ColumnMapping
+from ml.formats import FILE_NAMES
 
 _TELLING = ("controller", "program")
 HIDDEN = "controller hidden"
@@ -29,8 +30,7 @@ def reason(evidence: Evidence) -> str:
 
 
 KIND_NAMES = {
-    "rcs": "RC+S session folder",
-    "percept": "Percept report",
+    **FILE_NAMES,
     "csv": "table",
     "parquet": "table (Parquet)",
     "control_log": "controller's log",

@@ -18,8 +18,6 @@ from app.tables.sessions import Activity, Controller
 from app.tables.visits import Dose, Drug
 from ml.outcomes import BY_FIELD, OUTCOMES
 
-DEVICE_NAMES = {"rcs": "RC+S", "percept": "Percept"}
-"""Of kinds of devices that are not called by their own word."""
 EVENT_KINDS = {
     EventKind.DYSKINESIA: "Dyskinesia",
     EventKind.SPEECH: "Speech",

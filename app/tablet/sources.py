@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Generator, Iterable
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -21,10 +20,6 @@ from ml.deploy.runtime.envelope import BetaSample, Signal
 from ml.deploy.runtime.protocol import number
 from ml.deploy.streaming import StreamingBeta, split_by_period
 from ml.formats import DecodeOptions, RecordingLog, TraceLog, UndecodableFile, decode, sniff
-from ml.formats.archive import FolderFiles, ZipFiles
-from ml.formats.rcs.beta import time_domain_stretches
-from ml.formats.rcs.folder import find_sessions, read_streams
-from ml.formats.recording import FileReport
 from ml.formats.tables.delimited import read_delimited
 from ml.formats.tables.numbers import column_name, unit_name
 from ml.signals import Stretch, band_rows
@@ -103,7 +98,11 @@ def open_source(text: str, manifest: BundleManifest, wish: Wish, stdin: Iterable
         if not path.is_dir() and sniff(path) == "csv" and (lfp := _lfp_columns(path)):
             return _raw(lfp, manifest, f"{path.name}, raw LFP")
         options = DecodeOptions(
-            manifest.period_s, manifest.beta_low_hz, manifest.beta_high_hz, min_valid_fraction=manifest.min_valid_fraction
+            manifest.period_s,
+            manifest.beta_low_hz,
+            manifest.beta_high_hz,
+            min_valid_fraction=manifest.min_valid_fraction,
+            keep_samples=True,
         )
         return _recorded(path, options, manifest, wish)
     except UndecodableFile as error:
@@ -115,10 +114,11 @@ def _recorded(path: Path, options: DecodeOptions, manifest: BundleManifest, wish
     recordings = [r for r in decode(path, options=options).recordings if _same_side(r, manifest)]
     for recording in recordings:
         traces = [t for t in recording.traces if t.stream in ("beta", "band_power") and t.unit != "uV2"]
-        has_raw = recording.kind == "rcs" and recording.started_at and any(t.source == "time_domain" for t in traces)
-        if has_raw and manifest.beta_source == "time_domain":
-            trace = _chosen([t for t in traces if t.source == "time_domain"], wish.channel)
-            stretches = _rcs_stretches(path, options, recording).get(trace.channel, [])
+        sampled = {log.channel: log for log in recording.samples}
+        measured = [t for t in traces if t.source == "time_domain" and t.channel in sampled]
+        if measured and manifest.beta_source == "time_domain":
+            trace = _chosen(measured, wish.channel)
+            stretches = sampled[trace.channel].stretches()
             source = _raw(stretches, manifest, f"{path.name}, {trace.channel}, raw LFP", rows=trace.values.size)
             source.offline = _offline(stretches, manifest, trace.values.size)
             return source
@@ -195,24 +195,6 @@ def _stream(stretches: list[Stretch], manifest: BundleManifest, count: int, stre
 def _offline(stretches: list[Stretch], manifest: BundleManifest, rows: int) -> NDArray[np.float64]:
     found = band_rows(stretches, rows, manifest.period_s, manifest.beta_low_hz, manifest.beta_high_hz)
     return np.where(found.reached >= manifest.min_valid_fraction - 1e-9, found.rms, np.nan)
-
-
-def _rcs_stretches(path: Path, options: DecodeOptions, recording: RecordingLog) -> dict[str, list[Stretch]]:
-    """Collect gap-free stretches of the recording's channels in uV, on the recording's clock."""
-    files = FolderFiles(path) if path.is_dir() else ZipFiles(path, options.archive)
-    start_ms = recording.started_at.timestamp() * 1000.0 if recording.started_at else 0.0
-    out: dict[str, list[Stretch]] = {}
-    with files if isinstance(files, ZipFiles) else nullcontext():
-        for session in find_sessions(files, FileReport(path.name)):
-            streams = read_streams(session, files)
-            times, settings = streams.placed()
-            if streams.time_domain is None or "time_domain" not in times.streams:
-                continue
-            for name, pieces in time_domain_stretches(streams.time_domain, times.streams["time_domain"], settings).items():
-                placed = [((first_ms - start_ms) / 1000.0, rate, x * 1000.0) for first_ms, rate, x in pieces]
-                if any(-1.0 <= t <= recording.duration_s + 1.0 for t, _, _ in placed):
-                    out.setdefault(name, []).extend(placed)
-    return out
 
 
 def _lfp_columns(path: Path) -> list[Stretch]:

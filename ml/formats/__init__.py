@@ -1,19 +1,16 @@
 """Decoders of uploaded files: bytes in, recordings and reports out. No database and no network in here.
 
-`sniff`, `redact` and `decode` are the only entrances.
+`sniff`, `redact` and `decode` are the entrances. `registry` has one record per format of a device.
 """
 
 from __future__ import annotations
 
 import zipfile
+from collections import Counter
 from pathlib import Path
-from typing import Literal
 
 from ml.formats.archive import ZipFiles
-from ml.formats.identity import redact
-from ml.formats.options import ArchiveLimits, DecodeOptions
-from ml.formats.percept import decode_percept, looks_like_report, report_members
-from ml.formats.rcs import decode_rcs, find_sessions
+from ml.formats.options import ArchiveLimits, BetaMeasure, DecodeOptions
 from ml.formats.recording import (
     DECODE_VERSION,
     TREMOR_CLASSES,
@@ -23,23 +20,34 @@ from ml.formats.recording import (
     GraspLog,
     Problem,
     RecordingLog,
+    SampleLog,
     SpectrumLog,
     TraceLog,
+    TraceSource,
     TremorLog,
     UndecodableFile,
 )
-from ml.formats.redaction_record import REDACTOR_VERSION, Redaction
+from ml.formats.redaction_record import REDACTOR_VERSION, Redaction, pseudonym
+from ml.formats.registry import BY_KIND, DEVICE_NAMES, DEVICES, FILE_NAMES, SOURCE_NAMES, DeviceFormat
 from ml.formats.source import Source
-from ml.formats.tables import TableKind, decode_table, kind_of_text
+from ml.formats.tables import TABLES, decode_table, kind_of_text, redact_table
 from ml.formats.tables.delimited import utf16_without_mark
 
 __all__ = [
+    "BY_KIND",
     "DECODE_VERSION",
+    "DEVICES",
+    "DEVICE_NAMES",
+    "FILE_NAMES",
     "REDACTOR_VERSION",
+    "SOURCE_NAMES",
+    "TABLES",
     "TREMOR_CLASSES",
     "ArchiveLimits",
+    "BetaMeasure",
     "DecodeOptions",
     "DecodedFile",
+    "DeviceFormat",
     "EventLog",
     "FileKind",
     "FileReport",
@@ -47,22 +55,24 @@ __all__ = [
     "Problem",
     "RecordingLog",
     "Redaction",
+    "SampleLog",
+    "Source",
     "SpectrumLog",
     "TraceLog",
+    "TraceSource",
     "TremorLog",
     "UndecodableFile",
     "decode",
+    "left_out_of",
+    "pseudonym",
     "redact",
     "sniff",
 ]
 
-FileKind = Literal["rcs", "percept"] | TableKind
+FileKind = str
+"""Kind of a file: that of a device's format, or of a table (`TABLES`)."""
 HEAD = 65_536
-HINT = (
-    "Upload an RC+S session folder as a zip, a Percept session report (JSON), a table as CSV or Parquet, "
-    "a tremor export, or a table of open-fist times."
-)
-
+HINT = f"Upload {', '.join(one.upload for one in DEVICES)}, a table as CSV or Parquet, a tremor export, or a table of open-fist times."
 
 _OTHER_ARCHIVES = (
     ("gzip", 0, b"\x1f\x8b"),
@@ -75,6 +85,9 @@ _OTHER_ARCHIVES = (
 """Archives that are not unpacked: name, place and bytes of their mark. Sources: RFC 1952, POSIX, and the formats' specifications."""
 
 
+_ZIPPED = next(one.kind for one in DEVICES if one.zipped)
+
+
 def sniff(path: Source) -> FileKind:
     """Detect the kind of a file by its content, whatever its name and extension.
 
@@ -82,7 +95,7 @@ def sniff(path: Source) -> FileKind:
         UndecodableFile: empty, or nothing this service reads.
     """
     if isinstance(path, Path) and path.is_dir():
-        return "rcs"
+        return _ZIPPED
     with path.open("rb") as stream:
         head = stream.read(HEAD)
         zipped = head.startswith((b"PK\x03\x04", b"PK\x05\x06")) or zipfile.is_zipfile(stream)
@@ -96,13 +109,14 @@ def sniff(path: Source) -> FileKind:
         return "parquet"
     if zipped:
         return _kind_of_zip(path)
-    if looks_like_report(head):
-        return "percept"
+    for one in DEVICES:
+        if one.code.begins(head):
+            return one.kind
     text = head.lstrip(b"\xef\xbb\xbf \t\r\n")
     if text and len(head) < HEAD and text.strip(b"\0 \t\r\n,[]{}") == b"":
         raise UndecodableFile("the file is empty: it holds nothing but brackets or zero bytes", "file", HINT)
     if text.startswith((b"[", b"{")):
-        what = "a single JSON file, neither a whole RC+S session nor a Percept session report"
+        what = f"a single JSON file, and no {' and no '.join(FILE_NAMES.values())}"
         raise UndecodableFile(what, "file", "Zip the whole session folder and upload that.")
     if head.startswith((b"\xff\xfe", b"\xfe\xff")) or b"\0" not in head[:4096] or utf16_without_mark(head[:4096]) is not None:
         return kind_of_text(path)
@@ -110,21 +124,39 @@ def sniff(path: Source) -> FileKind:
 
 
 def _kind_of_zip(path: Source) -> FileKind:
-    """Detect a zip of Percept reports, which has no RC+S file. What cannot be opened is left to the decoder of RC+S, which reports why."""
+    """Detect the kind of a zip by its files. One that cannot be opened is left to a decoder that reports why."""
     try:
         with ZipFiles(path, ArchiveLimits()) as files:
-            if not find_sessions(files, FileReport("archive")) and report_members(files):
-                return "percept"
+            return next((one.kind for one in DEVICES if one.code.within(files, FileReport("archive"))), _ZIPPED)
     except UndecodableFile:
-        return "rcs"
-    return "rcs"
+        return _ZIPPED
+
+
+def redact(source: Source, target: Path, kind: FileKind, key: bytes, options: DecodeOptions | None = None) -> Redaction:
+    """Write a file without identity; the same bytes in give the same bytes out, and they decode to the same content.
+
+    Args:
+        source: the uploaded file.
+        target: where the redacted file is written.
+        kind: what it is, from `sniff`.
+        key: secret of the installation for pseudonyms of devices, at least 16 bytes.
+        options: choices of the decoder, which checks tables as the sender wrote them.
+
+    Raises:
+        UndecodableFile: it cannot be parsed, and so not be cleaned; nothing is written then.
+        ValueError: a table that a column mapping reads; `tables.mapping.redact_mapped` cleans it.
+    """
+    options = options or DecodeOptions()
+    if kind in BY_KIND:
+        return BY_KIND[kind].code.redact(source, target, key, options.archive)
+    return redact_table(source, target, kind, options)
 
 
 def decode(path: Path, kind: FileKind | None = None, options: DecodeOptions | None = None, name: str | None = None) -> DecodedFile:
     """Decode a file.
 
     Args:
-        path: where its bytes are; for RC+S a folder will do too.
+        path: where its bytes are; a folder will do too where a format has one.
         kind: what it is; sniffed when not given.
         options: choices that change the numbers.
         name: what to call it in reports and errors; the path's last part when not given.
@@ -134,19 +166,21 @@ def decode(path: Path, kind: FileKind | None = None, options: DecodeOptions | No
     """
     options = options or DecodeOptions()
     kind = kind or sniff(path)
-    if kind == "rcs":
-        decoded = decode_rcs(path, options, name)
-        if all(_is_empty(r) for r in decoded.recordings):
-            said = "this upload holds no data: no stream has a sample and no stimulation log an amplitude; kept as a recording without data"
-            decoded.reports[0].flagged.insert(0, said)
-        return decoded
-    if kind == "percept":
-        return decode_percept(path, options, name)
+    if kind in BY_KIND:
+        return BY_KIND[kind].code.decode(path, options, name)
     return decode_table(path, kind, options, name)
 
 
-def _is_empty(recording: RecordingLog) -> bool:
-    """Decide whether an RC+S recording has neither a sample nor an amplitude in its stimulation log."""
-    logged = (e.data for e in recording.events if e.kind == "stimulation" and e.data["origin"] == "StimLog")
-    stimulated = any(program["amplitude_ma"] is not None for data in logged for program in data["programs"])
-    return recording.duration_s == 0 and not recording.traces and not stimulated
+def left_out_of(source: Source, limits: ArchiveLimits) -> list[str]:
+    """Count the reasons why members of an archive were ignored, without their names, which may identify a person; of no archive none."""
+    with source.open("rb") as stream:
+        if not zipfile.is_zipfile(stream):
+            return []
+    listing = FileReport("archive")
+    try:
+        with ZipFiles(source, limits) as members:
+            BY_KIND[_ZIPPED].code.within(members, listing)
+            reasons = Counter(member.reason for member in members.left_out)
+    except UndecodableFile:
+        return []  # the problem itself says what is wrong with the archive
+    return [*listing.ignored, *(f"{n} file{'s' if n > 1 else ''}: {reason}" for reason, n in sorted(reasons.items()))]

@@ -154,6 +154,17 @@ class SampleLog:
             np.cumsum([0, *sizes[:-1]], dtype=np.int64)[: len(sizes)],
         )
 
+    def stretches(self) -> list[Stretch]:
+        """Cut the samples at their gaps; a stretch of one sample has the highest rate."""
+        ends = [*self.starts[1:].tolist(), self.values.size]
+        out: list[Stretch] = []
+        for begin, end in zip(self.starts.tolist(), ends, strict=True):
+            t_s = self.t_s[begin:end]
+            step = (t_s[-1] - t_s[0]) / (t_s.size - 1) if t_s.size > 1 else 1.0 / self.rates_hz[-1]
+            rate = min(self.rates_hz, key=lambda hz: abs(hz * step - 1.0))
+            out.append((float(t_s[0]), rate, self.values[begin:end].astype(np.float64)))
+        return out
+
     def between(self, begin_s: float, end_s: float) -> SampleLog:
         """Select the samples after `begin_s` and up to `end_s`, to the microsecond, as rows of traces take them."""
         inside = np.flatnonzero((self.t_s > begin_s + 1e-6) & (self.t_s <= end_s + 1e-6))

@@ -31,8 +31,7 @@ from app.platform.raw_bytes import RawFile, raw_file
 from app.study import service as study_service
 from app.tables.participants import Participant
 from app.tables.uploads import PREVIEW, StoredFile, UploadFile
-from ml.formats.recording import UndecodableFile
-from ml.formats.redaction_record import REDACTOR_VERSION
+from ml.formats import REDACTOR_VERSION, UndecodableFile
 
 
 def review(db: Session, file_id: int, caller: Caller) -> Iterator[bytes]:

@@ -10,7 +10,7 @@ from app.platform.errors import Invalid
 from app.study.outcomes import service as outcomes
 from app.tables.sessions import StudySession
 from app.tables.uploads import UploadFile
-from ml.formats.recording import GraspLog, TremorLog
+from ml.formats import GraspLog, TremorLog
 
 NO_SESSION = (
     "A grasp file names no clock, so that nobody can tell its session from it: it is kept. Attach it on the page of proposals, "

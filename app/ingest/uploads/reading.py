@@ -16,10 +16,7 @@ from app.platform.jobs.children.child import Cause, ChildLimits
 from app.platform.jobs.children.limited import ChildEnded, run_limited
 from app.platform.raw_bytes import RawFile
 from app.settings import get_settings
-from ml.formats import transfer
-from ml.formats.options import DecodeOptions
-from ml.formats.recording import DecodedFile, UndecodableFile
-from ml.formats.redaction_record import Redaction
+from ml.formats import DecodedFile, DecodeOptions, Redaction, UndecodableFile, transfer
 from ml.formats.tables.mapping import TableMapping
 
 log = structlog.get_logger()

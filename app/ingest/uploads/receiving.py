@@ -30,11 +30,8 @@ from app.settings import get_settings
 from app.tables.participants import Participant
 from app.tables.recordings import Recording
 from app.tables.uploads import PREVIEW, StoredFile, Upload, UploadFile
+from ml.formats import REDACTOR_VERSION, DecodedFile, DecodeOptions, FileReport, GraspLog, Problem, Redaction, Source, UndecodableFile
 from ml.formats.archive import cleaned_suffix
-from ml.formats.options import DecodeOptions
-from ml.formats.recording import DecodedFile, FileReport, GraspLog, Problem, UndecodableFile
-from ml.formats.redaction_record import REDACTOR_VERSION, Redaction
-from ml.formats.source import Source
 
 log = structlog.get_logger()
 

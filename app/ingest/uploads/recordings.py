@@ -18,8 +18,7 @@ from app.study.traces import pack
 from app.tables.participants import Participant
 from app.tables.recordings import Device, Recording, Trace
 from app.tables.uploads import UploadFile
-from ml.formats.recording import DECODE_VERSION, RecordingLog, TraceLog
-from ml.formats.redaction_record import pseudonym
+from ml.formats import DECODE_VERSION, RecordingLog, TraceLog, pseudonym
 
 
 @dataclass

@@ -32,7 +32,7 @@ from app.tables.participants import Participant
 from app.tables.recordings import Recording, Trace
 from app.tables.sessions import StudySession
 from app.tables.uploads import UploadFile
-from ml.formats.recording import DECODE_VERSION, DecodedFile, RecordingLog, UndecodableFile
+from ml.formats import DECODE_VERSION, DecodedFile, RecordingLog, UndecodableFile
 
 log = structlog.get_logger()
 

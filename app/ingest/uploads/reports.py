@@ -10,8 +10,7 @@ from typing import Any
 
 from app.ingest import wording
 from app.tables.uploads import PREVIEW, UploadFile
-from ml.formats.recording import FileReport, Problem
-from ml.formats.redaction_record import Redaction
+from ml.formats import FileReport, Problem, Redaction
 
 BEGUN = "begun"
 """Member of a file's report: how often reading it was begun, while it is being read."""

@@ -32,8 +32,7 @@ from app.study.visits.service import require_unlocked
 from app.tables.participants import Hemisphere, Participant
 from app.tables.sessions import Controller, StudySession
 from app.tables.uploads import Upload, UploadFile
-from ml.formats.options import BetaMeasure, DecodeOptions
-from ml.formats.recording import FileReport, Problem, UndecodableFile
+from ml.formats import BetaMeasure, DecodeOptions, FileReport, Problem, UndecodableFile
 
 __all__ = ["BetaStated", "FileOutcome", "Incoming", "UploadOutcome", "receive", "state_session", "stored_reports", "unreadable_members"]
 

@@ -18,7 +18,7 @@ from app.overview.samples.parquet import write_parquet
 from app.overview.samples.signal import Signal
 from app.platform.jobs import StepReport
 from ml import formats
-from ml.formats.recording import SampleLog, UndecodableFile
+from ml.formats import SampleLog, UndecodableFile
 
 WRITERS = {"parquet": write_parquet, "nwb": write_nwb}
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from app.overview.samples.compute import samples_within
 from app.platform.jobs import StepReport
-from ml.formats.recording import SampleLog
+from ml.formats import SampleLog
 from ml.sample_views import Stretch, pyramid, spectrogram
 
 HEADER = "channels.json"

@@ -24,7 +24,7 @@ from app.platform.jobs.children.limited import ChildEnded, run_limited
 from app.settings import get_settings, private_folder
 from app.study import blinding
 from app.tables.sessions import StudySession
-from ml.formats.recording import DECODE_VERSION
+from ml.formats import DECODE_VERSION
 from ml.sample_views import FIRST, Level, Spectrogram, fewer_columns, level_for
 
 BUILD = "app.overview.signals.compute:build"

@@ -8,8 +8,7 @@ from typing import Any
 
 from app.platform.web.numbers import stated
 from app.tables.recordings import Recording
-from ml.formats.rcs.packets.time import Rejected
-from ml.formats.rcs.quality import REJECTED_WORDS
+from ml.formats.rejection import REJECTED_WORDS, Rejected
 
 CLOCKS = {
     "pc": "clock of the PC that recorded (packet times)",

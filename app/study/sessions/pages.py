@@ -35,11 +35,12 @@ from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.stimulation import beside, delivered
 from app.study.traces import NO_CONTROL, control_programs, session_offset_s
 from app.study.visits.blinded import blinded_page
-from app.study.wording import ACTIVITIES, DEVICE_NAMES, EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
+from app.study.wording import ACTIVITIES, EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
 from app.tables.outcomes import QocRevision
 from app.tables.recordings import Recording
 from app.tables.sessions import StudySession
 from ml.energy import relative_energy
+from ml.formats import DEVICE_NAMES
 from ml.outcomes import FIELDS, OUTCOMES
 
 router = APIRouter()

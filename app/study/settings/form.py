@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any, Generic, TypeVar
 
 from app.platform.web.numbers import typed
+from ml.formats import SOURCE_NAMES
 from ml.outcomes import END_WEIGHTS
 
 Row = TypeVar("Row")
@@ -43,8 +44,7 @@ _WORDS: dict[str, Any] = {"maxlength": 40, "autocomplete": "off"}
 SOURCES = (
     ("", "not stated"),
     ("time_domain", "time-domain LFP, band-passed and averaged here"),
-    ("device_power", "band power computed on the device"),
-    ("percept_lfp", "Percept band power"),
+    *SOURCE_NAMES.items(),
     ("table", "uploaded table"),
 )
 

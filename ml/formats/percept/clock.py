@@ -10,7 +10,7 @@ from dataclasses import replace
 from datetime import datetime, timedelta
 from typing import Any
 
-from ml.formats.clocks import Moment, Offset, estimate, lead_in_words, unknown
+from ml.formats.facts.clocks import Moment, Offset, estimate, lead_in_words, unknown
 from ml.formats.percept.report_json import inside, moment
 from ml.formats.recording import FileReport
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.formats.facts.sentinels import reading, readings
 from ml.formats.percept.annotations import Annotation
 from ml.formats.percept.enums import UNKNOWN, mask, word
 from ml.formats.percept.facts import AMPLITUDE, BATTERY_MONTHS, BATTERY_PERCENT, IMPEDANCE, MAGNITUDE, POWER
@@ -21,7 +22,6 @@ from ml.formats.percept.keys import KEYS
 from ml.formats.percept.report_json import SIDES, entries, finite, inside, moment, samples, side_of
 from ml.formats.percept.words import EVENT_WORDS, cleaned
 from ml.formats.recording import EventLog
-from ml.formats.sentinels import reading, readings
 
 ToUtc = Callable[[datetime], datetime]
 """Converts a date of the report, on the implant's clock, to UTC."""

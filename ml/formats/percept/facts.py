@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ml.formats.counters import Counter
 from ml.formats.facts import ClockFact, DoseModifier, Facts
-from ml.formats.sentinels import UINT8, WIDE, Field
+from ml.formats.facts.counters import Counter
+from ml.formats.facts.sentinels import UINT8, WIDE, Field
 
 _TURN_MS = 65_536 * 50.0
 _INTEGER = "largest value of an integer of 16 or 32 bits, or -1"

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.archive import READ_ERRORS, ZipFiles, told
+from ml.formats.archive import READ_ERRORS, Files, ZipFiles, told
 from ml.formats.beta import channel_spectrum, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
 from ml.formats.percept import details
@@ -71,7 +71,7 @@ def decode_percept(path: Path, options: DecodeOptions, name: str | None = None) 
     return DecodedFile(tuple(recordings), tuple(reports))
 
 
-def report_members(files: ZipFiles, *, damaged: bool = False) -> list[str]:
+def report_members(files: Files, *, damaged: bool = False) -> list[str]:
     """List members of an archive that begin like a session report; with `damaged` also JSON files that cannot be read, to report them."""
     out = []
     for member in files.names():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from ml.formats.counters import shift_by_turns
+from ml.formats.facts.counters import shift_by_turns
 from ml.formats.percept.streams import TURN_MS, DevicePower, TimeDomain
 from ml.formats.recording import FileReport
 

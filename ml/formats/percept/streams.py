@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.beta import LARGEST_UV
-from ml.formats.counters import shift_by_turns, unwrap
+from ml.formats.facts.counters import shift_by_turns, unwrap
+from ml.formats.facts.sentinels import readings
 from ml.formats.percept.enums import word
 from ml.formats.percept.facts import AMPLITUDE, FACTS, POWER
 from ml.formats.percept.report_json import SIDES, channel_names, entries, finite, inside, moment, packet_list, samples, side_of
-from ml.formats.sentinels import readings
 
 Side = Literal["left", "right"]
 TURN_MS = FACTS.counters["TicksInMs"].turn

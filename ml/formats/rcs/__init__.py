@@ -1,6 +1,17 @@
-"""Summit RC+S session folders: read by `decode_rcs`, freed of identity by `redact_rcs_zip`; `find_sessions` lists those of an archive."""
+"""Summit RC+S session folders: `CODE` is what the registry of formats takes of this package."""
 
-from ml.formats.rcs.folder import decode_rcs, find_sessions
+from ml.formats.rcs.folder import LOOSE, decode_rcs, holds_session
+from ml.formats.rcs.packets.example import write_example
+from ml.formats.rcs.packets.facts import FACTS
 from ml.formats.rcs.redact import redact_rcs_zip
+from ml.formats.registry import FormatCode
 
-__all__ = ["decode_rcs", "find_sessions", "redact_rcs_zip"]
+CODE = FormatCode(
+    begins=lambda head: False,
+    within=holds_session,
+    redact=redact_rcs_zip,
+    decode=decode_rcs,
+    facts=FACTS,
+    example=write_example,
+    loose=LOOSE,
+)

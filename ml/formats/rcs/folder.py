@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 from ml.formats.archive import READ_ERRORS, Files, FolderFiles, ZipFiles, hint_of, told
+from ml.formats.loose import MIXED, LooseFiles, Opening, group
 from ml.formats.options import DecodeOptions
 from ml.formats.rcs.leads import leads_only
-from ml.formats.rcs.opening import HEAD, STEM_OF, Opening, group, read_opening
+from ml.formats.rcs.opening import HEAD, STEM_OF, read_opening, stem_in_name
 from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
 from ml.formats.rcs.packets.scan import Batch, batch_of, scan
 from ml.formats.rcs.packets.streams import (
@@ -42,7 +43,6 @@ TELLING = ("DeviceSettings", "StimLog", "AdaptiveLog")
 COUNTED = {"ErrorLog": "errors", "DiagnosticsLog": "diagnostics"}
 KEY_OF = {stem: key for key, stem in STEM_OF.items()}
 KNOWN = {name.lower(): name for name in (*NEEDED, *KEY_OF, *COUNTED)}
-MIXED = "the files of one folder name {} implants or sessions: each was taken as a recording of its own, for two are never mixed"
 NEEDED_SETTINGS = (
     "RecordInfo", "UtcOffset", "GeneralData", "SensingConfig", "SenseState", "AdaptiveConfig", "DetectionConfig", "BatteryStatus"
 )  # fmt: skip
@@ -77,6 +77,11 @@ def decode_rcs(path: Path, options: DecodeOptions, name: str | None = None) -> D
         return decode_files(files, options, name or path.name)
 
 
+def holds_session(files: Files, report: FileReport) -> bool:
+    """Decide whether any of the files is of a session; the report counts those that are not."""
+    return bool(find_sessions(files, report))
+
+
 def decode_files(files: Files, options: DecodeOptions, name: str) -> DecodedFile:
     """Decode every device folder among the files; see `decode_rcs`."""
     whole = FileReport(name)
@@ -94,8 +99,18 @@ def decode_files(files: Files, options: DecodeOptions, name: str) -> DecodedFile
         else:
             recordings.append(recording)
         reports.extend(session.reports.values())
+    if all(_is_empty(r) for r in recordings):
+        said = "this upload holds no data: no stream has a sample and no stimulation log an amplitude; kept as a recording without data"
+        whole.flagged.insert(0, said)
     whole.understood.append(f"{len(recordings)} RC+S recording{'s' if len(recordings) != 1 else ''}")
     return DecodedFile(tuple(recordings), tuple(reports))
+
+
+def _is_empty(recording: RecordingLog) -> bool:
+    """Decide whether a recording has neither a sample nor an amplitude in its stimulation log."""
+    logged = (e.data for e in recording.events if e.kind == "stimulation" and e.data["origin"] == "StimLog")
+    stimulated = any(program["amplitude_ma"] is not None for data in logged for program in data["programs"])
+    return recording.duration_s == 0 and not recording.traces and not stimulated
 
 
 def find_sessions(files: Files, report: FileReport) -> list[SessionFiles]:
@@ -108,9 +123,8 @@ def find_sessions(files: Files, report: FileReport) -> list[SessionFiles]:
     unknown = 0
     for name in files.names():
         path = PurePosixPath(name)
-        stem = KNOWN.get(path.stem.lower()) if path.suffix.lower() == ".json" else None
         opening = _opening(files, name)
-        stem = stem or opening.stem
+        stem = _stem_of(path) or opening.stem
         if stem is None:
             unknown += 1
         else:
@@ -119,6 +133,22 @@ def find_sessions(files: Files, report: FileReport) -> list[SessionFiles]:
         report.ignored.append(f"{unknown} file{'s' if unknown != 1 else ''} not of an RC+S session")
     found = [members for _, listed in sorted(folders.items()) for members in _apart(listed, report)]
     return [SessionFiles(members, f"recording {i}: " if len(found) > 1 else "") for i, members in enumerate(found, start=1)]
+
+
+def _stem_of(path: PurePosixPath) -> str | None:
+    """Find which file of a session has this very name."""
+    return KNOWN.get(path.stem.lower()) if path.suffix.lower() == ".json" else None
+
+
+def read_loose(name: str, head: bytes) -> Opening:
+    """Find which file of a session a loose file is: by its name or its content. Where that is empty or damaged, the beginning of its name
+    decides."""
+    path, opening = PurePosixPath(name), read_opening(head)
+    begun = stem_in_name(path.name) if path.suffix.lower() == ".json" else None
+    return replace(opening, stem=_stem_of(path) or opening.stem or begun)
+
+
+LOOSE = LooseFiles("RC+S files", HEAD, read_loose)
 
 
 def _opening(files: Files, name: str) -> Opening:

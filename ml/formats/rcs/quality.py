@@ -12,9 +12,10 @@ from ml.formats.rcs.beta import flat_share
 from ml.formats.rcs.packets.headers import PacketHeaders
 from ml.formats.rcs.packets.loss import Interval, loss_of
 from ml.formats.rcs.packets.streams import Power, TimeDomain, TimeSync
-from ml.formats.rcs.packets.time import LATE_MS, PacketTimes, RecordingTimes, Rejected
+from ml.formats.rcs.packets.time import LATE_MS, PacketTimes, RecordingTimes
 from ml.formats.rcs.settings import Settings
 from ml.formats.recording import FileReport
+from ml.formats.rejection import REJECTED_WORDS, Rejected
 
 STEMS = {
     "time_domain": "RawDataTD",
@@ -28,15 +29,6 @@ STEMS = {
 
 COUNTED = {"errors": "ErrorLog", "diagnostics": "DiagnosticsLog"}
 """Files whose records are counted."""
-
-REJECTED_WORDS = {
-    Rejected.DUPLICATE: "the same packet twice, sample by sample",
-    Rejected.UNPLACEABLE: "its ticks contradict both clocks",
-    Rejected.DAY_OFF: "timestamp more than a day off",
-    Rejected.CLOCKS_DISAGREE: "device and PC clock disagree by more than 2 s",
-    Rejected.STEPS_BACK: "PacketGenTime steps back",
-}
-"""Reasons why packets were ignored, in words; the last three are of decode versions up to 4."""
 
 SENSING_BITS = {"time_domain": 1, "fft": 2, "power": 4}
 """Bits of the sensing state with which a stream is on; the others run while any is set."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, UndecodableFile
@@ -17,7 +17,7 @@ from ml.formats.tables.redact import redact_table
 from ml.formats.tables.steps import decode_csv, decode_parquet
 from ml.formats.tables.strivepd import decode_strivepd, looks_like_tremor
 
-__all__ = ["TableKind", "decode_table", "kind_of_text", "redact_table"]
+__all__ = ["TABLES", "TableKind", "decode_table", "kind_of_text", "redact_table"]
 
 TableKind = Literal["csv", "parquet", "control_log", "tremor", "grasp", "mapped"]
 
@@ -31,9 +31,13 @@ _DECODERS: dict[TableKind, Callable[[Path, DecodeOptions, str | None], DecodedFi
 }
 
 
-def decode_table(path: Path, kind: TableKind, options: DecodeOptions, name: str | None = None) -> DecodedFile:
+TABLES: frozenset[str] = frozenset(_DECODERS)
+"""Kinds of tables."""
+
+
+def decode_table(path: Path, kind: str, options: DecodeOptions, name: str | None = None) -> DecodedFile:
     """Decode a table; see `ml.formats.decode`. Raises UndecodableFile."""
-    return _DECODERS[kind](path, options, name)
+    return _DECODERS[cast(TableKind, kind)](path, options, name)
 
 
 def kind_of_text(path: Source) -> TableKind:

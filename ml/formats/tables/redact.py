@@ -6,7 +6,6 @@ The result decodes to the same recording, minutes or grasp tests; texts of the f
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -21,10 +20,8 @@ from ml.formats.tables.removed import removed_columns
 from ml.formats.tables.steps import decode_columns
 from ml.formats.tables.strivepd import decode_strivepd
 
-TableKind = Literal["csv", "parquet", "control_log", "tremor", "grasp"]
 
-
-def redact_table(source: Source, target: Path, kind: TableKind, options: DecodeOptions) -> Redaction:
+def redact_table(source: Source, target: Path, kind: str, options: DecodeOptions) -> Redaction:
     """Write a table of the known columns alone; the same bytes in give the same bytes out.
 
     Headers become the column's role with its unit in brackets, cells the numbers that were read. A table of steps or of raw LFP keeps its
@@ -38,7 +35,10 @@ def redact_table(source: Source, target: Path, kind: TableKind, options: DecodeO
 
     Raises:
         UndecodableFile: the table cannot be decoded; nothing is written then.
+        ValueError: no kind of table, or one that a column mapping reads.
     """
+    if kind not in ("csv", "parquet", "control_log", "tremor", "grasp"):
+        raise ValueError(f"a file of kind {kind} is not cleaned here; a column mapping cleans the tables that it reads")
     if kind in ("tremor", "grasp"):
         return redact_outcomes(source, target, kind, options)
     if kind == "control_log":

@@ -14,9 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ml.formats import ArchiveLimits, DecodeOptions, UndecodableFile, decode, sniff
+from ml.formats import ArchiveLimits, DecodeOptions, UndecodableFile, decode, redact, sniff
 from ml.formats.archive import FolderFiles, ZipFiles
-from ml.formats.identity import redact
 
 
 def members(path, **limits):

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ml.formats import clocks
-from ml.formats.clocks import Moment, Offset, OtherClock, estimate
-from ml.formats.counters import shift_by_turns, unwrap
+from ml.formats.facts import clocks
+from ml.formats.facts.clocks import Moment, Offset, OtherClock, estimate
+from ml.formats.facts.counters import shift_by_turns, unwrap
+from ml.formats.facts.sentinels import reading, readings
 from ml.formats.percept.facts import FACTS as PERCEPT
 from ml.formats.rcs.packets.facts import FACTS as RCS
-from ml.formats.sentinels import reading, readings
 
 COUNTERS = {**PERCEPT.counters, **RCS.counters}
 FIELDS = {**PERCEPT.fields, **RCS.fields}

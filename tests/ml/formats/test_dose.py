@@ -8,9 +8,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from ml.formats import decode
+from ml.formats import decode, redact
 from ml.formats.dose import Cycle, Program, delivered_dose
-from ml.formats.identity import redact
 
 FOLDER = "Session1700000000000/DeviceNPC799999H/"
 TWO_MA = Program(True, 2.0, 60.0, (0.0, 3.0))

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from ml.formats import DEVICES, DeviceFormat
 from ml.formats.facts import Facts
-from ml.formats.percept.facts import FACTS as PERCEPT
-from ml.formats.rcs.packets.facts import FACTS as RCS
 
 DOCUMENT = Path(__file__).parents[3] / "docs/ingest.md"
 
@@ -28,15 +27,16 @@ def rows(name: str, facts: Facts) -> list[str]:
     return out
 
 
-@pytest.mark.parametrize(("name", "facts"), [("Percept", PERCEPT), ("RC+S", RCS)])
-def test_the_document_has_every_fact_of_a_format_and_no_other(name: str, facts: Facts) -> None:
+@pytest.mark.parametrize("one", DEVICES, ids=lambda one: one.kind)
+def test_the_document_has_every_fact_of_a_format_and_no_other(one: DeviceFormat) -> None:
+    name = one.device
     written = [
         line
         for line in DOCUMENT.read_text().splitlines()
         if line.startswith((f"| {name} | clock", f"| {name} | counter", f"| {name} | field", f"| {name} | dose"))
     ]
-    assert written == rows(name, facts)
+    assert written == rows(name, one.code.facts)
 
 
 if __name__ == "__main__":
-    sys.stdout.write("\n".join([*rows("Percept", PERCEPT), *rows("RC+S", RCS), ""]))
+    sys.stdout.write("".join(f"{row}\n" for one in DEVICES for row in rows(one.device, one.code.facts)))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ml.formats.counters import Counter
 from ml.formats.facts import ClockFact, DoseModifier, Facts
-from ml.formats.sentinels import UINT8, UINT32, WIDE, Field
+from ml.formats.facts.counters import Counter
+from ml.formats.facts.sentinels import UINT8, UINT32, WIDE, Field
 
 FACTS = Facts(
     clocks=(

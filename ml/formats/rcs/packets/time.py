@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from ml.formats.rcs.packets.clock import SECONDS_STEP_MS, PcClock, fit_clock, le
 from ml.formats.rcs.packets.headers import PacketHeaders
 from ml.formats.rcs.packets.loss import Gaps, find_gaps
 from ml.formats.rcs.packets.ticks import between_streams, device_ms
+from ml.formats.rejection import Rejected
 
 LATE_MS = 500.0
 """A packet is late when it arrives by so much more after it was measured than is usual in its stream."""
@@ -36,16 +36,6 @@ OFF_LATTICE_MS = 20.0
 
 Same = Callable[[int, int], bool]
 """Whether two packets of a stream, by their places in the file, hold the same samples."""
-
-
-class Rejected(StrEnum):
-    """Reason why a packet was ignored. The last three are of decode versions up to 4, whose recordings are shown as they were stored."""
-
-    DUPLICATE = "duplicate"
-    UNPLACEABLE = "unplaceable"
-    DAY_OFF = "day_off"
-    CLOCKS_DISAGREE = "clocks_disagree"
-    STEPS_BACK = "steps_back"
 
 
 @dataclass(frozen=True, slots=True)

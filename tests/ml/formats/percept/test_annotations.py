@@ -7,8 +7,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from ml.formats import decode
-from ml.formats.identity import redact
+from ml.formats import decode, redact
 from ml.formats.percept.annotations import SPEAKS_OF, gather
 from ml.formats.percept.words import KEY_WORDS, cleaned, typed
 from tests.ml.formats.conftest import PERCEPT_TIME

@@ -8,8 +8,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from ml.formats import decode
-from ml.formats.identity import redact
+from ml.formats import decode, redact
 from ml.formats.percept.streams import TURN_MS
 
 RIGHT, LEFT = "ONE_THREE_RIGHT", "ZERO_TWO_LEFT"

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ml.formats import UndecodableFile, decode, sniff
-from ml.formats.identity import redact
+from ml.formats import UndecodableFile, decode, redact, sniff
 
 RIGHT = "ONE_THREE_RIGHT"
 

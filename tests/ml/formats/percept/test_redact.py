@@ -5,8 +5,7 @@ import zipfile
 
 import pytest
 
-from ml.formats import UndecodableFile, decode, sniff
-from ml.formats.identity import redact
+from ml.formats import UndecodableFile, decode, redact, sniff
 from ml.formats.percept.enums import is_known
 from ml.formats.redaction_record import pseudonym
 

@@ -7,8 +7,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from ml.formats import DecodeOptions, decode, sniff
-from ml.formats.identity import redact
+from ml.formats import DecodeOptions, decode, redact, sniff
 from ml.formats.percept.details import groups
 from ml.formats.percept.enums import word
 from ml.formats.percept.report_json import channel_names, packet_list, side_of, utc_offset_h

@@ -14,7 +14,7 @@ import pytest
 
 from ml.formats import decode
 from ml.formats.rcs import folder as rcs_module
-from ml.formats.rcs import redact_rcs_zip
+from ml.formats.rcs.redact import redact_rcs_zip
 
 KEY = b"a key of the clinic's own"
 FOLDER = "DeviceNPC799999H/"

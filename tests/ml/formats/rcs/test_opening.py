@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from ml.formats import decode, sniff
-from ml.formats.rcs import redact_rcs_zip
-from ml.formats.rcs.opening import Opening, group, read_opening
+from ml.formats.loose import Opening, group
+from ml.formats.rcs.opening import read_opening
+from ml.formats.rcs.redact import redact_rcs_zip
 
 
 @pytest.mark.parametrize("name", ["stim_sweep", "embedded_adaptive", "montage_packet_loss", "empty_streams"])

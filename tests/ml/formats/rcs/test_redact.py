@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ml.formats import UndecodableFile, decode
-from ml.formats.rcs import redact_rcs_zip
+from ml.formats.rcs.redact import redact_rcs_zip
 from ml.formats.redaction_record import pseudonym
 
 KEY = b"a key of the clinic's own"

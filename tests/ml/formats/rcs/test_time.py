@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from ml.formats.rcs.packets.clock import fit_clock
 from ml.formats.rcs.packets.headers import PacketHeaders
 from ml.formats.rcs.packets.ticks import device_ms
-from ml.formats.rcs.packets.time import Rejected, reconstruct
+from ml.formats.rcs.packets.time import reconstruct
+from ml.formats.rejection import Rejected
 
 RATE = 500.0
 PER_PACKET = 50

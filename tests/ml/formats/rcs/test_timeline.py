@@ -10,7 +10,8 @@ import pytest
 from ml.formats import decode
 from ml.formats.rcs.packets.headers import PacketHeaders
 from ml.formats.rcs.packets.loss import loss_of
-from ml.formats.rcs.packets.time import Rejected, reconstruct, reconstruct_all
+from ml.formats.rcs.packets.time import reconstruct, reconstruct_all
+from ml.formats.rejection import Rejected
 
 START_MS = 1.7e12
 FOLDER = "Session1700000000000/DeviceNPC799999H/"

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ml.formats import UndecodableFile, decode, sniff
-from ml.formats.identity import redact
+from ml.formats import UndecodableFile, decode, redact, sniff
 from ml.formats.recording import TREMOR_CLASSES
 from ml.formats.tables.grasps import decode_grasps
 from ml.formats.tables.strivepd import decode_strivepd

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ml.formats import DecodeOptions, UndecodableFile, decode, sniff
-from ml.formats.identity import redact
+from ml.formats import DecodeOptions, UndecodableFile, decode, redact, sniff
 from ml.formats.tables.redact import redact_table
 
 KEY = b"a key of the clinic's own"

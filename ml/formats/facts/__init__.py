@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ml.formats.clocks import Clock
-from ml.formats.counters import Counter
-from ml.formats.sentinels import Field
+from ml.formats.facts.clocks import Clock
+from ml.formats.facts.counters import Counter
+from ml.formats.facts.sentinels import Field
 
 
 @dataclass(frozen=True, slots=True)

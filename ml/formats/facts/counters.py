@@ -1,6 +1,6 @@
 """Counters of devices that turn: the one function that lets them run on.
 
-The facts of each format list its counters (`ml/formats/facts.py`). Where two series of one device count differently, one running on and one
+The facts of each format list its counters (`ml/formats/facts`). Where two series of one device count differently, one running on and one
 turning, `shift_by_turns` finds the whole turns between them.
 """
 

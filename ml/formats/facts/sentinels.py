@@ -1,7 +1,7 @@
 """Values that a device writes where it has no reading, and the bounds of what each field can measure.
 
 A sentinel is the largest value of the field's integer, or -1. A value that is a sentinel, or outside the bounds, is no reading and becomes
-NaN. The facts of each format list its fields (`ml/formats/facts.py`).
+NaN. The facts of each format list its fields (`ml/formats/facts`).
 """
 
 from __future__ import annotations
