@@ -22,9 +22,7 @@ from app.study import repository as study_repository
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.participants import Participant
-from ml.ope.compare.ranking import default_method
-from ml.ope.estimate import Estimate
-from ml.ope.registry import AGGREGATE, POSTERIOR, shown
+from ml.ope import AGGREGATE, POSTERIOR, Estimate, default_method, shown
 
 
 def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams) -> list[Policy]:

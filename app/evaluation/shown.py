@@ -6,8 +6,7 @@ from typing import TypeVar
 
 from app.evaluation import wording
 from app.evaluation.schemas import EstimateSummary, FlagOut, ReasonOut
-from ml.ope.estimate import Estimate
-from ml.ope.flags import Flag
+from ml.ope import Estimate, Flag
 
 Shown = TypeVar("Shown", bound=EstimateSummary)
 

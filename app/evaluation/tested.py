@@ -16,8 +16,7 @@ from app.learning.policies.service import onnx_of, window_of
 from app.platform.errors import Invalid
 from app.tables.learning import BufferSnapshot, Policy
 from ml.mdp import MdpSettings
-from ml.ope.posterior.gaussian import QUANTITIES
-from ml.ope.posterior.tested import TestSession, differences_to_cdbs, spread_of_random
+from ml.ope import QUANTITIES, TestSession, differences_to_cdbs, spread_of_random
 from ml.trajectories import ReplayBuffer
 
 

@@ -9,7 +9,7 @@ from app.evaluation.ranking.results import RandomSessions
 from app.evaluation.schemas import Standing
 from app.evaluation.wording import OUTCOME_NAMES, amplitude, chance, number, percent, sentence, signed
 from app.platform.web.charts import counted
-from ml.ope.flags import Flag
+from ml.ope import Flag
 from ml.outcomes import ANY, OUTCOMES, Outcome
 from ml.qoc import Margins
 

@@ -9,7 +9,7 @@ from app.evaluation.ranking.answer import OFF_SHARE
 from app.evaluation.ranking.judged import Judged
 from app.platform.web.templates import render_part
 from app.study.margins.service import margins_of
-from ml.ope.posterior.verdict import NEARLY_OFF
+from ml.ope import NEARLY_OFF
 
 
 def what_next(judged: Judged, *, may_run: bool) -> Markup:

@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from app.platform.web.charts import counted
-from ml.ope.flags import Flag
-from ml.ope.registry import shown
+from ml.ope import Flag, shown
 from ml.outcomes import ALL, ANY, OUTCOMES
 
 UNSUPPORTED = "not supported by the data"

@@ -18,7 +18,7 @@ from app.platform import files
 from app.platform.jobs import JobContext
 from app.study.repository import settings_version
 from app.tables.learning import BufferSnapshot
-from ml.ope.registry import AGGREGATE, POSTERIOR, shown
+from ml.ope import AGGREGATE, POSTERIOR, shown
 
 FIT_WEIGHT = 15.0
 COVERAGE_STEP = "coverage"

@@ -19,7 +19,7 @@ from app.tables.adverse_events import AdverseEvent
 from app.tables.evaluations import Evaluation
 from app.tables.participants import Participant
 from app.tables.plans import Plan
-from ml.ope.flags import Flag
+from ml.ope import Flag
 
 Events = Mapping[int, tuple[AdverseEvent, ...]]
 """Serious adverse events that no clinician has cleared, by policy."""

@@ -21,7 +21,7 @@ from app.tables.plans import Plan, PlanItem
 from app.tables.sessions import Controller
 from ml.deploy.manifest import BundleManifest
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS, NEAR_SPREAD
-from ml.ope.posterior.portfolio import Suggestion
+from ml.ope import Suggestion
 
 LEAVE_AT_ONCE = "A stop, an adverse event or a lost link: back to cDBS at once; the rest of the session is not made up for."
 

@@ -2,7 +2,7 @@
 
 A session's log begins with its first step, yet stimulation acts over minutes. The dose before it is still at work while the discount is
 largest. Between sessions a participant is under clinical stimulation (cDBS), so that is expected. But a study may do otherwise, and some
-sessions do not record it. Where the amplitude in force before a session is on record, that is it (`ml.ope.fqe.steps.lead_dose`). For the
+sessions do not record it. Where the amplitude in force before a session is on record, that is it (`ml.ope.doses.lead_dose`). For the
 others, the evidence of the linear model of beta weighs the two accounts.
 """
 

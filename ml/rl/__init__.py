@@ -21,51 +21,29 @@ if TYPE_CHECKING:
     from ml.rl.training import TrainedPolicy, train, train_many
 
 _HOMES = {
-    "ALGORITHMS": "algorithms.registry",
-    "Algorithm": "algorithms.registry",
-    "CheckpointError": "loop",
-    "CriticConfig": "configs",
-    "DistilConfig": "distillation",
-    "HeldOutSessions": "held_out",
-    "MlpPolicy": "kernels.networks",
-    "SATURATION_MARGIN": "algorithms._learner",
-    "STUDENT_HIDDEN": "kernels.networks",
-    "TEACHER_HIDDEN": "kernels.networks",
-    "TrainConfig": "configs",
-    "TrainedPolicy": "training",
-    "TrainingDiverged": "loop",
-    "algorithm": "algorithms.registry",
-    "distil": "distillation",
-    "fit_end_reward": "end_reward",
-    "split_sessions": "held_out",
-    "train": "training",
-    "train_many": "training",
+    "algorithms.registry": ("ALGORITHMS", "Algorithm", "algorithm"),
+    "loop": ("CheckpointError", "TrainingDiverged"),
+    "configs": ("CriticConfig", "TrainConfig"),
+    "distillation": ("DistilConfig", "distil"),
+    "held_out": ("HeldOutSessions", "split_sessions"),
+    "kernels.networks": ("MlpPolicy", "STUDENT_HIDDEN", "TEACHER_HIDDEN"),
+    "algorithms._learner": ("SATURATION_MARGIN",),
+    "training": ("TrainedPolicy", "train", "train_many"),
+    "end_reward": ("fit_end_reward",),
 }
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
+# fmt: off
 __all__ = [
-    "ALGORITHMS",
-    "SATURATION_MARGIN",
-    "STUDENT_HIDDEN",
-    "TEACHER_HIDDEN",
-    "Algorithm",
-    "CheckpointError",
-    "CriticConfig",
-    "DistilConfig",
-    "HeldOutSessions",
-    "MlpPolicy",
-    "TrainConfig",
-    "TrainedPolicy",
-    "TrainingDiverged",
-    "algorithm",
-    "distil",
-    "fit_end_reward",
-    "split_sessions",
-    "train",
-    "train_many",
+    "ALGORITHMS", "SATURATION_MARGIN", "STUDENT_HIDDEN", "TEACHER_HIDDEN", "Algorithm", "CheckpointError", "CriticConfig",
+    "DistilConfig", "HeldOutSessions", "MlpPolicy", "TrainConfig", "TrainedPolicy", "TrainingDiverged", "algorithm", "distil",
+    "fit_end_reward", "split_sessions", "train", "train_many",
 ]
+# fmt: on
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    """Import a public name from its module. Raises AttributeError for any other name."""
+    if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)

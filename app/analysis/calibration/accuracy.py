@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.analysis.calibration.schemas import AccuracyOut, MethodMetricOut
-from ml.ope.compare.metrics import accuracy
-from ml.ope.estimate import LEVEL
+from ml.ope import LEVEL, accuracy
 from ml.statistics.bootstrap import percentile_interval, resamples
 
 Floats = NDArray[np.float64]

@@ -9,7 +9,7 @@ from app.analysis.calibration.schemas import AccuracyOut, CalibrationOut, Method
 from app.evaluation.ranking.charts import style
 from app.platform.web.charts import MUTED, Chart, axis, counted, figure
 from app.platform.web.numbers import hover
-from ml.ope.registry import shown as method_of
+from ml.ope import shown as method_of
 from ml.outcomes import OUTCOMES
 
 QUANTITY_NAMES = {

@@ -42,8 +42,7 @@ from app.tables.participants import Participant
 from app.tables.sessions import StudySession
 from app.tables.visits import Visit
 from ml.mdp import MdpSettings
-from ml.ope.estimate import LEVEL, Estimate
-from ml.ope.registry import method_keys
+from ml.ope import LEVEL, Estimate, method_keys
 from ml.returns import KNOWN_SHARE
 
 

@@ -17,8 +17,7 @@ from app.study.threshold import mdp_settings
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot
 from app.tables.participants import Participant
-from ml.ope.compare.metrics import accuracy
-from ml.ope.registry import shown
+from ml.ope import accuracy, shown
 
 WANTED_SEEDS = 3
 LEAST_POLICIES = 2

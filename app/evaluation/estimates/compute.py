@@ -15,21 +15,28 @@ from app.platform.web.numbers import number
 from ml import progress
 from ml.faults import said_of
 from ml.loading import load_libraries
-from ml.ope.compare.skill import held_out_skill
+from ml.ope import (
+    AGGREGATE,
+    POSTERIOR,
+    Size,
+    TestedDifference,
+    behaviour_map,
+    build,
+    diagnose,
+    estimators,
+    held_out_skill,
+    not_counted_tests,
+    quick_estimators,
+)
 from ml.ope.dlsm.config import DlsmConfig
-from ml.ope.flags import not_counted_tests
 from ml.ope.posterior.further_sessions import session_noise
-from ml.ope.posterior.gaussian import TestedDifference
-from ml.ope.registry import AGGREGATE, POSTERIOR, Size, build, estimators, quick_estimators
-from ml.ope.support.behaviour_map import behaviour_map
-from ml.ope.support.diagnostics import diagnose
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.policies.policy import Policy
 from ml.trajectories import ReplayBuffer
 
 if TYPE_CHECKING:
+    from ml.ope import FittedPosterior, Posterior
     from ml.ope.dlsm.estimator import Dlsm
-    from ml.ope.posterior.estimator import FittedPosterior, Posterior
 
 FIT_SHARE = 0.5
 """Share of an evaluation step's progress that fitting takes."""

@@ -12,8 +12,7 @@ from typing import Any
 from app.evaluation.schemas import CheckOut, CoverageOut
 from app.evaluation.shown import flag_out
 from app.tables.evaluations import Evaluation
-from ml.ope.estimate import Estimate
-from ml.ope.flags import Flag, distinct
+from ml.ope import Estimate, Flag, distinct
 
 STORED = "coverage"
 """Member of an evaluation's diagnostics."""

@@ -16,7 +16,7 @@ from app.tables.participants import Participant, SettingsVersion
 from ml.ope.outcomes.minutes import SHAPES
 
 if TYPE_CHECKING:
-    from ml.ope.posterior.estimator import FittedPosterior
+    from ml.ope import FittedPosterior
 
 STORED = "dose_shapes"
 """Member of an evaluation's diagnostics, and of what the posterior's compute step gives."""

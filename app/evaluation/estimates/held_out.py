@@ -13,10 +13,7 @@ from itertools import combinations
 from typing import Any
 
 from app.tables.evaluations import Evaluation
-from ml.ope.compare.aggregate import combine
-from ml.ope.compare.skill import with_held_out_error
-from ml.ope.estimate import Estimate
-from ml.ope.registry import AGGREGATE, POSTERIOR, shown
+from ml.ope import AGGREGATE, POSTERIOR, Estimate, combine, shown, with_held_out_error
 
 STORED = "held_out"
 """Member of an evaluation's diagnostics."""

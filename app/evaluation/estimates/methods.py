@@ -9,8 +9,7 @@ from pydantic import AfterValidator, Field, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from ml.ope import registry
-from ml.ope.registry import AGGREGATE
+from ml.ope import AGGREGATE, registry
 
 
 class _PublishedKeys:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from app.tables.evaluations import EstimateRow
-from ml.ope.estimate import Estimate
+from ml.ope import Estimate
 
 _COLUMNS = {column.key for column in EstimateRow.__table__.columns}
 

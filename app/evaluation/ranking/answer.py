@@ -12,9 +12,7 @@ from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.evaluation.ranking.decisions import Decided
 from app.study.margins.service import margins_of
 from app.tables.evaluations import Evaluation
-from ml.ope.estimate import Estimate
-from ml.ope.posterior.verdict import SAME_AMPLITUDE, chance_within, interval, outcome_draws
-from ml.ope.support.behaviour_map import BehaviourMap
+from ml.ope import SAME_AMPLITUDE, BehaviourMap, Estimate, chance_within, interval, outcome_draws
 from ml.outcomes import FIELDS
 
 ORDER = ("test", "test_with_care", "cannot_tell", "not_advised", "unsafe", "same_as_cdbs")

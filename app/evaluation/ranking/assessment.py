@@ -16,10 +16,8 @@ from app.platform.errors import Invalid
 from app.study import cdbs_amplitude
 from app.tables.evaluations import Evaluation
 from app.tables.participants import Participant, SettingsVersion
-from ml.ope.compare.ranking import rank_policies
-from ml.ope.estimate import Estimate
+from ml.ope import POSTERIOR, Estimate, rank_policies
 from ml.ope.posterior.further_sessions import Place
-from ml.ope.registry import POSTERIOR
 
 _LAST = ("unsafe",)
 """Verdicts that come last whatever is estimated, beside policies that the data do not support."""

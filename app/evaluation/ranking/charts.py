@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from app.evaluation.schemas import RankedPolicy, RankingOut
 from app.platform.web.charts import Chart, axis, counted, figure
-from ml.ope.registry import shown
+from ml.ope import shown
 
 
 def style(method: str) -> dict[str, str]:

@@ -12,13 +12,8 @@ from app.evaluation.schemas import Decision, Standing
 from app.study.margins.service import margins_of
 from app.tables.evaluations import Evaluation
 from app.tables.participants import MarginsVersion
-from ml.ope.compare.gain import gain_over
-from ml.ope.estimate import Estimate
-from ml.ope.flags import Flag
+from ml.ope import FEWEST_VISITS, HAZARDS, POSTERIOR, SETTLED_BY_SESSIONS, Estimate, Flag, Levels, Verdict, gain_over, verdict
 from ml.ope.posterior.further_sessions import Further, Place, further_sessions
-from ml.ope.posterior.support import FEWEST_VISITS
-from ml.ope.posterior.verdict import HAZARDS, SETTLED_BY_SESSIONS, Levels, Verdict, verdict
-from ml.ope.registry import POSTERIOR
 
 SESSION_NOISE = "session_noise"
 """Member of what `check_coverage` found: standard deviation of each outcome from session to session."""

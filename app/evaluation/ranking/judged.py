@@ -33,8 +33,7 @@ from app.study.sessions.repository import ReadOnce
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot
 from app.tables.participants import Participant, SettingsVersion
-from ml.ope.estimate import Estimate
-from ml.ope.registry import method_keys
+from ml.ope import Estimate, method_keys
 
 T = TypeVar("T")
 

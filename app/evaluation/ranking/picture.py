@@ -13,9 +13,7 @@ from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.platform.web.charts import Cell, written
 from app.platform.web.numbers import number
 from app.platform.web.svg import Plane, apart, drawing
-from ml.ope.estimate import Estimate
-from ml.ope.posterior.verdict import interval, outcome_draws
-from ml.ope.support.behaviour_map import DOSES, BehaviourMap
+from ml.ope import DOSES, BehaviourMap, Estimate, interval, outcome_draws
 from ml.outcomes import OUTCOMES
 
 MOST = 8

@@ -22,10 +22,7 @@ from app.study import service as study
 from app.study.sessions.repository import ReadOnce
 from app.tables.learning import BufferSnapshot
 from app.tables.participants import Participant
-from ml.ope.compare.gain import gain_over
-from ml.ope.estimate import Estimate
-from ml.ope.flags import Flag, distinct
-from ml.ope.registry import method_keys
+from ml.ope import Estimate, Flag, distinct, gain_over, method_keys
 
 
 def current_ranking(

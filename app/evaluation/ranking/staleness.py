@@ -27,7 +27,7 @@ from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot, SnapshotSession
 from app.tables.participants import Participant, SettingsVersion
 from app.tables.sessions import StudySession
-from ml.ope.flags import Flag
+from ml.ope import Flag
 
 NAMED = 5
 """Policies that are named where a ranking lacks some."""

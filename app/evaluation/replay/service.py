@@ -27,7 +27,7 @@ from app.tables.participants import Participant
 from app.tables.recordings import Trace
 from app.tables.sessions import StudySession
 from ml.energy import relative_energy
-from ml.ope.posterior.verdict import NEARLY_OFF, SAME_AMPLITUDE
+from ml.ope import NEARLY_OFF, SAME_AMPLITUDE
 from ml.policies.onnx_policy import PolicyFileError
 
 ASK = "app.evaluation.replay.compute:ask"

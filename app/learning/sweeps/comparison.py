@@ -8,7 +8,7 @@ from typing import Any
 
 from app.platform.web.charts import Chart, axis, counted, figure
 from app.tables.learning import Policy, Sweep
-from ml.ope.compare.selection import surest
+from ml.ope import surest
 from ml.policies.logged_range import LARGEST_SHARE_BELOW
 from ml.returns import Gain
 

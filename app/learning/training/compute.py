@@ -20,10 +20,8 @@ from app.platform.jobs import JobError, StepReport, write_atomically
 from ml import rl
 from ml.faults import said_of
 from ml.loading import load_libraries
+from ml.ope import Levels, PosteriorGain, TestedDifference, Tests, gains_over_cdbs
 from ml.ope.fqe.score import fqe_value
-from ml.ope.posterior.gains import PosteriorGain, Tests, gains_over_cdbs
-from ml.ope.posterior.gaussian import TestedDifference
-from ml.ope.posterior.verdict import Levels
 from ml.policies.from_buffer import behaviour_mean, proportional_from_buffer
 from ml.policies.logged_range import random_bound, share_below_bound, stays_in_range
 from ml.policies.onnx_policy import OnnxPolicy

@@ -18,7 +18,7 @@ from app.platform.errors import Invalid
 from app.platform.jobs import JobContext, JobError
 from app.study.repository import settings_version
 from app.tables.learning import BufferSnapshot, Policy
-from ml.ope.registry import POSTERIOR, shown
+from ml.ope import POSTERIOR, shown
 
 CHOOSE = "choose-parents"
 JUDGE = "judge-tested"

@@ -19,7 +19,7 @@ from app.study.blinding import arm
 from app.tables.evaluations import Evaluation
 from app.tables.learning import Policy
 from app.tables.participants import Participant
-from ml.ope.registry import POSTERIOR
+from ml.ope import POSTERIOR
 
 TRAINABLE = ("trained", "distilled")
 

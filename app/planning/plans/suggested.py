@@ -14,9 +14,8 @@ from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.judged import Judged
 from app.evaluation.repository import PolicyHead
 from app.planning.protocol.schedule import cdbs_sessions
+from ml.ope import FEWEST_DRAWS, Suggestion, portfolio
 from ml.ope.posterior.further_sessions import Hold, Place, worth_exploring, worth_holding
-from ml.ope.posterior.portfolio import Suggestion, portfolio
-from ml.ope.posterior.verdict import FEWEST_DRAWS
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from app.tables.participants import Participant
 from app.tables.plans import Plan, PlanItem
 from app.tables.sessions import Controller
 from app.tables.visits import Visit
-from ml.ope.estimate import Estimate
+from ml.ope import Estimate
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ from app.settings import get_settings
 from app.simulation.demo.data import DAY_WITH_POLICIES, Generation, LearnedPolicy, RecordedSession, Story, write
 from app.simulation.demo.study import trajectories
 from ml.mdp import MdpSettings
-from ml.ope.posterior.gains import PosteriorGain, Tests, gains_over_cdbs
-from ml.ope.posterior.tested import TestSession, differences_to_cdbs, spread_of_random
+from ml.ope import PosteriorGain, Tests, TestSession, differences_to_cdbs, gains_over_cdbs, spread_of_random
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.population import PARTICIPANTS, run_session
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet

@@ -31,7 +31,6 @@ class DlsmConfig:
         free_bits: KL of a step that costs nothing, nats.
         overshoot: free runs of the objective start from posterior states at a multiple of so many steps, drawn anew at every
             gradient step; 0: from the first step alone.
-        kl_weight, end_weight: weights in the objective; 1 and 1 is the bound.
         members: ensemble size, one seed each.
         steps: gradient steps at most. batch: sessions per step. learning_rate: of Adam, falling to a tenth along a half cosine.
         clip_norm: largest norm of the gradient. weight_decay: decoupled.
@@ -68,8 +67,6 @@ class DlsmConfig:
     reward_terms: bool = True
     free_bits: float = 0.0
     overshoot: int = 0
-    kl_weight: float = 1.0
-    end_weight: float = 1.0
     members: int = 5
     steps: int = 150
     batch: int = 32

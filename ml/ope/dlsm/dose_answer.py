@@ -17,7 +17,7 @@ from scipy.special import stdtrit
 from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.held_out import dose_slopes
 from ml.ope.dlsm.networks import DlsmNetworks
-from ml.ope.fqe.steps import memories
+from ml.ope.doses import memories
 
 FEWEST_SESSIONS = 4
 """Random sessions with doses that differ, below which the data say nothing."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ml.mdp import MdpSettings
 from ml.ope.dlsm.batches import Batch
 from ml.ope.dlsm.networks import DlsmNetworks
-from ml.ope.fqe.steps import memories
+from ml.ope.doses import memories
 from ml.ope.scale import Scale
 
 Floats = NDArray[np.float64]
@@ -312,7 +312,7 @@ def block_error(seen: Floats, predicted: Floats) -> Floats:
 def dose_slopes(actions: NDArray[Any], usable: NDArray[np.bool_], *betas: Floats) -> tuple[float, ...]:
     """Sum of squares of a session's doses over blocks, and the slope of each beta [T] on them; zeros where doses hardly differ.
 
-    The dose is the average over about 20 steps (`ml.ope.fqe.steps`); blocks as in `block_error`, of which three at least must count.
+    The dose is the average over about 20 steps (`ml.ope.doses`); blocks as in `block_error`, of which three at least must count.
     """
     dose = memories(actions.astype(np.float64))[:, 1]
     blocks = [slice(first, first + BLOCK) for first in range(0, usable.size, BLOCK)]

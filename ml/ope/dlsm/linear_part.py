@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from ml.ope.dlsm.batches import Batch
-from ml.ope.fqe.steps import after_doses, lead_doses
+from ml.ope.doses import after_doses, lead_doses
 from ml.ope.lead import dose_before
 from ml.ope.linear.dynamics import LinearResponse, SessionTable, filtered, fit_dynamics
 from ml.ope.scale import Scale

@@ -89,9 +89,9 @@ class Terms:
     kl_first: Tensor
     kl_path: Tensor
 
-    def bound(self, kl_weight: float = 1.0, end_weight: float = 1.0) -> Tensor:
-        """The evidence lower bound per session, [B], at weights 1; the training objective otherwise."""
-        return self.states + self.rewards + end_weight * self.outcomes - kl_weight * (self.kl_first + self.kl_path)
+    def bound(self) -> Tensor:
+        """Compute the evidence lower bound per session, [B]."""
+        return self.states + self.rewards + self.outcomes - (self.kl_first + self.kl_path)
 
 
 class DlsmNetworks(nn.Module):
@@ -180,9 +180,9 @@ class DlsmNetworks(nn.Module):
     def loss(self, batch: Batch, noise: Noise, fast: bool = True) -> Tensor:
         """The training objective, negated, per living step of the batch."""
         c = self.config
-        total = self.posterior_terms(batch, noise, fast).bound(c.kl_weight, c.end_weight).sum()
+        total = self.posterior_terms(batch, noise, fast).bound().sum()
         if c.objective == "sum":
-            total = total + self.free_running_terms(batch, noise, fast).bound(c.kl_weight, c.end_weight).sum()
+            total = total + self.free_running_terms(batch, noise, fast).bound().sum()
         return -total / batch.alive.sum()
 
     def _first(self, batch: Batch, noise: Noise) -> tuple[Tensor, Tensor, Tensor]:

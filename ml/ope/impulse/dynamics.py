@@ -19,8 +19,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.ope.doses import after_doses, held_amplitude, lead_dose, lead_doses
 from ml.ope.estimate import require_two_sessions
-from ml.ope.fqe.steps import after_doses, held_amplitude, lead_dose, lead_doses
 from ml.ope.linear.dynamics import autoregression, innovations_of, level_sums, log_noise_weights, split_coefficients, visit_numbers
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedFit, MixedModel
@@ -122,7 +122,7 @@ class ResponseTable:
 
     @classmethod
     def of(cls, session: SessionTrajectory, scale: Scale, otherwise: float | None = None) -> ResponseTable:
-        """Tables of a session after the dose before it, which is `otherwise` where no record says it (`ml.ope.fqe.steps.lead_dose`)."""
+        """Tables of a session after the dose before it, which is `otherwise` where no record says it (`ml.ope.doses.lead_dose`)."""
         a, window, before = held_amplitude(session), session.lead_beta.size, lead_dose(session, otherwise)
         first = a[0] if before is None else before
         means = {shape: lagged_means(dose(shape, np.concatenate([np.full(window, first), a]))) for shape in SHAPES}

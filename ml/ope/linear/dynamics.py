@@ -16,8 +16,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.ope.doses import DECAYS, after_doses, fresh_memory, held_amplitude, lead_dose, lead_doses, memories
 from ml.ope.estimate import require_two_sessions
-from ml.ope.fqe.steps import DECAYS, after_doses, fresh_memory, held_amplitude, lead_dose, lead_doses, memories
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedModel
 from ml.statistics.nested import SessionSums
@@ -42,7 +42,7 @@ def answers(a: Floats, memory: Floats) -> Floats:
     """What beta answers to, [N, 7]: the dose (average over about 20 steps), three differences in timing from it, three curvatures.
 
     Args:
-        a: amplitude, [N]. memory: memories of amplitudes with a in them, [N, 3]; `ml.ope.fqe.steps.DECAYS`.
+        a: amplitude, [N]. memory: memories of amplitudes with a in them, [N, 3]; `ml.ope.doses.DECAYS`.
     """
     return np.stack(_answers(a, memory.T), axis=1)
 
@@ -70,7 +70,7 @@ class SessionTable:
 
     @classmethod
     def of(cls, session: SessionTrajectory, scale: Scale, otherwise: float | None = None) -> SessionTable:
-        """Tables of a session after the dose before it, which is `otherwise` where no record says it (`ml.ope.fqe.steps.lead_dose`)."""
+        """Tables of a session after the dose before it, which is `otherwise` where no record says it (`ml.ope.doses.lead_dose`)."""
         a, before = held_amplitude(session), lead_dose(session, otherwise)
         own = answers(a, memories(a, before))
         first = a[:1] if before is None else np.array([before])

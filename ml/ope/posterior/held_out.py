@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.mdp import step_reward
-from ml.ope.fqe.steps import held_amplitude
+from ml.ope.doses import held_amplitude
 from ml.ope.linear.dynamics import noise_features
 from ml.ope.posterior.structures import Fit, LinearForm, take
 from ml.ope.scale import Scale

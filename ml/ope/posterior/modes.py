@@ -23,8 +23,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ml.ope.doses import after_doses, held_amplitude, lead_dose, lead_doses
 from ml.ope.estimate import require_two_sessions
-from ml.ope.fqe.steps import after_doses, held_amplitude, lead_dose, lead_doses
 from ml.ope.linear.dynamics import autoregression, innovations_of, level_sums, log_noise_weights, split_coefficients, visit_numbers
 from ml.ope.scale import Scale
 from ml.statistics.mixed import MixedFit, MixedModel

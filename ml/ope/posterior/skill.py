@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtr
 
 from ml.ope.behaviour import controllers
-from ml.ope.fqe.steps import held_amplitude
+from ml.ope.doses import held_amplitude
 from ml.ope.outcomes.model import COLUMN, EndModel
 from ml.ope.posterior.held_out import HeldOut
 from ml.ope.scale import outcome_table

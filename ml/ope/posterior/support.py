@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.ope.doses import held_amplitude
 from ml.ope.flags import Flag
-from ml.ope.fqe.steps import held_amplitude
 from ml.trajectories import ReplayBuffer
 
 Floats = NDArray[np.float64]

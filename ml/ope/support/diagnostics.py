@@ -10,9 +10,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ml.ope.doses import memories
 from ml.ope.estimate import checked_horizon
 from ml.ope.flags import Flag
-from ml.ope.fqe.steps import UsableSteps, memories, usable_steps
+from ml.ope.fqe.steps import UsableSteps, usable_steps
 from ml.ope.importance import ImportanceSampling, horizon_of_ten
 from ml.ope.support.coverage import (
     FEW_EFFECTIVE,

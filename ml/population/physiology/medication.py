@@ -63,9 +63,3 @@ def effect(regimen: Regimen, hours: NDArray[np.float64], dose_factor: float = 1.
         concentration += np.interp(hours - dose - delay_h, grid, curve, left=0.0, right=0.0)
     response = (dose_factor * concentration) ** HILL
     return LONG_DURATION_FLOOR + (1 - LONG_DURATION_FLOOR) * response / (EC50_MG_L**HILL + response)
-
-
-def since_dose(regimen: Regimen, hour: float) -> float | None:
-    """Compute the hours from the last dose of the day to an hour of it; None where there was none."""
-    before = [hour - dose for dose in regimen.levodopa_h if dose <= hour]
-    return min(before) if before else None

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from ml.ope.compare.metrics import accuracy
+from ml.ope.doses import fresh_memory, held_amplitude, memories
 from ml.ope.fqe.estimator import Fqe, FqeConfig, backward_induction, discounts, logged_returns, minutes_of, spectral_radius, within_reach
 from ml.ope.fqe.score import fqe_value
-from ml.ope.fqe.steps import RATES, TargetActions, fresh_memory, held_amplitude, memories, usable_steps
+from ml.ope.fqe.steps import RATES, TargetActions, usable_steps
 from ml.ope.outcomes.minutes import ABOVE, AMPLITUDE, BETA, ENERGY, step_features
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.qoc import Qoc

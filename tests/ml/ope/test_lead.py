@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ml.ope.doses import fresh_memory, lead_doses, remember
 from ml.ope.fqe.score import fqe_value
-from ml.ope.fqe.steps import fresh_memory, lead_doses, remember, usable_steps
+from ml.ope.fqe.steps import usable_steps
 from ml.ope.lead import CDBS, dose_before
 from ml.ope.posterior.structures import STRUCTURES
 from ml.ope.scale import learn_scale

@@ -17,7 +17,7 @@ from ml.ope.dlsm.estimator import Dlsm, FittedDlsm
 from ml.ope.dlsm.held_out import BLOCK, SessionError, dose_slopes, shares
 from ml.ope.dlsm.linear_part import LinearPart
 from ml.ope.dlsm.networks import DlsmNetworks
-from ml.ope.fqe.steps import memories
+from ml.ope.doses import memories
 from ml.ope.scale import learn_scale
 from ml.policies.policy import ConstantPolicy
 from ml.qoc import Qoc

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ml.mdp import MdpSettings
-from ml.ope.fqe.steps import memories
+from ml.ope.doses import memories
 from ml.ope.linear.dynamics import ANSWERS, LARGEST_ROOT, SessionTable, answers, fit_dynamics, noise_features
 from ml.ope.linear.estimator import LinearConfig, LinearModel
 from ml.ope.linear.held_out import block_error, mean_path, replay_skill

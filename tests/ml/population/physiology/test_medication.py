@@ -6,17 +6,11 @@ from scipy.integrate import solve_ivp
 
 from ml.population import PARTICIPANTS
 from ml.population.days import day_effect
-from ml.population.physiology.medication import LONG_DURATION_FLOOR, effect, effect_site_curve, since_dose
+from ml.population.physiology.medication import LONG_DURATION_FLOOR, effect, effect_site_curve
 
 
 def test_exposure_of_one_tablet_is_dose_times_bioavailability_over_clearance():
     assert np.trapezoid(effect_site_curve(), dx=1 / 120) == pytest.approx(100 * 0.84 / 30.9, rel=1e-3)
-
-
-def test_the_time_since_a_dose_is_that_of_the_last_one_of_the_day():
-    twice = PARTICIPANTS["P1"].regimen
-    assert [since_dose(twice, hour) for hour in (-2.5, -2.0, 2.5, 3.0, 4.0)] == [None, 0.0, 4.5, 0.0, 1.0]
-    assert since_dose(PARTICIPANTS["P2"].regimen, 1.0) is None
 
 
 def test_the_effect_site_follows_the_differential_equations():
