@@ -20,10 +20,10 @@ PAGE = ROOT / "docs" / "hazards.md"
 class Harm(StrEnum):
     """Harm to a participant."""
 
-    UNDER = "too little stimulation: symptoms return"
-    OVER = "too much stimulation: side effects"
-    SWINGS = "amplitudes that jump: discomfort, falls"
-    WRONG_RECORD = "a wrong record: later controllers learn from it"
+    UNDER = "under: too little stimulation, symptoms return"
+    OVER = "over: too much stimulation, side effects"
+    SWINGS = "jumps: amplitudes that jump, discomfort, falls"
+    WRONG_RECORD = "record: a wrong record, from which later controllers learn"
 
 
 class Severity(StrEnum):
@@ -70,58 +70,55 @@ _P1, _P2, _P3, _P4 = Likelihood.P1, Likelihood.P2, Likelihood.P3, Likelihood.P4
 HAZARDS: tuple[Hazard, ...] = (
     Hazard(
         "H01", "The bundle of another participant is started", (_U, _O), _S3, _P2,
-        "The manifest names the participant and is signed; the device side says who is connected, and any other name ends the "
-        "session before it begins; `--participant` checks what the clinician reads off the chart.",
+        "The signed manifest names the participant, and the device side names who is connected. Any other name ends the session before "
+        "it begins. `--participant` checks the code on the chart.",
         _P1,
-        "A device side that was set up with the wrong code states it with confidence: the sheet asks to compare it with the "
-        "programmer.",
+        "A device side set up with the wrong code is believed. The sheet asks to compare it with the programmer.",
     ),
     Hazard(
         "H02", "The controller is connected to the other side, or to another device", (_U, _O), _S3, _P2,
-        "Side, unit, source and period stand in the device's first line and must be the bundle's; without that line nothing but "
-        "cDBS is sent. Recordings of the other side are not used.",
-        _P1, "Leads that are swapped in the stimulator itself look right: contacts and side are on the sheet.",
+        "Side, unit, source and period are in the device's first line and must be the bundle's. Without that line only cDBS is sent. "
+        "Recordings of the other side are not used.",
+        _P1, "Leads swapped in the stimulator itself look right. Contacts and side are on the sheet.",
     ),
     Hazard(
         "H03", "Beta comes in another unit, or from another source", (_U, _O), _S3, _P3,
-        "Each value states unit and source; a window whose mean lies far from every level that was logged gives cDBS, whatever it "
-        "says of itself.",
+        "Each value states unit and source. A window whose mean is far from every logged level gives cDBS, whatever unit "
+        "it states.",
         _P1, "A scale error below about twice stays within the logged range.",
     ),
     Hazard(
         "H04", "A policy asks for nearly nothing", (_U,), _S3, _P3,
-        "Unsafe policies need a stated override in the plan; the clinician's lowest amplitude holds whatever the network answers; "
-        "sheet and page warn of policies that ask for less than was ever tried.",
+        "Unsafe policies need a stated override in the plan. The clinician's lowest amplitude applies whatever the network answers. "
+        "Sheet and page warn of policies that ask for less than was ever tried.",
         _P1, "The lowest amplitude itself may treat badly: stop rules and the stop button remain.",
     ),
     Hazard(
         "H05", "An amplitude leaves the limits", (_O, _U), _S3, _P2,
-        "The envelope outside the network cuts every answer to the clinician's limits, which lie within the stimulator's own; the "
+        "The envelope outside the network cuts every answer to the clinician's limits, which are within the stimulator's own. The "
         "device side has limits of its own and leaves them for no message.",
-        _P1, "Limits that were stated wrongly: they are signed with the plan, before any bundle is made.",
+        _P1, "Limits may be stated wrongly. They are signed with the plan, before any bundle is made.",
     ),
     Hazard(
         "H06", "The amplitude changes too fast", (_S,), _S2, _P4,
-        "The change from one decision to the next is bounded by the clinician's ramp, and by one period's worth however late a "
-        "decision comes.",
-        _P1, "The return to cDBS is not ramped, so that nobody stays under-treated on a signal that is not trusted.",
+        "The clinician's ramp bounds the change from one decision to the next. A late decision gets one period's worth.",
+        _P1, "The return to cDBS is not ramped, so that no participant stays under-treated on a signal that is not trusted.",
     ),
     Hazard(
         "H07", "Beta is stale or missing", (_U, _O), _S2, _P4,
-        "The runner keeps its own clock and decides in every period; beta that has not come a fifth of a period after it was due, "
-        "or that is older than 0.9 of a period, gives cDBS.",
+        "The runner keeps its own clock and decides in every period. Beta that is late by a fifth of a period, or older than 0.9 of a "
+        "period, gives cDBS.",
         _P1, "One lost value costs a whole window of cDBS.",
     ),
     Hazard(
         "H08", "Beta is no number, or the network fails", (_U, _O), _S2, _P3,
-        "Whatever is no amplitude empties the window; an answer that is no fraction in [0, 1] and an error of the network give "
-        "cDBS.",
+        "A value that is no amplitude empties the window. An answer outside [0, 1] and an error of the network give cDBS.",
         _P1, "None known.",
     ),
     Hazard(
         "H09", "Beta is saturated", (_U, _O), _S2, _P3,
-        "A value above three times the highest that was logged counts as saturated, and gives cDBS.",
-        _P1, "Where nothing was logged no bound is known; the bundle's sheet says so.",
+        "A value above three times the highest logged one counts as saturated, and gives cDBS.",
+        _P1, "Where nothing was logged, no bound is known. The bundle's sheet says so.",
     ),
     Hazard(
         "H10", "Beta is frozen: the same value comes again and again", (_U, _O), _S2, _P2,
@@ -130,70 +127,69 @@ HAZARDS: tuple[Hazard, ...] = (
     ),
     Hazard(
         "H11", "Messages are repeated, lost or cut off, or the link breaks", (_U, _O), _S2, _P3,
-        "Numbers that repeat, skip or begin anew, lines that are no message, and a lost connection give cDBS within one period, "
-        "and the window begins anew.",
+        "Numbers that repeat, skip or restart, lines that are no message, and a lost connection give cDBS within one period and a new "
+        "window.",
         _P1, "None known.",
     ),
     Hazard(
         "H12", "The clock of the device jumps", (_U, _O), _S2, _P2,
-        "Times of the device are held against the runner's own monotonic clock; a jump gives cDBS and a new window. In the "
-        "envelope a clock that runs back does the same.",
-        _P1, "A clock that is off by less than half a period from one value to the next goes unnoticed.",
+        "The device's times are compared with the runner's own monotonic clock. A jump gives cDBS and a new window. In the envelope a "
+        "clock that runs back does the same.",
+        _P1, "A clock that is off by less than half a period from one value to the next is not noticed.",
     ),
     Hazard(
         "H13", "The tablet stands still or sleeps", (_U, _O), _S2, _P3,
-        "The clock goes on while the tablet sleeps; values that waited are old when it wakes, a missed deadline gives cDBS and a "
-        "new window, and after a standstill so long that the device side's watchdog has returned to clinical settings the session "
-        "ends.",
+        "The clock continues while the tablet sleeps. Values that waited are old when it wakes. A missed deadline gives cDBS and a new "
+        "window. After a standstill that triggered the device side's watchdog, the session ends.",
         _P1, "None known.",
     ),
     Hazard(
         "H14", "A fault or an attacker floods the runner with lines", (_S, _U), _S2, _P1,
-        "At most one decision in half a period, a bound on lines that wait and on their length; the port is open to this machine "
+        "At most one decision in half a period; a bound on lines that wait and on their length. The port is open to this machine "
         "alone, and the first device keeps it.",
-        _P1, "Whoever has control of the tablet has control of its controller: lock it.",
+        _P1, "A person with control of the tablet has control of its controller: lock it.",
     ),
     Hazard(
         "H15", "The session does not end", (_U, _O), _S2, _P2,
-        "It ends by itself after its minutes, at midnight, when stopped from the tablet or the device, and then sends the return "
-        "to clinical settings as its last line.",
+        "It ends after its minutes, at midnight, or when stopped on the tablet or the device. Its last line is the return to clinical "
+        "settings.",
         _P1, "None known.",
     ),
     Hazard(
         "H16", "The runner, or the link to the device, dies", (_U, _O), _S3, _P3,
-        "The protocol carries a watchdog: after two missing messages the device side returns to clinical settings, shown with the "
+        "The protocol has a watchdog: after two missing messages the device side returns to clinical settings, shown with the "
         "runner killed. Whole rows of the log are on disk. Lines that are cut off or old are no messages.",
-        _P1, "A device side without the watchdog must not be connected: the reference shows what it does.",
+        _P1, "A device side without the watchdog must not be connected. The reference shows what it does.",
     ),
     Hazard(
         "H17", "A session is started again after a crash", (_U, _R), _S2, _P2,
-        "A slot runs once: it is noted on disk before the first amplitude. The next start refuses, says when it was broken off "
-        "and after how many decisions, and the device stays on clinical settings.",
-        _P1, "Another tablet does not know of it; the study notices the second log.",
+        "A slot runs once: it is noted on disk before the first amplitude. The next start refuses and reports when the session was "
+        "interrupted and after how many decisions. The device stays on clinical settings.",
+        _P1, "Another tablet does not know of it. The study notices the second log.",
     ),
     Hazard(
         "H18", "An outdated bundle runs: yesterday's, or of a plan that was replaced", (_U, _O), _S3, _P2,
-        "A bundle names its visit's day and runs on no other; plans that were replaced stand on the study's signed list of "
-        "withdrawals; a clock that was set back by a day is noticed.",
+        "A bundle names its visit's day and runs on no other. Replaced plans are on the study's signed list of withdrawals. A clock "
+        "set back by a day is noticed.",
         _P1, "On the day itself the list must reach the tablet.",
     ),
     Hazard(
         "H19", "A bundle runs that nobody signed, or that was changed", (_U, _O), _S3, _P2,
-        "Signature, hashes of all files and test vectors are checked at every start, and a bundle without a slot of a signed plan "
-        "runs on the bench alone. Bundles leave for the slots of signed plans.",
-        _P1, "The bundle's own runner is part of what was changed: `betaloop control` checks from outside.",
+        "Signature, hashes of all files and test vectors are checked at every start. A bundle without a slot of a signed plan runs "
+        "on the bench alone. Bundles leave for the slots of signed plans.",
+        _P1, "The bundle's own runner may be changed too. `betaloop control` checks from outside.",
     ),
     Hazard(
         "H20", "A policy is used after it was withdrawn", (_U, _O), _S3, _P2,
-        "No bundle leaves for it, and a bundle that has left is refused where the study's signed list of withdrawals names it; a "
-        "list once seen is remembered, and an older one is not taken in its place.",
+        "No bundle leaves for it. A bundle that has left is refused if the study's signed list of withdrawals names it. A list once "
+        "seen is remembered, and no older one replaces it.",
         _P1, "On the day itself the list must reach the tablet.",
     ),
     Hazard(
         "H21", "A log is uploaded for another participant or session, or its steps are shifted by one", (_R,), _S2, _P3,
-        "A log says whose it is, and of which slot of which signed bundle; uploaded for anybody else it is refused. Beta stands beside "
-        "the amplitude that was in force while it was measured.",
-        _P1, "Logs of before version 2 say nothing of themselves: they are assigned by a person.",
+        "A log names its participant, signed bundle and slot. Uploaded for another participant it is refused. Each row has beta and "
+        "the amplitude in force while it was measured.",
+        _P1, "Logs older than version 2 name nothing. A person assigns them.",
     ),
     Hazard(
         "H22", "Two forms of a controller answer differently", (_U, _O), _S3, _P2,
@@ -203,20 +199,20 @@ HAZARDS: tuple[Hazard, ...] = (
     ),
     Hazard(
         "H23", "A random session stays low for long, or its draws are lost", (_U, _R), _S2, _P2,
-        "Its amplitudes are laid out before the visit and signed with the bundle; they run within the same envelope, low ones at "
-        "the end alone, and each row of the log has its hold and density.",
-        _P1, "The session is unpleasant by design: a stop ends it on clinical settings.",
+        "Its amplitudes are fixed before the visit and signed with the bundle. They run within the same envelope, low ones at the end "
+        "alone. Each row of the log has its hold and density.",
+        _P1, "The session is unpleasant by design. A stop ends it on clinical settings.",
     ),
     Hazard(
         "H24", "An adverse event is written down, and the controller goes on", (_U, _O), _S3, _P2,
-        "What is entered on the clinic day, adverse events and its own Stop included, does not signal the control loop. Whoever runs the "
-        "session stops the controller on its tablet (Ctrl-C, or the device's stop), which returns to cDBS, the clinical settings, at once. "
-        "The form of an adverse event says to do so first; after a severe one the page asks for it until the return is confirmed. A policy "
-        "with a serious event that no clinician has cleared is unsafe from then on: no plan takes it without a clinician's reason. Of a "
-        "plan that was signed before, no further session starts and no bundle leaves, and the list of withdrawals names it, until a "
-        "clinician has cleared the event or signed a newer reason.",
-        _P1, "It rests on whoever runs the session: nothing in betaloop stops a session that runs because of what was written down. A "
-        "bundle that is on the tablet already is refused once the new list of withdrawals reaches it.",
+        "Entries of the clinic day, adverse events and its own Stop included, do not signal the control loop. The person who runs the "
+        "session stops the controller on its tablet (Ctrl-C, or the device's stop). It returns to cDBS, the clinical settings, at once. "
+        "The form of an adverse event asks for this first. After a severe one the page repeats it until the return is confirmed. A policy "
+        "with a serious event is unsafe until a clinician clears it: no plan takes it without a clinician's reason. Until the event is "
+        "cleared or a newer reason is signed, no further session of a signed plan starts, no bundle leaves, and the list of withdrawals "
+        "names it.",
+        _P1, "It depends on the person who runs the session: no entry stops a running session. A bundle already on the tablet is refused "
+        "once the new list of withdrawals reaches it.",
     ),
 )  # fmt: skip
 
@@ -242,24 +238,27 @@ def page(tests: Mapping[str, Sequence[str]]) -> str:
     """Write the text of docs/hazards.md, in Markdown."""
     lines = [
         "# Hazard log", "",
-        "In which ways could a controller harm, what stands against each, and which tests show it? In the form of ISO 14971:",
-        "hazardous situation, harm, risk before and after its control, what remains. This page is made from",
-        "`app/tablet/hazards.py` and from the tests (`python -m app.tablet.hazards`), and a test holds it current. A hazard without",
-        "a test that passes fails `make test`.", "",
-        "Severities and likelihoods are judgements of the authors, made without data on betaloop in use: a study that uses it reviews",
-        "them, and signs them, with its own device and its own risk management.", "",
-        *[f"* **{str(one.value)[:2]}** {str(one.value)[4:]}" for kind in (Severity, Likelihood) for one in kind], "",
+        "How could a controller harm, which control applies, which risk remains, and which tests verify the control? In the form of",
+        "ISO 14971. `python -m app.tablet.hazards` writes this page from `app/tablet/hazards.py` and the tests; a test keeps it current.",
+        "A hazard without a test that passes fails `make test`.", "",
+        "**Severities and likelihoods are judgements of the authors, without data on betaloop in use.** A study reviews and signs",
+        "them with its own device and its own risk management.", "",
+        "| | meaning |", "|---|---|",
+        *["| **{}** | {} |".format(*one.value.split(": ", 1)) for kind in (Harm, Severity, Likelihood) for one in kind], "",
         "| | situation | harm | before | control | after | what remains |", "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     lines += [
-        f"| {h.number} | {h.situation} | {'; '.join(h.harms)} | {h.severity.name} {h.before.name} | {h.control} | "
+        f"| {h.number} | {h.situation} | {', '.join(x.split(':')[0] for x in h.harms)} | {h.severity.name} {h.before.name} | {h.control} | "
         f"{h.severity.name} {h.after.name} | {h.residual} |"
         for h in HAZARDS
     ]
-    lines += ["", "## Tests", ""]
+    lines += ["", "## Tests", "", "Folders begin with `tests`.", "", "| | file: tests |", "|---|---|"]
     for hazard in HAZARDS:
-        lines += [f"**{hazard.number}** {hazard.situation}", "", *[f"* `{name}`" for name in tests.get(hazard.number, [])], ""]
-    return "\n".join(lines).rstrip() + "\n"
+        files: dict[str, list[str]] = {}
+        for path, _, name in (test.partition("::") for test in tests.get(hazard.number, [])):
+            files.setdefault(path.removeprefix("tests/"), []).append(f"`{name}`")
+        lines.append(f"| {hazard.number} | {'; '.join(f'{path}: ' + ', '.join(names) for path, names in files.items())} |")
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":
