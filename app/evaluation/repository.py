@@ -42,9 +42,9 @@ def lock_job(db: Session, job_id: str) -> None:
     db.execute(text("select pg_advisory_xact_lock(hashtextextended(:key, 0))"), {"key": f"evaluation:{job_id}"})
 
 
-def evaluation_of_job(db: Session, job_id: str) -> Evaluation | None:
-    """What a job evaluated."""
-    return db.scalar(select(Evaluation).where(Evaluation.job_id == job_id))
+def evaluation_of_job(db: Session, job_id: str, *, first_answer: bool = False) -> Evaluation | None:
+    """Find what a job evaluated in the end, or as its first answer."""
+    return db.scalar(select(Evaluation).where(Evaluation.job_id == job_id, Evaluation.first_answer.is_(first_answer)))
 
 
 def evaluation(db: Session, participant_id: int, evaluation_id: int) -> Evaluation | None:

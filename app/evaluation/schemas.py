@@ -174,6 +174,7 @@ class RankingOut(Model):
     participant: str
     evaluation_id: int
     job_id: str | None = Field(description="The job that made it, with its learning curves.")
+    first_answer: bool = Field(description="Whether the job stored it before it trained, so that the job's own ranking follows.")
     created_at: datetime
     default_method: str
     methods: list[str]

@@ -25,8 +25,11 @@ from app.tables.participants import Participant
 from ml.ope import AGGREGATE, POSTERIOR, Estimate, default_method, shown
 
 
-def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams) -> list[Policy]:
+def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams, *, least: int = 1) -> list[Policy]:
     """The candidates of an evaluation.
+
+    Args:
+        least: 0 where references alone are an answer too.
 
     Raises:
         NotFound: no such policy. Invalid: there is none, or a retired one or one of another window is named, or a stored file is missing.
@@ -34,10 +37,10 @@ def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams) -
     window = db.get_one(Participant, participant_id).current_settings.window
     if not params.policies:
         found = list(learning.candidates(db, participant_id))
-        if not found:
+        if not found and least:
             raise Invalid("There is no policy to rank.", "Train policies, or upload one made elsewhere as an ONNX file.")
         fitting = [p for p in found if window_of(p) == window]
-        if not fitting:
+        if not fitting and least:
             raise Invalid(
                 f"None of the {len(found)} policies takes windows of {window} beta amplitudes, as the settings say now.",
                 "Train policies with these settings, or set the window back.",
@@ -66,6 +69,7 @@ def store_evaluation(
     config: Mapping[str, Any],
     skill: Mapping[str, Any] | None = None,
     coverage: Mapping[str, Any] | None = None,
+    first_answer: bool = False,
 ) -> Evaluation:
     """Store every method's estimates of every policy; a job that has stored its evaluation gets that one.
 
@@ -80,6 +84,7 @@ def store_evaluation(
         config: how the methods ran; where its `methods` name the combination, that is computed here from the others.
         skill: what `choose_method` found out on left-out controllers: it widens the intervals of the single methods.
         coverage: what `check_coverage` found out; a policy that it refuses is not supported by the data, whatever a method says of it.
+        first_answer: whether it is the job's first answer, which its own evaluation follows.
 
     Raises:
         Invalid: no method could speak; lists why.
@@ -87,7 +92,7 @@ def store_evaluation(
     if job_id is not None:
         # the job's row is locked by whoever stores for it; this covers direct calls too
         repository.lock_job(db, job_id)
-        known = repository.evaluation_of_job(db, job_id)
+        known = repository.evaluation_of_job(db, job_id, first_answer=first_answer)
         if known is not None:
             return known
     estimates: dict[str, dict[str, Estimate]] = {
@@ -105,12 +110,13 @@ def store_evaluation(
         reasons = "; ".join(f"{shown(m).name}: {reason}" for m, reason in failed.items())
         raise Invalid(f"No method could estimate these policies: {reasons}.", "Collect more sessions, then evaluate again.")
     ranked = {m: {i: e for i, e in table.items() if int(i) in set(candidates)} for m, table in estimates.items()}
-    able = {m: table for m, table in ranked.items() if table}
+    able = {m: table for m, table in ranked.items() if table} if candidates else estimates
     row = Evaluation(
         participant_id=snapshot.participant_id,
         snapshot_id=snapshot.id,
         settings_version_id=snapshot.settings_version_id,
         job_id=job_id,
+        first_answer=first_answer,
         horizon_steps=horizon_steps,
         gamma=study_repository.settings_version(db, snapshot.settings_version_id).gamma,
         default_method=POSTERIOR if POSTERIOR in able else default_method(able),

@@ -1,4 +1,7 @@
-"""The kind `evaluate`, and its stages for longer jobs: fit the DLSM, check coverage, estimate by every method, rank by the posterior."""
+"""The kind `evaluate`, and its stages for longer jobs: fit the DLSM, check coverage, estimate by every method, rank by the posterior.
+
+A longer job gives a first answer before it trains: what is there already, and the references, by the posterior alone.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +24,12 @@ from app.tables.learning import BufferSnapshot
 from ml.ope import AGGREGATE, POSTERIOR, shown
 
 FIT_WEIGHT = 15.0
-COVERAGE_STEP = "coverage"
+CHOOSE, COVERAGE, ESTIMATE, RANK = "choose-policies", "coverage", f"estimate/{POSTERIOR}", "rank"
 COVERAGE_WEIGHT = 1.0
 SKILL_STEP = "choose-method"
 SKILL_WEIGHT = 2.0
+FIRST = "first-answer/"
+"""Head of the steps of a first answer."""
 
 
 def run_evaluate(job: JobContext) -> dict[str, Any]:
@@ -41,12 +46,39 @@ def declare_evaluation(job: JobContext, params: EvaluateParams, *, fit: bool) ->
     """Show the evaluation stage from the start."""
     if fit:
         declare_fit(job, params)
-    job.step("choose-policies", "Choose policies and references", weight=STORE_WEIGHT)
-    job.step(COVERAGE_STEP, "Check what the data can say about each policy", weight=COVERAGE_WEIGHT)
+    job.step(CHOOSE, "Choose policies and references", weight=STORE_WEIGHT)
+    job.step(COVERAGE, "Check what the data can say about each policy", weight=COVERAGE_WEIGHT)
     for method in _fitted(params):
         job.step(f"estimate/{method}", f"Estimate every policy: {shown(method).name}", weight=shown(method).weight)
     job.step(SKILL_STEP, "Hold the methods against controllers that were left out", weight=SKILL_WEIGHT)
-    job.step("rank", "Store the estimates and rank", weight=STORE_WEIGHT)
+    job.step(RANK, "Store the estimates and rank", weight=STORE_WEIGHT)
+
+
+def declare_first_answer(job: JobContext) -> None:
+    """Show the first answer from the start."""
+    job.step(FIRST + CHOOSE, "First answer: choose policies and references", weight=STORE_WEIGHT)
+    job.step(FIRST + COVERAGE, "First answer: check what the data can say about each policy", weight=COVERAGE_WEIGHT)
+    job.step(FIRST + ESTIMATE, "First answer: estimate policies and references", weight=shown(POSTERIOR).weight)
+    job.step(FIRST + RANK, "First answer: store the estimates", weight=STORE_WEIGHT)
+
+
+def first_answer(job: JobContext, params: EvaluateParams, snapshot: dict[str, Any]) -> dict[str, Any]:
+    """Estimate by the posterior what there is before any policy is trained, and store that as the ranking until the job's own is there.
+
+    Returns:
+        `returns`, the posterior's by policy id; or `failed` with the reason where it cannot work on these data, and then nothing is stored.
+    """
+    choice = _choose(job, params, snapshot, FIRST)
+    coverage, found = job.compute_all(
+        [
+            (FIRST + COVERAGE, "check_coverage", _common(params, snapshot, choice)),
+            (FIRST + ESTIMATE, "evaluate_method", _call(params, snapshot, choice, POSTERIOR)),
+        ]
+    )
+    if "failed" in found:
+        return found
+    _store(job, params.model_copy(update={"methods": [POSTERIOR]}), snapshot, choice, {POSTERIOR: found}, coverage, head=FIRST)
+    return {"returns": {policy_id: float(e["value"]) for policy_id, e in found["estimates"].items()}}
 
 
 def declare_fit(job: JobContext, params: EvaluateParams) -> None:
@@ -77,10 +109,23 @@ def store_members(job: JobContext, results: Sequence[dict[str, Any]]) -> dict[st
 
 def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, Any], models: dict[str, Any]) -> dict[str, Any]:
     """Check coverage, estimate candidates and references by every method, the posterior with what tested sessions showed, and rank."""
+    choice = _choose(job, params, snapshot)
+    methods, common = _fitted(params), _common(params, snapshot, choice)
+    calls: list[ComputeStep] = [(COVERAGE, "check_coverage", common)]
+    own = {"dlsm": models}
+    calls += [(f"estimate/{m}", "evaluate_method", _call(params, snapshot, choice, m) | own.get(m, {})) for m in methods]
+    calls.append((SKILL_STEP, "choose_method", common | {"methods": params.methods, "policies": choice["ran"]}))
+    coverage, *estimates, skill = job.compute_all(calls)
+    results = dict(zip(methods, estimates, strict=True))
+    return _store(job, params, snapshot, choice, results, coverage, skill, members=models.get("members", []))
+
+
+def _choose(job: JobContext, params: EvaluateParams, snapshot: dict[str, Any], head: str = "") -> dict[str, Any]:
+    """Choose candidates and references, and collect what tested sessions and other participants say; a first answer needs no candidate."""
 
     def choose(db: Session) -> dict[str, Any]:
         row = db.get_one(BufferSnapshot, snapshot["id"])
-        candidates = service.policies_to_rank(db, row.participant_id, params)
+        candidates = service.policies_to_rank(db, row.participant_id, params, least=0 if head else 1)
         buffer = read_buffer(row.file_sha256)
         participant = participant_of(db, job)
         references = ensure_baselines(db, participant, row, buffer, job.created_by)
@@ -99,43 +144,58 @@ def evaluate_all(job: JobContext, params: EvaluateParams, snapshot: dict[str, An
             "others": dose_shapes.of_others(db, participant, settings_version(db, row.settings_version_id)),
         }
 
-    chosen = job.transact("choose-policies", choose)
-    common = {
-        "snapshot_sha256": snapshot["sha256"],
-        "preset": params.preset,
-        "seed": params.seed,
-        "horizon_steps": chosen["horizon_steps"],
-        "policies": chosen["policies"],
-    }
-    methods = _fitted(params)
-    others = chosen["others"]
-    pooled = {"others": others["evidence"]} if others else {}
-    shown_by = {name: chosen[name] for name in ("tests", "tested", "tests_left_out")}
-    own: dict[str, dict[str, Any]] = {"dlsm": models, POSTERIOR: shown_by | pooled}
-    calls: list[ComputeStep] = [(COVERAGE_STEP, "check_coverage", common)]
-    calls += [(f"estimate/{method}", "evaluate_method", common | {"method": method} | own.get(method, {})) for method in methods]
-    calls.append((SKILL_STEP, "choose_method", common | {"methods": params.methods, "policies": chosen["ran"]}))
-    coverage, *estimates, skill = job.compute_all(calls)
-    results = dict(zip(methods, estimates, strict=True))
+    return job.transact(head + CHOOSE, choose)
+
+
+def _common(params: EvaluateParams, snapshot: dict[str, Any], choice: dict[str, Any]) -> dict[str, Any]:
+    """Build the params that every compute step of an evaluation has."""
+    named = {"preset": params.preset, "seed": params.seed, "horizon_steps": choice["horizon_steps"], "policies": choice["policies"]}
+    return {"snapshot_sha256": snapshot["sha256"]} | named
+
+
+def _call(params: EvaluateParams, snapshot: dict[str, Any], choice: dict[str, Any], method: str) -> dict[str, Any]:
+    """Build the params of a method's step; the posterior alone knows of tests and of other participants."""
+    own: dict[str, Any] = {}
+    if method == POSTERIOR:
+        own = {name: choice[name] for name in ("tests", "tested", "tests_left_out")}
+        own |= {"others": choice["others"]["evidence"]} if choice["others"] else {}
+    return _common(params, snapshot, choice) | {"method": method} | own
+
+
+def _store(
+    job: JobContext,
+    params: EvaluateParams,
+    snapshot: dict[str, Any],
+    choice: dict[str, Any],
+    results: dict[str, dict[str, Any]],
+    coverage: dict[str, Any],
+    skill: dict[str, Any] | None = None,
+    *,
+    members: Sequence[str] = (),
+    head: str = "",
+) -> dict[str, Any]:
+    """Store an evaluation as the participant's newest; `head` is that of the steps of a first answer."""
+    others = choice["others"]
 
     def store(db: Session) -> dict[str, Any]:
         row = service.store_evaluation(
             db,
             job_id=job.id,
+            first_answer=bool(head),
             created_by=job.created_by,
             snapshot=db.get_one(BufferSnapshot, snapshot["id"]),
-            horizon_steps=chosen["horizon_steps"],
-            candidates=chosen["candidates"],
+            horizon_steps=choice["horizon_steps"],
+            candidates=choice["candidates"],
             results=results,
             config=params.model_dump(mode="json")
-            | {"dlsm_members": models.get("members", [])}
+            | {"dlsm_members": list(members)}
             | ({"pooled_evaluations": others["evaluations"]} if others else {}),
             skill=skill,
             coverage=coverage,
         )
         return {"evaluation_id": row.id, "default_method": row.default_method}
 
-    return job.transact("rank", store)
+    return job.transact(head + RANK, store)
 
 
 def _fitted(params: EvaluateParams) -> list[str]:

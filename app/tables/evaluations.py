@@ -21,13 +21,14 @@ class Evaluation(Base):
     """Every candidate policy estimated on one buffer snapshot under one settings version: what a ranking is made of."""
 
     __tablename__ = "evaluation"
-    __table_args__ = (CheckConstraint("horizon_steps >= 1", name="horizon"),)
+    __table_args__ = (UniqueConstraint("job_id", "first_answer"), CheckConstraint("horizon_steps >= 1", name="horizon"))
 
     id: Mapped[int] = mapped_column(primary_key=True)
     participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
     snapshot_id: Mapped[int] = mapped_column(ForeignKey("buffer_snapshot.id"))
     settings_version_id: Mapped[int] = mapped_column(ForeignKey("settings_version.id"))
-    job_id: Mapped[str | None] = mapped_column(ForeignKey("job.id"), unique=True)
+    job_id: Mapped[str | None] = mapped_column(ForeignKey("job.id"))
+    first_answer: Mapped[bool] = mapped_column(server_default="false")
     horizon_steps: Mapped[int]
     gamma: Mapped[float]
     default_method: Mapped[str] = mapped_column(String(40))

@@ -783,6 +783,7 @@ def upgrade() -> None:
         sa.Column("snapshot_id", sa.Integer(), nullable=False),
         sa.Column("settings_version_id", sa.Integer(), nullable=False),
         sa.Column("job_id", sa.String(length=36), nullable=True),
+        sa.Column("first_answer", sa.Boolean(), server_default=sa.text("false"), nullable=False),
         sa.Column("horizon_steps", sa.Integer(), nullable=False),
         sa.Column("gamma", sa.Double(), nullable=False),
         sa.Column("default_method", sa.String(length=40), nullable=False),
@@ -799,7 +800,7 @@ def upgrade() -> None:
         ),
         sa.ForeignKeyConstraint(["snapshot_id"], ["buffer_snapshot.id"], name=op.f("fk_evaluation_snapshot_id_buffer_snapshot")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_evaluation")),
-        sa.UniqueConstraint("job_id", name=op.f("uq_evaluation_job_id")),
+        sa.UniqueConstraint("job_id", "first_answer", name=op.f("uq_evaluation_job_id_first_answer")),
     )
     op.create_index(op.f("ix_evaluation_participant_id"), "evaluation", ["participant_id"], unique=False)
     op.create_table(

@@ -39,8 +39,8 @@ class Method:
         needs: what the data must have for it, for people.
         factory: `module:attribute` of a `Factory`; None for the combination.
         held_out: whether it is fitted within seconds, so that it can be refitted without each controller and held against its sessions.
-        quick: whether the preset `quick` runs it where nothing is said: one method of every family.
-        on_request: only run where it is named: no preset has it, and it is never taken by default.
+        by_default: whether it runs where no methods are named: the answer rests on it, or it checks the answer within seconds.
+        combines: whether the combination of all takes it where it ran.
         preference: place in the usual order where the data choose no method; None for a method that is never taken by default.
         weight: share of a job's progress that its step takes.
         colour, symbol: of its marks in charts: a colour token of the pages, and a plotly symbol that has an open form.
@@ -53,8 +53,8 @@ class Method:
     needs: str
     factory: str | None
     held_out: bool = False
-    quick: bool = False
-    on_request: bool = False
+    by_default: bool = False
+    combines: bool = True
     preference: int | None = None
     weight: float = 1.0
     colour: str = "other"
@@ -85,19 +85,19 @@ def unregister(key: str) -> None:
 
 # fmt: off
 for _method in (
-    Method(key="dlsm", name="DLSM", short="DLSM", family="model", needs="four sessions", factory="ml.ope.dlsm.estimator:build", quick=True, preference=2, weight=6.0, colour="rl", symbol="diamond"),  # noqa: E501
-    Method(key="dlsm_paper", name="DLSM (paper)", short="DLSM (paper)", family="model", needs="four sessions", factory="ml.ope.dlsm.estimator:build_paper", on_request=True, weight=8.0, colour="rl", symbol="diamond-wide"),  # noqa: E501
-    Method(key="linear", name="Linear model", short="Linear", family="model", needs="two sessions", factory="ml.ope.linear.estimator:build", held_out=True, quick=True, preference=1, weight=2.0, colour="distilled", symbol="square"),  # noqa: E501
-    Method(key="impulse", name="Impulse-response model", short="Impulse", family="model", needs="two sessions", factory="ml.ope.impulse.estimator:build", weight=2.0, colour="good", symbol="hourglass"),  # noqa: E501
+    Method(key="dlsm", name="DLSM", short="DLSM", family="model", needs="four sessions", factory="ml.ope.dlsm.estimator:build", preference=2, weight=6.0, colour="rl", symbol="diamond"),  # noqa: E501
+    Method(key="dlsm_paper", name="DLSM (paper)", short="DLSM (paper)", family="model", needs="four sessions", factory="ml.ope.dlsm.estimator:build_paper", combines=False, weight=8.0, colour="rl", symbol="diamond-wide"),  # noqa: E501
+    Method(key="linear", name="Linear model", short="Linear", family="model", needs="two sessions", factory="ml.ope.linear.estimator:build", by_default=True, held_out=True, preference=1, weight=2.0, colour="distilled", symbol="square"),  # noqa: E501
+    Method(key="impulse", name="Impulse-response model", short="Impulse", family="model", needs="two sessions", factory="ml.ope.impulse.estimator:build", by_default=True, weight=2.0, colour="good", symbol="hourglass"),  # noqa: E501
     Method(key="dlmm", name="DLMM", short="DLMM", family="model", needs="two sessions", factory="ml.ope.dlmm:build", weight=3.0, colour="accent", symbol="hexagram"),  # noqa: E501
-    Method(key="fqe", name="Fitted Q evaluation", short="FQE", family="value", needs=_START, factory="ml.ope.fqe.estimator:build", held_out=True, quick=True, preference=3, colour="cdbs", symbol="circle"),  # noqa: E501
-    Method(key="wdr", name="Weighted doubly robust", short="WDR", family="value", needs=_START, factory="ml.ope.doubly_robust:build", held_out=True, quick=True, preference=4, weight=2.0, colour="no_dbs", symbol="cross"),  # noqa: E501
+    Method(key="fqe", name="Fitted Q evaluation", short="FQE", family="value", needs=_START, factory="ml.ope.fqe.estimator:build", held_out=True, preference=3, colour="cdbs", symbol="circle"),  # noqa: E501
+    Method(key="wdr", name="Weighted doubly robust", short="WDR", family="value", needs=_START, factory="ml.ope.doubly_robust:build", held_out=True, preference=4, weight=2.0, colour="no_dbs", symbol="cross"),  # noqa: E501
     Method(key="dual_dice", name="DualDICE", short="DualDICE", family="density ratio", needs=_START, factory="ml.ope.dual_dice:build", preference=7, weight=3.0, colour="warn", symbol="star"),  # noqa: E501
-    Method(key="wis", name="Weighted importance sampling", short="WIS", family="importance weights", needs=_DENSITY, factory=_IS, held_out=True, quick=True, preference=6, colour="random", symbol="triangle-up"),  # noqa: E501
-    Method(key="pdis", name="Per-decision importance sampling", short="PDIS", family="importance weights", needs=_DENSITY, factory=_IS, quick=True, preference=8, colour="other", symbol="x"),  # noqa: E501
+    Method(key="wis", name="Weighted importance sampling", short="WIS", family="importance weights", needs=_DENSITY, factory=_IS, held_out=True, preference=6, colour="random", symbol="triangle-up"),  # noqa: E501
+    Method(key="pdis", name="Per-decision importance sampling", short="PDIS", family="importance weights", needs=_DENSITY, factory=_IS, preference=8, colour="other", symbol="x"),  # noqa: E501
     Method(key="cwpdis", name="Consistent weighted per-decision importance sampling", short="CWPDIS", family="importance weights", needs=_DENSITY, factory=_IS, held_out=True, preference=5, colour="muted", symbol="triangle-down"),  # noqa: E501
-    Method(key=POSTERIOR, name="All structures together", short="All structures", family="combination", needs="two sessions", factory="ml.ope.posterior.estimator:build", quick=True, weight=3.0, colour="info", symbol="star-diamond"),  # noqa: E501
-    Method(key=AGGREGATE, name="Combination of all methods", short="Combination", family="combination", needs="two other methods", factory=None, quick=True, colour="text", symbol="pentagon"),  # noqa: E501
+    Method(key=POSTERIOR, name="All structures together", short="All structures", family="combination", needs="two sessions", factory="ml.ope.posterior.estimator:build", by_default=True, weight=3.0, colour="info", symbol="star-diamond"),  # noqa: E501
+    Method(key=AGGREGATE, name="Combination of all methods", short="Combination", family="combination", needs="two other methods", factory=None, colour="text", symbol="pentagon"),  # noqa: E501
 ):
     register(_method)
 # fmt: on

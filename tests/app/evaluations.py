@@ -64,7 +64,12 @@ def judge(db: Session, policies: list[int]) -> Callable[..., int]:
     """Store an evaluation with the posterior of policies by id, and that of cDBS beside them."""
 
     def store(
-        posterior: dict[int, dict[str, Any]], reference: dict[str, Any] | None = None, shapes: dict[str, Any] | None = None, **more: Any
+        posterior: dict[int, dict[str, Any]],
+        reference: dict[str, Any] | None = None,
+        shapes: dict[str, Any] | None = None,
+        candidates: Sequence[int] | None = None,
+        job_id: str | None = None,
+        **more: Any,
     ) -> int:
         db.rollback()
         participant = participant_by_code(db, "P1", SYSTEM)
@@ -74,11 +79,11 @@ def judge(db: Session, policies: list[int]) -> Callable[..., int]:
         table = {str(i): e for i, e in posterior.items()} | {str(held): reference or cdbs().to_json()}
         row = store_evaluation(
             db,
-            job_id=None,
+            job_id=job_id,
             created_by="test",
             snapshot=snapshot,
             horizon_steps=snapshot.median_steps,
-            candidates=list(posterior),
+            candidates=list(posterior) if candidates is None else candidates,
             results={"posterior": {"estimates": table} | ({"dose_shapes": shapes} if shapes else {})},
             config={},
             **more,

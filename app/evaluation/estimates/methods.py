@@ -1,9 +1,8 @@
-"""Methods of evaluation as the API takes them: their keys, and which of them a preset runs. `ml.ope.registry` has the methods."""
+"""Methods of evaluation as the API takes them: their keys, and which of them run by default. `ml.ope.registry` has the methods."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import AfterValidator, Field, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
@@ -28,14 +27,9 @@ def _known(key: str) -> str:
 Method = Annotated[str, AfterValidator(_known), _PublishedKeys()]
 
 
-def quick_methods() -> list[str]:
-    """What the preset `quick` runs where nothing is said, so that a first ranking takes minutes."""
-    return [m.key for m in registry.methods() if m.quick]
-
-
-def methods_of(preset: str) -> list[str]:
-    """What a preset runs where no methods are named."""
-    return quick_methods() if preset == "quick" else [m.key for m in registry.methods() if not m.on_request]
+def default_methods() -> list[str]:
+    """List the methods that run where none are named: those that the answer rests on, so that it is there within seconds."""
+    return [m.key for m in registry.methods() if m.by_default]
 
 
 def names() -> dict[str, str]:
@@ -50,20 +44,13 @@ def _checked(methods: list[str]) -> list[str]:
     return once
 
 
-def _of_preset(values: Mapping[str, Any]) -> list[str]:
-    return methods_of(str(values.get("preset", "full")))
-
-
-_ON_REQUEST = [m.key for m in registry.methods() if m.on_request]
-
 Methods = Annotated[
     list[Method],
     Field(
-        default_factory=_of_preset,
+        default_factory=default_methods,
         min_length=1,
         max_length=20,
-        description=f"Estimators to run; where not given, for `full` all but {', '.join(_ON_REQUEST)}"
-        f" and for `quick` {', '.join(quick_methods())}.",
+        description=f"Estimators to run; where not given, those that the answer rests on: {', '.join(default_methods())}.",
     ),
     AfterValidator(_checked),
 ]

@@ -176,7 +176,8 @@ def assess(
         for i, reference in references.items()
         if reference != "cdbs" and i in table
     }
-    ordered = ordering_told({i: by[POSTERIOR] for i, by in table.items() if POSTERIOR in by and i not in references})
+    own = {i: by[POSTERIOR] for i, by in table.items() if POSTERIOR in by}
+    ordered = ordering_told({i: e for i, e in own.items() if i not in references} or own)
     # who is unsafe comes last, as who is not supported does
     held_back = {str(i): replace(e, supported=e.supported and decided[i].decision not in _LAST) for i, e in candidates.items()}
     places = {int(r.policy): r for r in rank_policies({method: held_back}, method)} if candidates else {}

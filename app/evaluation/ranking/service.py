@@ -66,6 +66,7 @@ def ranking_of(found: Judged, shown: RankingFilter | None = None) -> RankingOut:
         participant=participant.code,
         evaluation_id=evaluation.id,
         job_id=evaluation.job_id,
+        first_answer=evaluation.first_answer,
         created_at=evaluation.created_at,
         default_method=found.method,
         methods=ranked.methods,

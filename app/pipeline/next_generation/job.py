@@ -1,4 +1,4 @@
-"""The kind `next_generation`: judge what was tested, fine-tune the best, train fresh policies, distil, evaluate and rank, in one job."""
+"""The kind `next_generation`: assess what was tested, fine-tune the best, train fresh policies, distil, evaluate and rank, in one job."""
 
 from __future__ import annotations
 
@@ -6,22 +6,26 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from app.evaluation.estimates import dose_shapes
 from app.learning.training.configs import generation_groups
 from app.pipeline.distillation import declare_distillation, distil_all
-from app.pipeline.evaluation import declare_evaluation, declare_fit, evaluate_all, fit_calls, store_members
+from app.pipeline.evaluation import (
+    declare_evaluation,
+    declare_first_answer,
+    declare_fit,
+    evaluate_all,
+    first_answer,
+    fit_calls,
+    store_members,
+)
 from app.pipeline.next_generation.parents import best, posterior_on, tested_policies
 from app.pipeline.params import NextGenerationParams
 from app.pipeline.stages import PLAN, STORE_WEIGHT, acting, participant_of, plan_on_snapshot, policy_facts
 from app.pipeline.training import declare_training, store_trained, tested_so_far, training_calls, training_starts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext, JobError
-from app.study.repository import settings_version
 from app.tables.learning import BufferSnapshot, Policy
-from ml.ope import POSTERIOR, shown
 
 CHOOSE = "choose-parents"
-JUDGE = "judge-tested"
 
 
 def run_next_generation(job: JobContext) -> dict[str, Any]:
@@ -49,19 +53,24 @@ def run_next_generation(job: JobContext) -> dict[str, Any]:
 
 
 def _plan(db: Session, job: JobContext, snapshot: BufferSnapshot) -> dict[str, Any]:
-    """Read the tested policies, and their posterior returns where a ranking knows all sessions; else what assessing them again needs."""
+    """Read the tested policies, and their posterior returns where a ranking knows all sessions."""
     tested = [t.policy for t in tested_policies(db, participant_of(db, job))]
     plan = {"tested": policy_facts(tested), "tested_so_far": tested_so_far(db, snapshot, acting(job))}
     known = posterior_on(db, snapshot.participant_id, snapshot.id)
     if all(p.id in known for p in tested):
         return plan | {"posterior": {str(p.id): known[p.id] for p in tested}}
-    others = dose_shapes.of_others(db, participant_of(db, job), settings_version(db, snapshot.settings_version_id))
-    return plan | {"posterior": None, "others": others, "horizon_steps": snapshot.median_steps}
+    return plan | {"posterior": None}
 
 
 def _starts(job: JobContext, params: NextGenerationParams, planned: dict[str, Any]) -> list[dict[str, Any]]:
     """Choose the parents, the best first, as trainings start from them."""
-    posterior = planned["posterior"] if planned["posterior"] is not None else _judge(job, params, planned)
+    posterior = planned["posterior"]
+    if posterior is None:
+        declare_first_answer(job)
+        found = first_answer(job, params.evaluation(), planned["snapshot"])
+        if "failed" in found:
+            raise JobError(f"Which tested policy did best is unknown: {found['failed']}. Start a 'pipeline' that names the policies.")
+        posterior = found["returns"]
 
     def choose(db: Session) -> dict[str, Any]:
         tested = [db.get_one(Policy, p["id"]) for p in planned["tested"]]
@@ -74,29 +83,3 @@ def _starts(job: JobContext, params: NextGenerationParams, planned: dict[str, An
 
     starts: list[dict[str, Any]] = job.transact(CHOOSE, choose)["starts"]
     return starts
-
-
-def _judge(job: JobContext, params: NextGenerationParams, planned: dict[str, Any]) -> dict[str, float]:
-    """Estimate the posterior returns of the tested policies with what their sessions showed."""
-    job.step(JUDGE, "Judge the tested policies with the sessions since the last ranking", weight=shown(POSTERIOR).weight)
-    found = job.compute(JUDGE, "evaluate_method", judging_call(params, planned))
-    if "failed" in found:
-        raise JobError(f"Which tested policy did best cannot be told: {found['failed']}. Start a 'pipeline' that names the policies.")
-    return {policy_id: float(estimate["value"]) for policy_id, estimate in found["estimates"].items()}
-
-
-def judging_call(params: NextGenerationParams, planned: dict[str, Any]) -> dict[str, Any]:
-    """Build the params with which `evaluate_method` judges the tested policies."""
-    others, known = planned["others"], planned["tested_so_far"]
-    judged = {p["id"] for p in planned["tested"]}
-    return {
-        "snapshot_sha256": planned["snapshot"]["sha256"],
-        "preset": params.preset,
-        "seed": params.seed,
-        "method": POSTERIOR,
-        "horizon_steps": planned["horizon_steps"],
-        "policies": [{"id": p["id"], "sha256": p["sha256"]} for p in planned["tested"]],
-        "tests": known["tests"],
-        # what cannot be a parent, as a retired policy, informs those that can
-        "tested": [p for p in known["policies"] if p["id"] not in judged],
-    } | ({"others": others["evidence"]} if others else {})

@@ -81,7 +81,7 @@ def combine(estimates: Mapping[str, Mapping[str, Estimate]], bias: Mapping[str, 
     Raises:
         ValueError: no method takes part, or no policy has been estimated by all that do.
     """
-    apart = {m.key for m in methods_of_all() if m.family == "combination" or m.on_request}
+    apart = {m.key for m in methods_of_all() if m.family == "combination" or not m.combines}
     methods = [m for m, table in estimates.items() if m not in apart and any(e.supported for e in table.values())]
     if not methods:
         raise ValueError("nothing to combine: no method supports any policy")

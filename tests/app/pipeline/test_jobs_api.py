@@ -10,7 +10,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation.estimates.methods import quick_methods
+from app.evaluation.estimates.methods import default_methods
 from app.evaluation.schemas import EvaluateParams
 from app.evaluation.service import policies_to_rank
 from app.learning.policies.baselines import constant_onnx
@@ -18,7 +18,6 @@ from app.learning.schemas import DEFAULT_SWEEP
 from app.platform import files
 from app.study.repository import participant_by_code
 from app.tables.learning import Policy
-from ml.ope.registry import method_keys
 
 Upload = Callable[..., int]
 JOBS = "/api/v1/participants/P1/jobs"
@@ -39,12 +38,11 @@ def test_no_job_starts_without_a_threshold_and_the_answer_suggests_one(client: T
     assert client.get(JOBS).json()["total"] == 0
 
 
-def test_the_quick_preset_runs_its_own_methods_and_named_ones_are_run_once(client: TestClient, upload: Upload) -> None:
+def test_methods_of_the_answer_run_where_none_are_named_and_named_ones_run_once(client: TestClient, upload: Upload) -> None:
     upload("random")
     quick = client.post(JOBS, json={"kind": "pipeline", "preset": "quick"}).json()
-    assert quick["params"]["methods"] == quick_methods()
+    assert quick["params"]["methods"] == default_methods() == ["linear", "impulse", "posterior"]
     assert {name: quick["params"][name] for name in DEFAULT_SWEEP} == DEFAULT_SWEEP, "the sweep of the demo, whoever starts it"
-    assert set(quick_methods()) < set(method_keys())
     named = client.post(JOBS, json={"kind": "pipeline", "preset": "quick", "methods": ["dual_dice", "wis", "dual_dice"]}).json()
     assert named["params"]["methods"] == ["dual_dice", "wis"]
 
@@ -81,7 +79,7 @@ def test_a_job_is_accepted_with_its_defaults_and_listed(client: TestClient, uplo
     body = answer.json()
     assert (body["status"], body["progress"], body["participant"], body["created_by"]) == ("queued", 0.0, "P1", "admin@clinic.example")
     assert (body["params"]["count"], body["params"]["preset"]) == (6, "full")
-    assert body["params"]["methods"] == [m for m in method_keys() if m != "dlsm_paper"]
+    assert body["params"]["methods"] == default_methods()
     assert client.get(f"/api/v1/jobs/{body['id']}").json() == body
     assert client.get(JOBS).json()["items"] == [body]
     assert client.get(JOBS, params={"status": "running"}).json()["total"] == 0
@@ -176,7 +174,7 @@ def test_the_jobs_page_starts_shows_and_cancels_a_job(client: TestClient, upload
     assert "whole number" in refused.text
 
 
-def test_the_form_runs_the_ticked_methods_and_the_preset_those_of_its_size(client: TestClient, upload: Upload) -> None:
+def test_the_form_runs_the_ticked_methods_and_else_those_of_the_answer(client: TestClient, upload: Upload) -> None:
     upload("random")
 
     def methods_of(**ticked: list[str]) -> list[str]:
@@ -187,7 +185,7 @@ def test_the_form_runs_the_ticked_methods_and_the_preset_those_of_its_size(clien
         return found
 
     assert methods_of(methods=["wis", "dual_dice"]) == ["wis", "dual_dice"]
-    assert methods_of() == quick_methods()
+    assert methods_of() == default_methods()
     refused = client.post("/participants/P1/jobs", data={"kind": "pipeline", "methods": ["wis", "aggregate"]})
     assert refused.status_code == 422
     assert "at least two other methods" in refused.text

@@ -163,7 +163,12 @@ def test_the_pipeline_walks_from_sessions_to_a_ranking(client: TestClient, sessi
     for policy in ranking["policies"]:
         assert set(policy["estimates"]) == {"dlsm", "linear", "pdis", "posterior"}
         assert {"energy", "mean_beta", "grasp_hz", "rating", "tremor_percent"} <= set(policy["estimates"]["dlsm"]["predicted"])
-    assert (ranking["stale"], ranking["failed_methods"]) == (False, {})
+    assert (ranking["stale"], ranking["failed_methods"], ranking["first_answer"]) == (False, {}, False)
+    first, last = db.scalars(select(Evaluation).where(Evaluation.job_id == job).order_by(Evaluation.id))
+    assert (first.first_answer, last.first_answer, last.id) == (True, False, ranking["evaluation_id"])
+    assert first.diagnostics["candidates"] == []
+    references = {r["policy_id"] for r in ranking["references"]} - {p.id for p in db.scalars(select(Policy)) if p.algorithm == "cloning"}
+    assert {e.policy_id for e in first.estimates} == references, "before a policy is trained, the references are answered for"
     bundle = client.get(f"/api/v1/policies/{students[0].id}/bundle")
     assert verify_bundle(bundle.content).normalisation_mean == pytest.approx(students[0].metrics["beta_mean"])
     page = client.get(f"/jobs/{job}").text

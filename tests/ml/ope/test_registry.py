@@ -34,8 +34,8 @@ def test_the_usual_order_is_that_of_the_records() -> None:
 
 
 def test_the_form_of_the_paper_runs_where_it_is_named_and_nowhere_else() -> None:
-    asked = [m for m in methods() if m.on_request]
-    assert [(m.key, m.name, m.preference, m.quick, m.held_out) for m in asked] == [("dlsm_paper", "DLSM (paper)", None, False, False)]
+    asked = [m for m in methods() if not m.combines]
+    assert [(m.key, m.name, m.preference, m.by_default, m.held_out) for m in asked] == [("dlsm_paper", "DLSM (paper)", None, False, False)]
 
 
 def test_marks_are_told_apart_and_keys_are_taken_once() -> None:

@@ -34,7 +34,7 @@ from tests.app.evaluations import estimate
 
 MEAN = Method(
     key="mean_session", name="Mean of all sessions", short="Mean", family="value", needs="one session",
-    factory=f"{__name__}:build", quick=True, weight=0.5, colour="good", symbol="hourglass",
+    factory=f"{__name__}:build", by_default=True, weight=0.5, colour="good", symbol="hourglass",
 )  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def test_it_appears_in_the_schema_the_ranking_the_charts_and_the_jobs_page(
     registered: None, client: TestClient, policies: list[int], evaluate: Callable[..., int]
 ) -> None:
     assert MEAN.key in TypeAdapter(EvaluateParams).json_schema()["properties"]["methods"]["items"]["enum"]
-    assert MEAN.key in EvaluateParams(preset="quick").methods
+    assert MEAN.key in EvaluateParams().methods
     other = {"estimates": {str(i): estimate(MEAN.key, 50.0 + k) for k, i in enumerate(policies)}}
     evaluate({i: estimate("dlsm", 10.0) for i in policies}, **{MEAN.key: other})
     body = client.get("/api/v1/participants/P1/ranking", params={"method": MEAN.key}).json()

@@ -51,3 +51,28 @@ def test_where_nothing_is_worth_a_test_random_and_cdbs_sessions_are_planned_at_a
     visit = int(planned.headers["location"].split("/")[2])
     sessions = client.get(f"/api/v1/visits/{visit}/plan").json()["sessions"]
     assert sorted({s["controller"] for s in sessions}) == ["cdbs", "random"]
+
+
+def test_a_first_answer_tells_of_fixed_amplitudes_until_the_policies_of_its_job_are_there(
+    client: TestClient, policies: list[int], judge: Judge, db: Session
+) -> None:
+    job = client.post("/api/v1/participants/P1/jobs", json={"kind": "pipeline", "preset": "quick"}).json()["id"]
+    judge({policies[0]: judged(50.0)})
+    low = db.scalars(select(Policy).where(Policy.algorithm == "constant").order_by(Policy.id.desc())).first()
+    assert low is not None
+    first = judge({low.id: judged(60.0)}, candidates=[], job_id=job, first_answer=True)
+    assert judge({low.id: judged(60.0)}, candidates=[], job_id=job, first_answer=True) == first, "stored once"
+    ranking = client.get("/api/v1/participants/P1/ranking").json()
+    assert (ranking["first_answer"], ranking["job_id"], ranking["policies"]) == (True, job, [])
+    assert {r["policy_id"] for r in ranking["references"]} >= {low.id}
+    page = client.get(PAGE).text
+    text = above_fold(page)
+    assert "First answer, until the new policies are trained" in text
+    assert "No policy has been trained yet." in text
+    assert f"For comparison, {3 * low.config['amplitude']:.1f} mA all the time, the best fixed amplitude" in text
+    assert "no policy is barred" not in text, "there is none"
+    last = judge({policies[0]: judged(50.0)}, job_id=job)
+    assert last != first
+    ranking = client.get("/api/v1/participants/P1/ranking").json()
+    assert (ranking["first_answer"], ranking["evaluation_id"]) == (False, last)
+    assert "First answer" not in client.get(PAGE).text
