@@ -42,6 +42,8 @@ study_app = typer.Typer(no_args_is_help=True, help="Whole studies.")
 app.add_typer(accounts.user_app, name="user")
 app.add_typer(accounts.token_app, name="token")
 app.add_typer(study_app, name="study")
+control_app = typer.Typer()
+app.add_typer(control_app, name="control")
 accounts.register(study_app, accounts.user_app)
 closing.register(study_app)
 app.add_typer(participant_app, name="participant")
@@ -180,9 +182,13 @@ def pipeline(
     follow(job_id, wait, as_json)
 
 
-@app.command("control", epilog="Example: betaloop control --bundle P1-policy-3.zip --source session.zip --speed fast --log decisions.csv")
+@control_app.callback(
+    invoke_without_command=True,
+    epilog="Example: betaloop control --bundle P1-policy-3.zip --source session.zip --speed fast --log decisions.csv",
+)
 def control_(
-    bundle: Annotated[Path, typer.Option(help="Controller bundle.")],
+    context: typer.Context,
+    bundle: Annotated[Path | None, typer.Option(help="Controller bundle; needed.")] = None,
     source: Annotated[str | None, typer.Option(help="Device (-, tcp:PORT, tail:FILE, simulated:P1), recording or cohort:P1.")] = None,
     speed: Annotated[str, typer.Option(help="realtime or fast.")] = "realtime",
     log: Annotated[Path | None, typer.Option(help="CSV of every decision.")] = None,
@@ -200,10 +206,13 @@ def control_(
     as_json: AsJson = False,
 ) -> None:
     """Verify a controller bundle and run it on a stream of beta, as the tablet does."""
+    if context.invoked_subcommand is not None:
+        return
     from app.tablet.command import control, lines
-    from app.tablet.sources import Wish
-    from app.tablet.task import Task
+    from app.tablet.sources import Task, Wish
 
+    if bundle is None:
+        raise typer.BadParameter("Name a controller bundle.", param_hint="--bundle")
     if speed not in ("realtime", "fast"):
         raise typer.BadParameter(f"'{speed}' is neither realtime nor fast.", param_hint="--speed")
     wish = Wish(channel=channel, beta_source=beta_source, steps=steps, realtime=speed == "realtime")
@@ -212,6 +221,28 @@ def control_(
     summary = control(bundle, source, wish, task)
     show(summary, as_json, lines(summary))
     if "wrong_signal" in summary or summary.get("failed"):
+        raise typer.Exit(1)
+
+
+@control_app.command("check-port", epilog="Example: betaloop control check-port answers.csv --bundle P1-policy-3.zip --page check.html")
+def check_port_(
+    copy: Annotated[Path, typer.Argument(metavar="ANSWERS", help="CSV of answers; or a copy: .onnx, .tflite, a shared library.")],
+    bundle: Annotated[Path, typer.Option(help="Controller bundle.")],
+    key: Annotated[str | None, typer.Option(help="Public key, or a file with it; that of this installation by default.")] = None,
+    target: Annotated[str | None, typer.Option(help="What was converted, by what: 'TFLite, onnx2tf 1.29.24'.")] = None,
+    page: Annotated[Path | None, typer.Option(help="One page for the study's file, HTML.")] = None,
+    answers: Annotated[Path | None, typer.Option(help="CSV of the answers of a copy that ran here, to be uploaded.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check a converted copy of a policy against its bundle: same, within so many mA, or not this policy (exit code 1).
+
+    A shared library is run with your rights: build it from code that you trust.
+    """
+    from app.tablet.ports import Outputs, check
+
+    found, text, usable = check(copy, bundle, key, Outputs(target, page, answers))
+    show(found, as_json, text)
+    if not usable:
         raise typer.Exit(1)
 
 

@@ -21,8 +21,7 @@ from app.platform.errors import Invalid
 from app.settings import get_settings
 from app.tablet.battery import read_implant
 from app.tablet.live import is_live, run_live
-from app.tablet.sources import Rows, Source, Wish, open_source
-from app.tablet.task import Task
+from app.tablet.sources import Rows, Source, Task, Wish, open_source
 from ml.deploy.appraisal import battery_gain
 from ml.deploy.bundle import OpenBundle, open_bundle
 from ml.deploy.manifest import BundleError, BundleManifest

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from app.platform.errors import Invalid
 from app.tablet.simulated import SimulatedDevice, brain_of
-from app.tablet.sources import Wish
-from app.tablet.task import Task
+from app.tablet.sources import Task, Wish
 from ml.deploy.bundle import OpenBundle
 from ml.deploy.manifest import BundleManifest
 from ml.deploy.runtime.__main__ import LEDGER, open_link

@@ -4,6 +4,8 @@
     manifest.json, manifest.sig   whose, for which signal, within which limits; SHA-256 of every file; its Ed25519 signature
     model.onnx                    the network: beta_window [N, W] to amplitude_fraction [N, 1]
     test_vectors.json             what every runtime must answer, and one session with everything that can go wrong with beta
+    port-vectors.csv              400 windows with their doses, by which a converted copy is checked (`ml.deploy.ports`)
+    model-lost-sample.onnx        the network again: a lost sample reaches its answer by arithmetic, where its graph can be added to
   and for plain multi-layer perceptrons, as betaloop trains them and as many a file made elsewhere is one:
     weights.f32, controller/      the reference runner: `python -m controller`, Python and numpy alone
     betaloop_controller.h         the whole controller in C99, float32; selftest.c checks it
@@ -19,6 +21,7 @@ import hashlib
 import io
 import json
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +37,9 @@ from ml.deploy.c_header import fixed_point_header, float_header, self_test
 from ml.deploy.fixed_point import CutNetwork, quantise
 from ml.deploy.manifest import BundleError, BundleManifest
 from ml.deploy.onnx_mlp import NoPlainNetwork, mlp_of
+from ml.deploy.ports.lost_sample import MODEL_LOST
+from ml.deploy.ports.vectors import PORT_VECTORS, port_files
+from ml.deploy.ports.windows import MADE_UP, Recorded
 from ml.deploy.runtime.__main__ import check
 from ml.deploy.runtime.controller import BoundedController, WindowNetwork
 from ml.deploy.runtime.envelope import Signal
@@ -52,7 +58,12 @@ RUNNER = tuple(f"controller/{path.name}" for path in sorted(_RUNTIME.glob("*.py"
 _REQUIRED = {SHEET, VECTORS}
 _OF_NETWORKS = {WEIGHTS, HEADER, SELF_TEST}
 _OF_SMALL_NETWORKS = {HEADER_INT8, SELF_TEST_INT8}
-_ORDER = (SHEET, MANIFEST, SIGNATURE, MODEL, VECTORS, WEIGHTS, HEADER, SELF_TEST, HEADER_INT8, SELF_TEST_INT8, SEALED, *RUNNER)
+_OF_PORTS = {PORT_VECTORS, MODEL_LOST}
+"""Files that bundles of earlier versions lack."""
+_ORDER = (
+    SHEET, MANIFEST, SIGNATURE, MODEL, MODEL_LOST, VECTORS, PORT_VECTORS, WEIGHTS, HEADER, SELF_TEST, HEADER_INT8, SELF_TEST_INT8, SEALED,
+    *RUNNER,
+)  # fmt: skip
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a ZIP can hold
 
 
@@ -80,13 +91,14 @@ class OpenBundle:
         return make_controller(self.manifest, self.network)
 
 
-def build_bundle(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDArray[Any]) -> bytes:
+def build_bundle(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDArray[Any], visits: Sequence[Recorded] = ()) -> bytes:
     """Pack a policy.
 
     Args:
         policy_onnx: the network.
         manifest: everything but the layers, the facts of the fixed-point header and `files`, which are filled in here.
         test_windows: beta windows for the test vectors, shape [M, W], M at least 1, finite; windows at the edges are added.
+        visits: beta windows of each visit for the port vectors; the test windows when empty.
 
     Returns:
         The ZIP's bytes, the same for the same arguments.
@@ -97,8 +109,11 @@ def build_bundle(policy_onnx: bytes, manifest: BundleManifest, test_windows: NDA
     """
     manifest, network, policy, windows = _complete(policy_onnx, manifest, test_windows)
     expected = policy.act(windows)
-    steps = vectors.session(manifest, make_controller(manifest, network or PolicyWindow(policy, manifest.window)), windows)
+    controller = make_controller(manifest, network or PolicyWindow(policy, manifest.window))
+    steps = vectors.session(manifest, controller, windows)
     files = {MODEL: policy_onnx, VECTORS: vectors.to_json(windows, expected, steps)}
+    known = visits or [Recorded("recorded" if manifest.test_windows_from else MADE_UP, np.asarray(test_windows, dtype=np.float64))]
+    files |= port_files(manifest, policy, known, controller)
     if network is not None:
         files |= _runner_files()
         test = self_test(manifest, HEADER, windows, expected, steps, vectors.TOLERANCE, exact=True)
@@ -293,6 +308,8 @@ def _check_names(manifest: BundleManifest, present: set[str]) -> None:
     wanted |= (_OF_NETWORKS if manifest.layers else set()) | (_OF_SMALL_NETWORKS if manifest.int8_bound is not None else set())
     if manifest.layers or manifest.schedule:
         wanted |= set(RUNNER)
+    if manifest.schedule is None:
+        wanted |= named & _OF_PORTS
     _compare_names(named, wanted, present)
 
 

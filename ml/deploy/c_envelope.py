@@ -68,7 +68,7 @@ def _horner(name: str, coefficients: tuple[float, ...]) -> str:
 
 TANH = f"""\
 /* tanh as a ratio of polynomials, within 1e-6 of the true value; NaN stays NaN. */
-static inline float betaloop_tanh(float x) {{
+betaloop_linkage float betaloop_tanh(float x) {{
     float s, p, q;
     if (x > {_LARGEST!r}f) x = {_LARGEST!r}f;
     if (x < -{_LARGEST!r}f) x = -{_LARGEST!r}f;
@@ -91,7 +91,7 @@ def header_tanh(x: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 ENVELOPE = """\
-static inline int betaloop_same(const char *a, const char *b) {
+betaloop_linkage int betaloop_same(const char *a, const char *b) {
     if (!a || !b) return 0;
     while (*a && *a == *b) {
         ++a;
@@ -101,7 +101,7 @@ static inline int betaloop_same(const char *a, const char *b) {
 }
 
 /* The start of a session: cDBS in force, no beta yet. */
-static inline void betaloop_start(betaloop_state *s) {
+betaloop_linkage void betaloop_start(betaloop_state *s) {
     int i;
     s->last_sample_ms = 0;
     s->last_decision_ms = 0;
@@ -116,7 +116,7 @@ static inline void betaloop_start(betaloop_state *s) {
 }
 
 /* Judge a new beta amplitude; a valid one enters the window. Returns the reasons against it. */
-static inline uint32_t betaloop_admit(betaloop_state *s, int64_t now_ms, const betaloop_sample *sample) {
+betaloop_linkage uint32_t betaloop_admit(betaloop_state *s, int64_t now_ms, const betaloop_sample *sample) {
     uint32_t reasons = 0;
     uint64_t spacing = 0;
     int had = s->has_sample, i;
@@ -150,7 +150,7 @@ static inline uint32_t betaloop_admit(betaloop_state *s, int64_t now_ms, const b
 }
 
 /* Decide on the amplitude of the period that starts now. `sample`: the beta amplitude that came since the last decision; 0: none came. */
-static inline betaloop_decision betaloop_decide(betaloop_state *s, int64_t now_ms, const betaloop_sample *sample) {
+betaloop_linkage betaloop_decision betaloop_decide(betaloop_state *s, int64_t now_ms, const betaloop_sample *sample) {
     betaloop_decision d;
     uint32_t reasons = 0, trouble;
     uint64_t elapsed = BETALOOP_PERIOD_MS;

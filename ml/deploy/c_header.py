@@ -54,12 +54,12 @@ def float_header(manifest: BundleManifest, network: MlpNetwork) -> str:
     parts += [
         "",
         "/* z-score of a beta amplitude */",
-        "static inline float betaloop_score_of(float beta) {",
+        "betaloop_linkage float betaloop_score_of(float beta) {",
         f"    return (beta - {_float(network.mean)}) / {_float(network.std)};",
         "}\n",
         TANH,
         "/* Amplitude fraction for a window of z-scores, oldest first. */",
-        "static inline float betaloop_fraction(const float *scores) {",
+        "betaloop_linkage float betaloop_fraction(const float *scores) {",
         *(f"    float hidden_{index + 1}[{size}];" for index, size in enumerate(sizes[1:])),
         "    int i, j;",
     ]
@@ -95,7 +95,7 @@ def fixed_point_header(manifest: BundleManifest, fixed: FixedPointNetwork) -> st
     parts += [
         "",
         f"/* z-score of a beta amplitude in steps of 8/32767, cut at {SCORE_LIMIT:g} standard deviations */",
-        "static inline int16_t betaloop_score_of(float beta) {",
+        "betaloop_linkage int16_t betaloop_score_of(float beta) {",
         f"    float score = (beta - {_float(fixed.mean)}) / {_float(fixed.std)};",
         f"    score = (score < {-SCORE_LIMIT:.1f}f ? {-SCORE_LIMIT:.1f}f : score > {SCORE_LIMIT:.1f}f ? {SCORE_LIMIT:.1f}f : score)"
         f" * {_float(32767 / SCORE_LIMIT)};",
@@ -103,7 +103,7 @@ def fixed_point_header(manifest: BundleManifest, fixed: FixedPointNetwork) -> st
         "}\n",
         TANH,
         "/* Amplitude fraction for a window of scores, oldest first. */",
-        "static inline float betaloop_fraction(const int16_t *scores) {",
+        "betaloop_linkage float betaloop_fraction(const int16_t *scores) {",
         *(f"    int16_t hidden_{i + 1}[{layer.bias.size}];" for i, layer in enumerate(fixed.layers[:-1])),
         *(["    float real;"] if any(not layer.multiplier.size for layer in fixed.layers[:-1]) else []),
         "    int64_t total = 0;",
@@ -215,6 +215,9 @@ def _preamble(manifest: BundleManifest, kind: str) -> str:
 #error "include one betaloop controller per translation unit"
 #endif
 #define BETALOOP_CONTROLLER_H
+#ifndef betaloop_linkage
+#define betaloop_linkage static inline /* empty: a library that others may call */
+#endif
 
 #include <stdint.h>
 

@@ -2,20 +2,53 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from fastapi import APIRouter
+from pydantic import Field
 
 from app.accounts.deps import CurrentCaller
 from app.learning.deps import CurrentPolicy
 from app.planning.bundles.service import Limits
 from app.planning.releases import service
-from app.planning.releases.schemas import PolicyReleaseIn, PolicyReleaseLimits, PolicyReleaseOut
 from app.platform.database import Db
-from app.platform.signatures.schemas import SignatureOut
-from app.platform.web.schemas import problems
+from app.platform.signatures.schemas import SignatureOut, Signing
+from app.platform.signatures.service import SignatureState
+from app.platform.web.schemas import Model, Number, problems
 from app.tables.learning import Policy
-from app.tables.participants import Participant
+from app.tables.participants import Hemisphere, Participant
 
 router = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 422))
+
+Milliamperes = Annotated[Number, Field(ge=0, le=25.5)]
+
+
+class PolicyReleaseIn(Signing):
+    """Within which limits a policy is released, and who signs."""
+
+    min_ma: Milliamperes | None = Field(None, description="Lowest amplitude, mA; null: the default of a bundle.")
+    max_ma: Milliamperes | None = Field(None, description="Highest amplitude, mA; null: the cDBS amplitude.")
+    ramp_ma_per_s: Number | None = Field(None, gt=0, le=100, description="Fastest change, mA/s; null: the default of a bundle.")
+    hemisphere: Hemisphere | None = Field(None, description="Needed where a visit states several cDBS amplitudes.")
+
+
+class PolicyReleaseLimits(Model):
+    """Limits that were signed with a release."""
+
+    hemisphere: Hemisphere | None
+    cdbs_ma: float
+    min_ma: float
+    max_ma: float
+    ramp_ma_per_s: float
+
+
+class PolicyReleaseOut(Model):
+    """Whether a policy is released for testing in participants."""
+
+    policy_id: int
+    signature_state: SignatureState = Field(description="`none`: not released. `broken`: the policy was changed since.")
+    signature: SignatureOut | None = Field(description="The newest under this policy, standing or not.")
+    limits: PolicyReleaseLimits | None
 
 
 @router.get("/policies/{policy_id}/release")

@@ -15,8 +15,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.tablet.command import control
-from app.tablet.sources import Wish
-from app.tablet.task import Task
+from app.tablet.sources import Task, Wish
 
 SETTINGS = {"design": "stratified", "cdbs_amplitude_ma": 3.0, "xi_beta": 1.0, "beta_unit": "uV", "beta_source": "table"}
 WIDE = {"grasp_share": 0.5, "rating_points": 5, "tremor_points": 50, "unsafe_beyond": 0.9, "nearly_off_share": 0.9}

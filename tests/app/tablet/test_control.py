@@ -18,8 +18,7 @@ from app.cli import app as command_line
 from app.platform.errors import Invalid, NotFound
 from app.settings import get_settings
 from app.tablet.command import Run, control, drive, verified
-from app.tablet.sources import Row, Source, Wish, open_source
-from app.tablet.task import Task
+from app.tablet.sources import Row, Source, Task, Wish, open_source
 from ml.deploy.bundle import build_bundle, sign
 from ml.deploy.runtime.decision_log import Row as LogRow
 from ml.deploy.runtime.envelope import BetaSample, Signal

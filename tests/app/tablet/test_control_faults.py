@@ -18,8 +18,7 @@ from typer.testing import CliRunner
 from app.cli import app as command_line
 from app.platform.errors import Invalid
 from app.tablet.command import Run, control, drive, lines, verified
-from app.tablet.sources import Row, Source, Wish, open_source
-from app.tablet.task import Task
+from app.tablet.sources import Row, Source, Task, Wish, open_source
 from ml.deploy.runtime.envelope import BetaSample, Reason, Signal
 from tests.app.tablet.control_bundles import APPROVAL, MANIFEST, PUBLIC, made, rows_of
 

@@ -24,8 +24,7 @@ from app.platform.errors import Invalid
 from app.tablet.command import control, verified
 from app.tablet.live import run_live
 from app.tablet.simulated import Sent, SimulatedDevice, brain_of
-from app.tablet.sources import Wish
-from app.tablet.task import Task
+from app.tablet.sources import Task, Wish
 from ml.deploy.runtime.control_loop import End
 from ml.deploy.runtime.device import DeviceSide
 from ml.deploy.runtime.inputs import Event

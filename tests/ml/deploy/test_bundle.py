@@ -53,11 +53,12 @@ def with_file(bundle, name, content, *, restate=False):
 
 NETWORK_FILES = {"sheet.html", "model.onnx", "test_vectors.json", "weights.f32", "betaloop_controller.h", "selftest.c", *RUNNER}
 SMALL_FILES = {"betaloop_controller_int8.h", "selftest_int8.c"}
+PORT_FILES = {"port-vectors.csv", "model-lost-sample.onnx"}
 
 
 def test_a_bundle_holds_the_network_in_every_form_its_vectors_the_sheet_and_every_hash(bundle, network, manifest, test_windows):
     files = unpack(bundle)
-    assert set(files) == NETWORK_FILES | SMALL_FILES | {"manifest.json"}
+    assert set(files) == NETWORK_FILES | SMALL_FILES | PORT_FILES | {"manifest.json"}
     assert files["model.onnx"] == network.to_onnx()
     stated = verify_bundle(bundle)
     assert stated.files == {name: hashlib.sha256(content).hexdigest() for name, content in files.items() if name != "manifest.json"}
@@ -104,7 +105,7 @@ def test_a_policy_without_layers_leaves_as_onnx_alone_and_runs_within_the_same_e
     made = build_bundle(
         constant_onnx(0.5, 10), dataclasses.replace(manifest, normalisation_mean=None, normalisation_std=None), test_windows
     )
-    assert set(unpack(made)) == {"sheet.html", "model.onnx", "test_vectors.json", "manifest.json"}
+    assert set(unpack(made)) == {"sheet.html", "model.onnx", "test_vectors.json", "manifest.json"} | PORT_FILES
     opened = open_bundle(made)
     controller, signal = opened.controller(), Signal("uV", "time_domain")
     amplitudes = [controller.decide(2.0 * k, BetaSample(2.0 * k, 120.0 + k % 2, signal)).amplitude_ma for k in range(20)]

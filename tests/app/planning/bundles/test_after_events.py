@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 from app.platform.errors import Invalid
 from app.tablet.command import verified
 from app.tablet.live import run_live
-from app.tablet.task import Task
+from app.tablet.sources import Task
 from ml.deploy.runtime.slot import read_withdrawals
 from tests.app.planning.bundles.test_slots import policies as policies
 from tests.app.planning.bundles.test_slots import signed as signed

@@ -25,8 +25,7 @@ from sqlalchemy.orm import Session
 from app.platform import files as stored
 from app.platform.errors import Invalid
 from app.tablet.command import control, lines
-from app.tablet.sources import Wish
-from app.tablet.task import Task
+from app.tablet.sources import Task, Wish
 from ml.deploy.bundle import BundleError, open_bundle
 from ml.deploy.manifest import BundleManifest
 from ml.deploy.runtime.envelope import OF_THE_CONTROLLER, reason_names

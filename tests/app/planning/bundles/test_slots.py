@@ -24,8 +24,7 @@ from app.platform.errors import Invalid
 from app.tables.visits import Visit
 from app.tablet.command import control, lines, verified
 from app.tablet.live import run_live
-from app.tablet.sources import Wish
-from app.tablet.task import Task
+from app.tablet.sources import Task, Wish
 from ml.deploy.bundle import open_bundle
 from ml.deploy.manifest import BundleManifest
 from ml.deploy.runtime.control_loop import End
