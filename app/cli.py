@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Any
 
 import structlog
@@ -23,8 +24,8 @@ from app.pipeline.next_generation import commands as next_generation
 from app.platform import logs
 from app.platform.audit.commands import app as audit_app
 from app.platform.bucket import bucket
-from app.platform.database import database_place, supervise_database, transaction
-from app.platform.start import in_one_line, require_data_folder, require_free
+from app.platform.database import database_place, keep_asking, supervise_database, transaction
+from app.platform.start import Watchdog, in_one_line, require_data_folder, require_free
 from app.platform.terminal import ACTOR, AsJson, Code, say, show
 from app.platform.upkeep.commands import app as upkeep_app
 from app.settings import Settings, get_settings
@@ -122,10 +123,20 @@ def serve(
     # beside the service, for reading what a crash left behind may take minutes
     threading.Thread(target=keep_resuming, args=("the service", threading.Event()), daemon=True).start()
     threading.Thread(target=keep_sealing, args=(threading.Event(),), daemon=True).start()
-    uvicorn.run(
+    stop = threading.Event()
+    watchdog = Watchdog(stop)
+    threading.Thread(target=keep_asking, args=(watchdog.beat,), daemon=True).start()
+
+    class Server(uvicorn.Server):
+        def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            stop.set()
+            super().handle_exit(sig, frame)
+
+    config = uvicorn.Config(
         service, host=host, port=port, log_level=settings.log_level.lower(), access_log=False,
         timeout_graceful_shutdown=3, timeout_keep_alive=75, ssl_certfile=tls_certificate, ssl_keyfile=tls_key,
     )  # fmt: skip
+    Server(config).run()
 
 
 @app.command(epilog="Example: betaloop worker --slots 2")
@@ -142,7 +153,7 @@ def worker(slots: Annotated[int | None, typer.Option(min=1, help="Compute steps 
     stop = threading.Event()
     _stop_on_signals(stop)
     supervise_database(stop)
-    run_worker(slots or get_settings().worker_slots, stop)
+    run_worker(slots or get_settings().worker_slots, stop, beat=Watchdog(stop).beat)
 
 
 @app.command(epilog="Example: betaloop demo --port 8000")

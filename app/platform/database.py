@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Annotated, Any
@@ -14,6 +15,7 @@ from psycopg.errors import UndefinedColumn, UndefinedTable
 from sqlalchemy import Connection, DateTime, Engine, MetaData, create_engine, event, make_url, text
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.exc import DBAPIError, ProgrammingError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import DeclarativeBase, ORMExecuteState, Session, SessionTransaction
 
 from app.platform.connection import NOTICED, connection_url
@@ -80,6 +82,7 @@ def _embedded_server(settings: Settings) -> EmbeddedPostgres:
         return _embedded[key]
 
 
+ASK_S = 5.0
 HEAL_POLL_S = 1.0
 """Longest time for which a service does not see that its embedded server died."""
 
@@ -251,6 +254,18 @@ def _announce(db: Session, connection: Connection) -> None:
 def _after_begin(db: Session, _transaction: Any, connection: Connection) -> None:
     if db.info.get("actor"):
         _announce(db, connection)
+
+
+def keep_asking(beat: Callable[[], None]) -> None:
+    """Ask the database something every ASK_S, for ever, and call `beat` once it has answered or failed."""
+    while True:
+        try:
+            with new_session() as db:
+                check_connection(db)
+        except (DBAPIError, PoolTimeout) as error:
+            log.warning("the database does not answer: %s", type(error).__name__)
+        beat()
+        time.sleep(ASK_S)
 
 
 def check_connection(db: Session) -> None:

@@ -1,9 +1,13 @@
-"""Requirements of a start, checked before anything else is done, and the reason why a command failed, in a line."""
+"""Start and end of a process: what a start needs, why a command failed in one line, and a watchdog that ends what hangs."""
 
 from __future__ import annotations
 
 import errno
+import logging
+import os
 import socket
+import threading
+import time
 from tempfile import TemporaryFile
 
 from pydantic import ValidationError
@@ -12,6 +16,8 @@ from sqlalchemy.exc import OperationalError
 from app.platform.database import database_place
 from app.platform.errors import FULL, BetaloopError, Conflict
 from app.settings import Settings, get_settings
+
+log = logging.getLogger(__name__)
 
 _WHY = {
     errno.EADDRINUSE: ("another program listens there", "Is betaloop running already? Else choose another port: --port {free}."),
@@ -119,3 +125,47 @@ def _last_line(error: BaseException | None) -> str:
     """Return the last line of a message of a server or its library, ending as a sentence does."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip() and "Is the server running" not in line]
     return f"{lines[-1].rstrip('.') if lines else 'nothing'}."
+
+
+OVERDUE_S = 60.0
+"""Longest time between two beats of a process that works."""
+STOP_S, STOP_WITH_DATABASE_S = 9.0, 60.0
+"""Longest time that a stop may take; the second where the process stops the embedded database, too."""
+_LOOK_S = 1.0
+
+
+class Watchdog:
+    """Thread that ends the process when its beat is overdue, or when a stop takes too long. The service manager starts it again.
+
+    A network that loses everything that is sent gives no answer and no error. A call of the database then waits for ever.
+
+    Args:
+        stop: set when the process is asked to stop.
+        overdue_s: longest time between two beats; it counts from the first one.
+    """
+
+    def __init__(self, stop: threading.Event, overdue_s: float = OVERDUE_S) -> None:
+        self._stop, self._overdue_s = stop, overdue_s
+        self._beat_at: float | None = None
+        threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
+
+    def beat(self) -> None:
+        """Say that the process goes on."""
+        self._beat_at = time.monotonic()
+
+    def _watch(self) -> None:
+        looked = time.monotonic()
+        while not self._stop.wait(_LOOK_S):
+            present = time.monotonic()
+            if present - looked > 5 * _LOOK_S and self._beat_at is not None:
+                self._beat_at = present  # the whole process stood still, as on a machine that slept
+            looked = present
+            if self._beat_at is not None and present - self._beat_at > self._overdue_s:
+                _end(1, f"nothing went on for {self._overdue_s:.0f} s, most likely because the database neither answers nor refuses")
+        time.sleep(STOP_S if get_settings().database_url else STOP_WITH_DATABASE_S)
+        _end(0, "the stop takes too long; what is unfinished is taken up again later")
+
+
+def _end(code: int, why: str) -> None:
+    log.critical("this process ends at once: %s", why)
+    os._exit(code)

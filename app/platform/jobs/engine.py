@@ -166,6 +166,11 @@ def recover(executor_ids: Sequence[str]) -> list[str]:
     return [handle.get_workflow_id() for handle in DBOS._recover_pending_workflows(list(executor_ids))]
 
 
+def requeue(job_ids: Sequence[str]) -> None:
+    """Put jobs that this executor has, and does not run, back on the queue. A job that had ended all the same ends again at once."""
+    DBOS.resume_workflows(list(job_ids), queue_name=QUEUE)
+
+
 def owners(db: Session) -> dict[str, str]:
     """Return the executor of every running job, by job id."""
     rows = db.execute(

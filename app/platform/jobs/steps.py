@@ -136,7 +136,7 @@ class JobRunner:
         """
         requests = StopRequests()
         with self._changed:
-            if self._stopping:
+            if self._stopping or job_id in self._running:
                 raise WorkerStopping
             self._running[job_id] = requests
         try:

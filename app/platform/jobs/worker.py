@@ -8,6 +8,7 @@ import shutil
 import socket
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
 
@@ -100,6 +101,7 @@ class WorkerMonitor:
         self._identity, self._runner, self._pace = identity, runner, pace
         self._host, self._pid = socket.gethostname(), os.getpid()
         self._may_reap_at = 0.0
+        self._lost: set[str] = set()
         self._next_beat = self._next_housekeeping = 0.0
 
     def look(self) -> None:
@@ -149,12 +151,19 @@ class WorkerMonitor:
                     self._runner.abandon(job_id)
 
     def _reap(self) -> None:
-        """Put the jobs of dead workers back on the queue."""
+        """Put the jobs of dead workers back on the queue, and jobs of our own that have not run here since the last look."""
         if time.monotonic() < self._may_reap_at:
             return
         with new_session() as db:
             live = {worker.id for worker in repository.live_workers(db, self._pace.stale_s)}
-            dead = sorted(set(engine.owners(db).values()) - live)
+            owners = engine.owners(db)
+        lost = {job_id for job_id, owner in owners.items() if owner == self._identity.id} - set(self._runner.running())
+        if again := sorted(lost & self._lost):
+            # what the engine wrote while the database took no writes is gone, and nothing of it runs
+            engine.requeue(again)
+            log.warning("jobs %s were ours and did not run: they are on the queue again", ", ".join(again))
+        self._lost = lost - set(again)
+        dead = sorted(set(owners.values()) - live)
         if dead:
             found = engine.recover(dead)
             log.warning("recovered %d jobs of %s", len(found), ", ".join(dead))
@@ -186,13 +195,14 @@ class WorkerMonitor:
             shutil.rmtree(folders[name])
 
 
-def run_worker(slots: int, stop_event: threading.Event, pace: Pace | None = None) -> None:
+def run_worker(slots: int, stop_event: threading.Event, pace: Pace | None = None, beat: Callable[[], None] = lambda: None) -> None:
     """Run jobs until `stop_event` is set; then kill the children and leave unfinished jobs to the next worker.
 
     Args:
         slots: compute steps to run side by side.
         stop_event: set by the caller's signal handler.
         pace: how often to do what.
+        beat: called whenever the worker has looked after everything.
 
     Raises:
         IdentityLost: another process took this worker's name; its jobs are left alone.
@@ -211,6 +221,7 @@ def run_worker(slots: int, stop_event: threading.Event, pace: Pace | None = None
     try:
         while not stop_event.wait(CANCEL_POLL_S):
             monitor.look()
+            beat()
     finally:
         _stop(identity, runner)
 

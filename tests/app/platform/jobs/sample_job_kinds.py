@@ -19,6 +19,7 @@ from sqlalchemy.orm import Session
 from app.platform import files
 from app.platform.jobs import JobContext, JobError, JobKind, StepReport, register, write_atomically
 from app.platform.jobs.worker import Pace, run_worker
+from app.platform.start import Watchdog
 from app.platform.web.schemas import Text
 
 PREPARED: list[int] = []
@@ -204,5 +205,5 @@ def work(slots: int, beat_s: float, stale_s: float) -> None:
     """A worker process, as the command line starts it."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    run_worker(slots, stop, Pace(beat_s=beat_s, stale_s=stale_s))
+    run_worker(slots, stop, Pace(beat_s=beat_s, stale_s=stale_s), Watchdog(stop, stale_s).beat)
     sys.exit(0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 
 import psutil
+import psycopg
 import pytest
 from sqlalchemy import text
 
@@ -199,3 +200,36 @@ def test_rounds_of_kill_nine_at_any_moment_lose_and_double_nothing(jobs):
     for job_id in job_ids:
         job = jobs.ended(job_id, 60)
         assert (job.status, job.error, jobs.counted(job_id)) == ("succeeded", None, [0, 1, 2])
+
+
+def test_a_worker_runs_a_job_again_that_is_its_own_and_does_not_run(jobs):
+    """As a database leaves it that took no writes when the engine had a job: no other worker would ever take it."""
+    jobs.start_worker()
+    with new_session() as db:
+        jobs.wait(lambda: repository.live_workers(db, 60.0) or db.rollback())
+        (worker,) = repository.live_workers(db, 60.0)
+    with transaction("test") as db:
+        job_id = service.submit(db, "count", None, {"parts": 1, "numbers": 1}, "test").id
+        mine = "update dbos.workflow_status set status = 'PENDING', executor_id = :worker, application_version = :version"
+        db.execute(text(f"{mine} where workflow_uuid = :id"), {"worker": worker.id, "version": engine.PROTOCOL, "id": job_id})
+    job = jobs.ended(job_id)
+    assert (job.status, jobs.counted(job_id)) == ("succeeded", [0])
+
+
+@pytest.mark.slow
+def test_a_database_that_takes_no_writes_for_a_while_fails_no_job(jobs, server):
+    jobs.start_worker()
+    job_id = jobs.submit(parts=2, numbers=20, pause_s=0.1)
+    _count_until(jobs, job_id, 3)
+    try:
+        with psycopg.connect(server.admin_conninfo(), autocommit=True) as admin:
+            admin.execute("alter system set default_transaction_read_only = on")
+            admin.execute("select pg_reload_conf()")
+        waiting = jobs.log.read_text().count("the database is away")
+        jobs.wait(lambda: jobs.log.read_text().count("the database is away") > waiting + 1)
+    finally:
+        with psycopg.connect(server.admin_conninfo(), autocommit=True) as admin:
+            admin.execute("alter system reset default_transaction_read_only")
+            admin.execute("select pg_reload_conf()")
+    job = jobs.ended(job_id)
+    assert (job.status, jobs.counted(job_id)) == ("succeeded", [0, 1])
