@@ -20,7 +20,7 @@ from app.settings import get_settings
 from tests.network import Line
 from tests.ports import free_port
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 PATIENCE_S = 300.0
 
 pytestmark = pytest.mark.slow
