@@ -216,7 +216,7 @@ def test_the_session_commits_and_nothing_else_but_what_must_in_the_middle() -> N
 
 
 def test_no_folder_outgrows_a_reader() -> None:
-    allowed = {"benchmarks"}  # a file of benchmarks is one command
+    allowed = {"benchmarks", "changes", "docs/results"}  # a file is one command, one change, one run
     folders = Counter(str(path.parent) for path in repository_files())
     assert {"app/templates", "benchmarks", "docs", "static", "tests/data"} <= set(folders)
     assert {folder: n for folder, n in folders.items() if n > 15 and folder not in allowed} == {}
