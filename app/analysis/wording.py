@@ -129,7 +129,16 @@ def verdict(result: VerdictResult) -> str:
         if result.no_verdict is NoVerdict.NO_VISIT_AFTER_LOCK:
             return f"No verdict on {name} yet: no visit was recorded after the margins were locked."
         return f"No verdict on {name}: no cDBS session has a {_SHARED} above 0, of which the margin would be a share."
-    return verdict_sentence(name, result.assessment.verdict, len(result.visits), planned=result.locked.until is None)
+    sentence = verdict_sentence(name, result.assessment.verdict, len(result.visits), planned=result.locked.until is None)
+    return f"{sentence} {late_stops(result.late_stops)}".rstrip()
+
+
+def late_stops(sessions: Sequence[int]) -> str:
+    """Return what a verdict does not count: stops that became known after a lock; empty without any."""
+    if not sessions:
+        return ""
+    of = f"Session{'s' if len(sessions) > 1 else ''} {_numbers(sessions)} {'were' if len(sessions) > 1 else 'was'} stopped"
+    return f"{of} for the participant's sake, which became known after the visit was locked: counted here as measured, not as failures."
 
 
 def verdict_sentence(name: str, found: Verdict, visits: int, *, planned: bool) -> str:
@@ -189,14 +198,17 @@ def outlook(result: VerdictResult, sessions_per_arm: int) -> str:
     name, a = CONTROLLER_NAMES[result.controller], result.assessment
     if a is None or not isinstance(a.verdict, Inconclusive):
         return verdict(result)
-    found = a.verdict
-    if found.more_visits is None:
-        return f"{name}: {_more(found)}."
-    visits, arms = counted(found.more_visits, "more visit"), counted(sessions_per_arm, "session")
+    return f"{_outlook(name, a.verdict, sessions_per_arm)} {late_stops(result.late_stops)}".rstrip()
+
+
+def _outlook(name: str, verdict_now: Inconclusive, sessions_per_arm: int) -> str:
+    if verdict_now.more_visits is None:
+        return f"{name}: {_more(verdict_now)}."
+    visits, arms = counted(verdict_now.more_visits, "more visit"), counted(sessions_per_arm, "session")
     settled = f"{name}: {visits}, each with {arms} of it and as many of cDBS, would show with a probability of 80 % that it saves energy"
     settled += " without loss, if what was seen holds"
-    if found.fewest_visits is not None and found.fewest_visits < found.more_visits:
-        return f"{settled}. With more sessions at each it is {counted(found.fewest_visits, 'visit')} at the least."
+    if verdict_now.fewest_visits is not None and verdict_now.fewest_visits < verdict_now.more_visits:
+        return f"{settled}. With more sessions at each it is {counted(verdict_now.fewest_visits, 'visit')} at the least."
     return f"{settled}. More sessions at a visit would not replace one."
 
 

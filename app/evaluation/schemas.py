@@ -71,18 +71,21 @@ class _Steps(Model):
     mean_return: float | None
     mean_step_return: float | None
     mean_end_reward: float | None
+    stopped: int = Field(description="Sessions among them that were stopped for the participant's sake.")
     energy: float | None
     mean_beta: float | None
+    energy_difference: float | None = Field(description="To the cDBS of the same visits, as a share of it; null without such cDBS.")
+    mean_beta_difference: float | None = Field(description="To the cDBS of the same visits.")
 
 
 if TYPE_CHECKING:
     _Means = _Steps
 else:
-    _Means = fields_model("_Means", lambda o: {o.field: (float | None, ...)}, _Steps)
+    _Means = fields_model("_Means", lambda o: {o.field: (float | None, ...), f"{o.field}_difference": (float | None, ...)}, _Steps)
 
 
 class TestedBefore(_Means):
-    """What a policy did where it ran: actual returns with the H and gamma of the estimates."""
+    """What a policy did where it ran: actual returns with the H and gamma of the estimates, and differences to the same visit's cDBS."""
 
     __test__ = False
 

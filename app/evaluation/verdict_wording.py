@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 from app.evaluation.ranking.answer import Difference
 from app.evaluation.ranking.results import RandomSessions
-from app.evaluation.schemas import Standing
-from app.evaluation.wording import OUTCOME_NAMES, amplitude, chance, number, percent, sentence, signed
+from app.evaluation.schemas import Standing, TestedBefore
+from app.evaluation.wording import OUTCOME_NAMES, amplitude, chance, count_stops, number, percent, sentence, signed
 from app.platform.web.charts import counted
 from ml.ope import Flag
 from ml.outcomes import ANY, OUTCOMES, Outcome
@@ -114,6 +114,19 @@ def effect(differences: Mapping[str, Difference], within: float | None = None) -
     return (", ".join(told) or "what it would change is not estimated") + ("" if within is None else f"; {likely(within)}")
 
 
+def test_results(results: TestedBefore | None) -> str:
+    """Return what a policy's own sessions showed: how many, how many were stopped, and the differences to the same day's cDBS."""
+    if results is None:
+        return "never run so far"
+    told = [f"{counted(results.sessions, 'session')} so far"]
+    if results.stopped:
+        told.append(f"{results.stopped} stopped for the participant's sake")
+    known = [(getattr(results, f"{quantity}_difference"), *words) for quantity, *words in _CHANGES]
+    apart = [change(name, scale * value, digits, unit) for value, name, scale, digits, unit in known if value is not None]
+    told.append("against cDBS of the same day: " + ", ".join(apart) if apart else "no cDBS of the same day")
+    return "; ".join(told)
+
+
 def change(name: str, difference: float, digits: int, unit: str) -> str:
     """What changes by how much: signed, with its unit, of one point in the singular; unchanged where it rounds to nothing.
 
@@ -137,6 +150,7 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "retired": lambda f: f"retired: {f.fact('text')}",
     "no_posterior": lambda f: "without the chances of every outcome: evaluate again",
     "adverse_event": lambda f: "serious adverse event, not cleared by a clinician",
+    "stopped": lambda f: f"{count_stops(f)}, not cleared by a clinician",
     "nearly_off": lambda f: f"nearly off {percent(f.value)} of the time",
     "beyond_margin": lambda f: (
         f"{chance(number(f))} likely that {ANY} is worse by more than its margin, most often {OUTCOME_NAMES[f.fact('outcome')]}"

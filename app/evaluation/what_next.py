@@ -33,6 +33,7 @@ def what_next(judged: Judged, *, may_run: bool) -> Markup:
             margins=margins_of(judged.participant.margins_in_force),
             plainly=verdict_wording.plainly,
             effect=verdict_wording.effect,
+            test_results=verdict_wording.test_results,
             random_effects=verdict_wording.random_effects,
             usual=verdict_wording.usual,
             allowed=verdict_wording.allowed,

@@ -23,6 +23,11 @@ def joined(flags: Sequence[Flag]) -> str:
     return "; ".join(sentence(flag) for flag in flags)
 
 
+def count_stops(flag: Flag) -> str:
+    """Return how many sessions were stopped for the participant's sake."""
+    return f"{counted(int(number(flag)), 'session')} stopped for the participant's sake"
+
+
 def amplitude(fraction: float, ma: float | None) -> str:
     """An amplitude in mA; as a share of cDBS where that is not known in mA."""
     return f"{ma:.1f} mA" if ma is not None else f"{percent(fraction)} of the cDBS amplitude"
@@ -220,6 +225,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "no_ordering_skill": _no_ordering_skill,
     "undecided": lambda f: "neither likely enough to be within the margins nor likely enough to be beyond one",
     "adverse_event": lambda f: "a serious adverse event under it has not been cleared by a clinician",
+    "stopped": lambda f: f"{count_stops(f)}, and no clinician has cleared {'it' if f.value == 1 else 'them'}",
     "nearly_off": lambda f: f"nearly off, below 20 % of the cDBS amplitude, {percent(f.value)} of the time (at most {percent(f.limit)})",
     "beyond_margin": lambda f: (
         f"{chance(number(f))} likely beyond a margin of {ANY}, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "

@@ -12,12 +12,13 @@ from starlette.datastructures import FormData
 from app.accounts.permissions import Caller
 from app.evaluation.ranking.answer import Answer, Row
 from app.evaluation.ranking.assessment import cdbs_amplitude_now
+from app.evaluation.ranking.decisions import findings_of
 from app.evaluation.ranking.judged import Judged
 from app.evaluation.ranking.service import current
 from app.evaluation.verdict_wording import plainly
 from app.learning import repository as learning
 from app.planning import wording
-from app.planning.grounds import HAPPENED, events_against
+from app.planning.grounds import events_against
 from app.planning.plans.designs import offered
 from app.planning.plans.schemas import HeldIn, LimitIn, PlanIn, PlanOptions
 from app.planning.plans.service import rules_of
@@ -99,7 +100,6 @@ def shown_of(db: Session, visit: Visit, caller: Caller, full: PlanView | None, v
         "ranking": found,
         "typed": values or {},
         "choices": choices,
-        "happened": plainly(HAPPENED.reasons),
         "suggestions": [(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],
         "held_rows": held_rows(values, held_in(found, slots - len(suggestions), place), place.lower_bound, cdbs_amplitude_now(participant)),
         "holding": wording.holding,
@@ -118,13 +118,13 @@ class Choice:
     """A policy that may be planned, and what the ranking says of it.
 
     Attributes:
-        row: its own; None for what no ranking holds. harmful: whether a serious adverse event under it has not been cleared by a
-            clinician. twins: policies that do the same by the ranking.
+        row: its own; None for what no ranking holds. harmful: serious adverse events and stops under it that no
+            clinician has cleared, in words. twins: policies that do the same by the ranking.
     """
 
     policy: Policy
     row: Row | None
-    harmful: bool
+    harmful: str
     twins: tuple[Choice, ...] = ()
 
 
@@ -138,7 +138,9 @@ def _choices(db: Session, participant: Participant, answered: Answer | None) -> 
     groups: dict[int, list[Choice]] = {}
     for p in policies:
         head = heads.get(p.id, p.id)
-        groups.setdefault(head if head in known else p.id, []).append(Choice(p, rows.get(p.id), p.id in harmful))
+        groups.setdefault(head if head in known else p.id, []).append(
+            Choice(p, rows.get(p.id), plainly(findings_of(harmful.get(p.id, ()))))
+        )
     return [replace(first, twins=tuple(others)) for first, *others in groups.values()]
 
 

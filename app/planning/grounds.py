@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from sqlalchemy.orm import Session
@@ -10,23 +9,14 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.evaluation import repository as evaluations
 from app.evaluation.ranking.assessment import Assessment
-from app.evaluation.ranking.decisions import Decided
+from app.evaluation.ranking.decisions import Decided, findings_of
 from app.evaluation.ranking.judged import judged
 from app.evaluation.schemas import Decision
 from app.study.adverse_events.repository import events_of_participant
-from app.study.adverse_events.service import blocking_events
-from app.tables.adverse_events import AdverseEvent
+from app.study.adverse_events.service import Events, blocking_events
 from app.tables.evaluations import Evaluation
 from app.tables.participants import Participant
 from app.tables.plans import Plan
-from ml.ope import Flag
-
-Events = Mapping[int, tuple[AdverseEvent, ...]]
-"""Serious adverse events that no clinician has cleared, by policy."""
-
-HAPPENED = Decided("unsafe", (Flag("adverse_event"),))
-"""The verdict on a policy under which something serious happened, where no ranking says so."""
-
 
 _STRICTEST_FIRST = ("unsafe", "test_with_care")
 
@@ -80,7 +70,7 @@ class Grounds:
         ranked = [one for ranking in self.rankings if (one := ranking.of(policy_id)) is not None]
         said = tuple(one.planned for one in ranked if one.planned is not None)
         if not said and policy_id in self.events:
-            said = (HAPPENED,)
+            said = (Decided("unsafe", findings_of(self.events[policy_id])),)
         return Finding(said) if said else None
 
 
@@ -118,5 +108,5 @@ def unanswered(plan: Plan, events: Events) -> Events:
 
 
 def events_against(db: Session, participant: Participant) -> Events:
-    """By policy, serious adverse events that no clinician has cleared; those of sealed visits too, as a verdict depends on no reader."""
+    """Return by policy the serious events and stops that no clinician has cleared; of sealed visits too: a verdict depends on no reader."""
     return blocking_events(events_of_participant(db, participant.id), SYSTEM)

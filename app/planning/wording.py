@@ -17,6 +17,7 @@ from app.planning.visit_day.screening import Found
 from app.platform.web.charts import counted
 from app.platform.web.numbers import stated
 from app.study.blinding import CONTROLLER_NAMES
+from app.tables.adverse_events import AdverseEvent
 from app.tables.plans import Plan, PlanItem
 from app.tables.sessions import Controller
 from ml.deploy.manifest import BundleManifest
@@ -65,17 +66,19 @@ ANSWER_EVENT = (
 """How a plan, or a policy's bundle, comes to run again after a serious adverse event."""
 
 
-def happened(policy: str | None, events: Sequence[int]) -> str:
-    """What stands against a policy, in one clause.
+def happened(policy: str | None, events: Sequence[AdverseEvent]) -> str:
+    """Return in one clause what no clinician has cleared of a policy.
 
     Args:
-        policy: its name; None where nobody may be shown which one it is. events: numbers of the adverse events; none where they would tell.
+        policy: its name; None where nobody may be shown which one it is. events: the adverse events; none where they would tell.
     """
     if policy is None:
-        return "a serious adverse event, which no clinician has cleared, stands against a policy of it"
-    one = len(events) == 1
-    which = f"adverse event{'' if one else 's'} {_listed(events)}"
-    return f"{which} under policy '{policy}' {'is' if one else 'are'} serious, and no clinician has cleared {'it' if one else 'them'}"
+        return "a serious adverse event or a stop, which no clinician has cleared, stands against a policy of it"
+    one, serious = len(events) == 1, [event for event in events if event.now.serious]
+    which = f"adverse event{'' if one else 's'} {_listed([event.id for event in events])}"
+    kind = "serious" if len(serious) == len(events) else "serious or stops" if serious else "a stop" if one else "stops"
+    kind += "" if serious else " for the participant's sake"
+    return f"{which} under policy '{policy}' {'is' if one else 'are'} {kind}, and no clinician has cleared {'it' if one else 'them'}"
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -171,6 +171,7 @@ def change_session(db: Session, session: StudySession, change: SessionChange, ca
     check_control(db, session, given)
     if "excluded_reason" in given and not (given["excluded_reason"] or "").strip() and session.excluded_reason is not None:
         repeated.refuse(db, session)
+    stopped_before = session.stopped_reason
     for name, value in given.items():
         if name in ("excluded_reason", "stopped_reason"):
             value = (value or "").strip() or None
@@ -178,6 +179,7 @@ def change_session(db: Session, session: StudySession, change: SessionChange, ca
             continue
         setattr(session, name, value)
     db.flush()
+    outcomes.follow_stop(db, session, stopped_before, change.reason or "", caller)
     if "hemisphere" in given:
         outcomes.derive_for_session(db, session)  # another hand's grasps may count now
     return session

@@ -31,9 +31,10 @@ EVENT_KINDS = {
     EventKind.PAIN: "Pain",
     EventKind.NAUSEA: "Nausea",
     EventKind.DEVICE: "Device",
+    EventKind.STOPPED: "Session stopped for the participant's sake",
     EventKind.OTHER: "Other",
 }
-EVENT_SEVERITIES = {Severity.NONE: "none", Severity.MILD: "mild", Severity.SEVERE: "severe"}
+EVENT_SEVERITIES = {Severity.NONE: "none", Severity.MILD: "mild", Severity.SEVERE: "severe", Severity.NOT_STATED: "not stated"}
 
 DRUG_NAMES = {drug.value: facts.name for drug, facts in DRUGS.items()}
 SYMPTOMS = {

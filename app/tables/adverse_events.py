@@ -36,6 +36,8 @@ class EventKind(StrEnum):
     PAIN = "pain"
     NAUSEA = "nausea"
     DEVICE = "device"
+    STOPPED = "stopped"
+    """A session was stopped for the participant's sake."""
     OTHER = "other"
 
 
@@ -45,6 +47,7 @@ class Severity(StrEnum):
     NONE = "none"
     MILD = "mild"
     SEVERE = "severe"
+    NOT_STATED = "not_stated"
 
 
 class AdverseEvent(Base):
@@ -76,9 +79,14 @@ class AdverseEvent(Base):
         return self.revisions[-1]
 
     @property
+    def is_stop(self) -> bool:
+        """True if it is a session that was stopped for the participant's sake."""
+        return self.now.kind == EventKind.STOPPED and self.now.severity != Severity.NONE
+
+    @property
     def blocks(self) -> bool:
-        """True if it is serious and no clinician has cleared its newest revision."""
-        return self.now.serious and self.now.cleared_reason is None
+        """True if it is serious, or a stop, and no clinician has cleared its newest revision."""
+        return (self.now.serious or self.is_stop) and self.now.cleared_reason is None
 
 
 class AdverseEventRevision(Base):
@@ -87,7 +95,7 @@ class AdverseEventRevision(Base):
     __tablename__ = "adverse_event_revision"
     __table_args__ = (
         UniqueConstraint("event_id", "revision"),
-        CheckConstraint("severity in ('none', 'mild', 'severe')", name="severity"),
+        CheckConstraint("severity in ('none', 'mild', 'severe', 'not_stated')", name="severity"),
         CheckConstraint("severity = 'none' or kind is not null", name="kind_stated"),
         CheckConstraint("severity <> 'none' or not serious", name="serious"),
         CheckConstraint("kind <> 'other' or severity = 'none' or note <> ''", name="other_described"),

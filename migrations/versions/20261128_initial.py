@@ -1212,7 +1212,7 @@ def upgrade() -> None:
         sa.CheckConstraint("kind <> 'other' or severity = 'none' or note <> ''", name=op.f("ck_adverse_event_revision_other_described")),
         sa.CheckConstraint("severity <> 'none' or not serious", name=op.f("ck_adverse_event_revision_serious")),
         sa.CheckConstraint("severity = 'none' or kind is not null", name=op.f("ck_adverse_event_revision_kind_stated")),
-        sa.CheckConstraint("severity in ('none', 'mild', 'severe')", name=op.f("ck_adverse_event_revision_severity")),
+        sa.CheckConstraint("severity in ('none', 'mild', 'severe', 'not_stated')", name=op.f("ck_adverse_event_revision_severity")),
         sa.ForeignKeyConstraint(["event_id"], ["adverse_event.id"], name=op.f("fk_adverse_event_revision_event_id_adverse_event")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_adverse_event_revision")),
         sa.UniqueConstraint("event_id", "revision", name=op.f("uq_adverse_event_revision_event_id_revision")),

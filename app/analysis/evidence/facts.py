@@ -85,7 +85,8 @@ class Facts:
 
     Attributes:
         values: by metric, absent where not measured. missing: why, by metric. steps: usable share of beta and amplitude is judged on them.
-        stopped: it was stopped for the patient's sake, for the reason given. medication_h: hours since the last dose, where known.
+        stopped: it was stopped for the patient's sake, for the reason given. late_stop: so, but known only after its visit was locked:
+            it counts as measured. medication_h: hours since the last dose, where known.
         created_at: when the record of the session came into being. visit_date: of its visit, where stated.
     """
 
@@ -106,6 +107,7 @@ class Facts:
     stopped: str | None
     medication_h: float | None
     visit_date: date | None = None
+    late_stop: bool = False
 
     def began_after(self, moment: datetime) -> bool:
         """Return whether the session is known to have begun after a moment: by its start, else by the day of its visit."""
@@ -135,8 +137,8 @@ class Excluded:
     duration_s: float = 0.0
 
 
-def read(session: StudySession, arm: Arm, traces: TracesOf) -> Facts:
-    """The facts of one session.
+def read(session: StudySession, arm: Arm, traces: TracesOf, *, late_stop: bool = False) -> Facts:
+    """Return the facts of one session.
 
     Raises:
         Invalid: traces that do not fit the session's grid, or a cDBS amplitude that cannot be told.
@@ -169,6 +171,7 @@ def read(session: StudySession, arm: Arm, traces: TracesOf) -> Facts:
         stopped=session.stopped_reason,
         medication_h=hours_since_dose(session),
         visit_date=session.visit.date,
+        late_stop=late_stop,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy.orm import Session
@@ -14,6 +14,7 @@ from app.platform.errors import Invalid
 from app.platform.kept import keep, recalled
 from app.study import blinding
 from app.study import repository as study
+from app.study.adverse_events.repository import late_stops
 from app.study.sessions.data import failed_qoc_of
 from app.study.sessions.repository import fingerprints
 from app.tables.participants import Participant
@@ -61,10 +62,11 @@ def of_all(db: Session, participants: Sequence[Participant], caller: Caller) -> 
         some = lacking[start : start + READ_AT_ONCE]
         sessions = repository.sessions_of(db, [participants[i].id for i in some])
         everything = [session for held in sessions.values() for session in held]
+        late = late_stops(db, [participants[i].id for i in some])
         traces = study.traces_of_recordings(db, {s.recording_id for session in everything for s in session.segments})
         held = _recordings_of_several_sides(db, everything, traces)
         for i in some:
-            result = _read(participants[i], sessions.get(participants[i].id, []), traces, caller, keys[i])
+            result = _read(participants[i], sessions.get(participants[i].id, []), traces, caller, keys[i], late)
             found[i] = keep(keys[i], result)
         del held  # until here the segments found theirs without a query each
     return [known for known in found if known is not None]
@@ -79,7 +81,12 @@ def _recordings_of_several_sides(
 
 
 def _read(
-    participant: Participant, held: Sequence[StudySession], traces: Mapping[int, Sequence[Trace]], caller: Caller, key: Hashable
+    participant: Participant,
+    held: Sequence[StudySession],
+    traces: Mapping[int, Sequence[Trace]],
+    caller: Caller,
+    key: Hashable,
+    late: Collection[int],
 ) -> Evidence:
     counted: list[Facts] = []
     excluded: list[Excluded] = []
@@ -93,7 +100,7 @@ def _read(
             excluded.append(Excluded(*place, LeftOut.SEALED if session.visit.sealed else LeftOut.HIDDEN, ""))
         else:
             try:
-                counted.append(read(session, arm, lambda i: traces.get(i, [])))
+                counted.append(read(session, arm, lambda i: traces.get(i, []), late_stop=session.id in late))
             except Invalid as error:
                 excluded.append(Excluded(*place, LeftOut.UNREADABLE, error.detail, arm, session.duration_s))
     settings = participant.current_settings

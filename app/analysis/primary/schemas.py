@@ -111,6 +111,7 @@ class VerdictOut(Model):
     outcomes: list[OutcomeVerdictOut]
     energy_saving_percent: AverageOut | None
     stopped_session_ids: list[int]
+    late_stop_session_ids: list[int] = Field(description="Stopped too, but known only after the lock of the visit: counted as measured.")
 
 
 class PrimaryOut(Model):

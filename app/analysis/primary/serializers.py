@@ -132,6 +132,7 @@ def verdict_out(result: VerdictResult) -> VerdictOut:
         outcomes=outcomes,
         energy_saving_percent=saving_out(a.saving) if a else None,
         stopped_session_ids=list(result.stopped),
+        late_stop_session_ids=list(result.late_stops),
     )
 
 

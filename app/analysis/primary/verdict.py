@@ -60,6 +60,7 @@ class VerdictResult:
         visits: with both arms, among the sessions that it rests on. drawn_from: all visits of these sessions.
         left_to_exploration: visits of before the lock.
         margin: by outcome, in its unit. stopped: sessions of the controller that were stopped for the patient's sake.
+        late_stops: so, but known only after their visit was locked: they count as measured.
     """
 
     controller: Controller
@@ -72,6 +73,7 @@ class VerdictResult:
     left_to_exploration: tuple[int, ...]
     margin: dict[str, float]
     stopped: tuple[int, ...]
+    late_stops: tuple[int, ...] = ()
 
 
 def opened_at(session: Facts) -> datetime:
@@ -154,6 +156,7 @@ def _judge(
         tuple(sorted({s.visit for s in everything if tested(s)} - used)),
         {o.name: o.margin for o in outcomes if o is not None},
         tuple(s.session_id for s in sessions if tested(s) and s.stopped is not None),
+        tuple(s.session_id for s in sessions if tested(s) and s.late_stop),
     )
 
 

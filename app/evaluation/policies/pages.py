@@ -93,6 +93,7 @@ def _page(
         same=_same(policy, answered) if answered else [],
         plainly=verdict_wording.plainly,
         effect=verdict_wording.effect,
+        test_results=verdict_wording.test_results,
         standing_names=verdict_wording.STANDING_NAMES,
         may_write=may(caller, can.WRITE_POLICIES, participant),
         algorithm_names=ALGORITHM_NAMES,

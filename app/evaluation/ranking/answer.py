@@ -126,7 +126,7 @@ class Answer:
     @property
     def off(self) -> list[Row]:
         """What is not to be run without a clinician's word because it is no stimulation by another name, and for nothing that happened."""
-        return [r for r in self.like_off if _held_back(r) and all(reason.code != "adverse_event" for reason in r.decided.reasons)]
+        return [r for r in self.like_off if _held_back(r) and not _happened(r)]
 
     @property
     def undecided(self) -> list[Row]:
@@ -283,6 +283,10 @@ def _under_cdbs(found: Assessment) -> dict[str, float]:
     own = found.cdbs.posterior if found.cdbs else None
     drawn = {name: outcome_draws(own, name) for name in QUANTITIES[1:]} if own is not None else {}
     return {name: float(draws.mean()) for name, draws in drawn.items() if draws is not None}
+
+
+def _happened(row: Row) -> bool:
+    return any(reason.code in ("adverse_event", "stopped") for reason in row.decided.reasons)
 
 
 def _needed(row: Row) -> float | None:

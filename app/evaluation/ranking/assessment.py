@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from app.platform.errors import Invalid
 from app.study import cdbs_amplitude
 from app.tables.evaluations import Evaluation
 from app.tables.participants import Participant, SettingsVersion
-from ml.ope import POSTERIOR, Estimate, rank_policies
+from ml.ope import POSTERIOR, Estimate, Flag, rank_policies
 from ml.ope.posterior.further_sessions import Place
 
 _LAST = ("unsafe",)
@@ -134,15 +134,16 @@ def assess(
     participant: Participant,
     version: SettingsVersion,
     cdbs_ma: float | None,
-    harmful: Collection[int] = (),
+    harms: Mapping[int, tuple[Flag, ...]] | None = None,
 ) -> Assessment:
     """What an evaluation says of its policies by one method, with the verdicts by the participant's margins of now.
 
     Args:
         evaluation: with its estimates. policies: all of them, by id. method: whose estimates rank; one of the evaluation's.
         participant: whose. version: the settings that the evaluation rests on. cdbs_ma: as `cdbs_amplitude_now` gives it.
-        harmful: policies under which something serious happened that no clinician has cleared.
+        harms: by policy, what happened under it that no clinician has cleared (`decisions.findings_of`); nothing where not given.
     """
+    found_under = harms or {}
     table: dict[int, dict[str, Estimate]] = defaultdict(dict)
     for row in evaluation.estimates:
         table[row.policy_id][row.method] = estimate_of(row)
@@ -160,19 +161,15 @@ def assess(
         cdbs_ma,
         tuple((held, table[i][POSTERIOR]) for i in references if (held := policies[i].amplitude) is not None and POSTERIOR in table[i]),
     )
+    by = evaluation.default_method
     candidates = {i: e for i, e in by_method.items() if i not in references}
     decided = {
-        i: decide(
-            table[i], cdbs, evaluation.default_method, given, i, retired_reason=policies[i].retired_reason, adverse_event=i in harmful
-        )
-        for i in candidates
+        i: decide(table[i], cdbs, by, given, i, retired_reason=policies[i].retired_reason, harms=found_under.get(i, ())) for i in candidates
     }
     # a reference may be planned as any policy; how many sessions would settle it is not asked
     unasked = replace(given, noise={})
     planned = decided | {
-        i: decide(
-            table[i], cdbs, evaluation.default_method, unasked, i, retired_reason=policies[i].retired_reason, adverse_event=i in harmful
-        )
+        i: decide(table[i], cdbs, by, unasked, i, retired_reason=policies[i].retired_reason, harms=found_under.get(i, ()))
         for i, reference in references.items()
         if reference != "cdbs" and i in table
     }

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
 from app.evaluation.schemas import Decision, Standing
 from app.study.margins.service import margins_of
+from app.tables.adverse_events import AdverseEvent
 from app.tables.evaluations import Evaluation
 from app.tables.participants import MarginsVersion
 from ml.ope import FEWEST_VISITS, HAZARDS, POSTERIOR, SETTLED_BY_SESSIONS, Estimate, Flag, Levels, Verdict, gain_over, verdict
@@ -82,36 +83,42 @@ def decide(
     policy_id: int,
     *,
     retired_reason: str | None = None,
-    adverse_event: bool = False,
+    harms: tuple[Flag, ...] = (),
 ) -> Decided:
     """The verdict on one candidate.
 
     A retired policy cannot be told: it is not proposed, whatever is predicted. Nor can one of an evaluation without a posterior: a single
     method knows no chance of keeping within the margins. It is unsafe where the whole interval of its gain over cDBS is below 0. A serious
-    adverse event counts whatever else is known.
+    adverse event and a stop count whatever else is known.
 
     Args:
         estimates: of the candidate, by method. cdbs: of the cDBS reference, by method; empty where it has none.
         method: that the evaluation ranks by.
         given: what all verdicts of the evaluation share. policy_id: whose.
         retired_reason: why a person withdrew it.
-        adverse_event: whether a serious adverse event under it has not been cleared by a clinician.
+        harms: what happened under it that no clinician has cleared, as `findings_of` gives it.
     """
-    happened = (Flag("adverse_event"),) if adverse_event else ()
     if retired_reason:
-        return Decided("cannot_tell", (Flag.of("retired", text=retired_reason), *happened))
+        return Decided("cannot_tell", (Flag.of("retired", text=retired_reason), *harms))
     own = estimates.get(POSTERIOR)
     if own is None:
         known = _without_posterior(estimates.get(method), cdbs.get(method))
-        return Decided("unsafe", (*happened, *known.reasons)) if happened else known
+        return Decided("unsafe", (*harms, *known.reasons)) if harms else known
     reference, levels = cdbs.get(POSTERIOR), levels_of(given.levels)
-    found = verdict(own, reference, margins_of(given.margins), levels, adverse_event=adverse_event, unchecked=given.unchecked)
+    found = verdict(own, reference, margins_of(given.margins), levels, harms=harms, unchecked=given.unchecked)
     if found.code != "cannot_tell" or found.reasons[0].code not in SETTLED_BY_SESSIONS:
         return Decided(found.code, found.reasons, found)
     if not given.noise:
         return Decided(found.code, found.reasons, found)  # how much a session tells is not known
     further = _further(own, reference, given, levels, policy_id)
     return Decided(found.code, (*found.reasons, *_of_sessions(further, given.cdbs_ma)), found, further)
+
+
+def findings_of(events: Sequence[AdverseEvent]) -> tuple[Flag, ...]:
+    """Return the findings that follow from adverse events that block a policy: a serious event first, then stops."""
+    serious = any(event.now.serious for event in events)
+    stops = sum(event.is_stop for event in events)
+    return (Flag("adverse_event"),) * serious + ((Flag("stopped", float(stops), None, "stops"),) if stops else ())
 
 
 def levels_of(margins: MarginsVersion) -> Levels:

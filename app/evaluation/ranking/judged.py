@@ -19,6 +19,7 @@ from app.accounts.permissions import SYSTEM, Caller
 from app.evaluation import repository
 from app.evaluation.ranking.answer import Answer, Row, answer
 from app.evaluation.ranking.assessment import Assessed, Assessment, assess, cdbs_amplitude_now
+from app.evaluation.ranking.decisions import findings_of
 from app.evaluation.ranking.picture import Picture, picture
 from app.evaluation.ranking.results import RandomSessions, random_sessions, tested_before
 from app.evaluation.repository import PolicyHead
@@ -28,12 +29,12 @@ from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study.adverse_events.repository import events_of_participant
-from app.study.adverse_events.service import blocked_policies
+from app.study.adverse_events.service import Events, blocking_events
 from app.study.sessions.repository import ReadOnce
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot
 from app.tables.participants import Participant, SettingsVersion
-from ml.ope import Estimate, method_keys
+from ml.ope import Estimate, Flag, method_keys
 
 T = TypeVar("T")
 
@@ -46,7 +47,7 @@ class Judged:
     """One evaluation of a participant, by one method, as it is judged now; of one request.
 
     Attributes:
-        heads: its policies as they are now, by id. harmful: those under which something serious happened that no clinician has cleared.
+        heads: its policies as they are now, by id. happened: by policy, serious events and stops that no clinician has cleared.
         caller, sessions: who asks what sessions showed, and the participant's; both None where nobody asks for that.
     """
 
@@ -55,7 +56,7 @@ class Judged:
     evaluation: Evaluation
     method: str
     heads: Mapping[int, PolicyHead]
-    harmful: frozenset[int]
+    happened: Mapping[int, tuple[Flag, ...]]
     cdbs_ma: float | None
     caller: Caller | None = None
     sessions: ReadOnce | None = None
@@ -64,7 +65,8 @@ class Judged:
     def key(self) -> Hashable:
         """Everything that what is kept depends on, beside this code."""
         margins, levels = self.participant.margins_in_force.id, self.participant.current_margins.id
-        judged = (self.evaluation.id, self.evaluation.created_at, self.method, tuple(self.heads.values()), self.harmful, self.cdbs_ma)
+        heads, happened = tuple(self.heads.values()), tuple(self.happened.items())
+        judged = (self.evaluation.id, self.evaluation.created_at, self.method, heads, happened, self.cdbs_ma)
         shown: Hashable = None
         if self.caller is not None and self.sessions is not None:
             shown = (self.sessions.fingerprint, blinding.sights(self.db, [self.participant], self.caller)[0])
@@ -86,7 +88,7 @@ class Judged:
     def with_draws(self) -> Assessment:
         """The assessment with every draw, read and judged anew. For computing what is kept."""
         version = study_repository.settings_version(self.db, self.evaluation.settings_version_id)
-        found = assess(self.evaluation, self.heads, self.method, self.participant, version, self.cdbs_ma, self.harmful)
+        found = assess(self.evaluation, self.heads, self.method, self.participant, version, self.cdbs_ma, self.happened)
         return found.with_tests(self.tested)
 
     @cached_property
@@ -136,11 +138,14 @@ class Judged:
         return self.kept(("picture", lower_bound, policy_id), read)
 
 
-def _with_copies(harmful: frozenset[int], heads: Mapping[int, PolicyHead]) -> frozenset[int]:
-    """Policies under which something serious happened, their students and their teachers: a student does what its teacher does."""
-    students = {i for i, head in heads.items() if head.teacher_id in harmful}
-    teachers = {head.teacher_id for i, head in heads.items() if i in harmful and head.teacher_id is not None}
-    return harmful | students | teachers
+def _with_copies(events: Events, heads: Mapping[int, PolicyHead]) -> dict[int, tuple[Flag, ...]]:
+    """Return findings by policy, of students and teachers too: a student does what its teacher does."""
+    found = dict(events)
+    for i, head in heads.items():
+        if head.teacher_id is not None:
+            found[i] = (*found.get(i, ()), *events.get(head.teacher_id, ()))
+            found[head.teacher_id] = (*found.get(head.teacher_id, ()), *events.get(i, ()))
+    return {i: findings_of(found[i]) for i in sorted(found) if found[i]}
 
 
 def judged(
@@ -168,8 +173,8 @@ def judged(
             raise Invalid(f"This ranking has no estimates by '{chosen}'.", f"Choose one of {', '.join(there)}.")
     heads, cdbs_ma = repository.policy_heads(db, evaluation.id), cdbs_amplitude_now(participant)
     # a verdict does not depend on who asks for it
-    harmful = _with_copies(blocked_policies(events_of_participant(db, participant.id), SYSTEM), heads)
-    return Judged(db, participant, evaluation, chosen, heads, harmful, cdbs_ma, caller, sessions)
+    happened = _with_copies(blocking_events(events_of_participant(db, participant.id), SYSTEM), heads)
+    return Judged(db, participant, evaluation, chosen, heads, happened, cdbs_ma, caller, sessions)
 
 
 class _WithoutDraws(dict[str, Any]):

@@ -103,6 +103,7 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             pooling=[wording.shape_pooling(o, told) for o, told in dose_shapes.pooling(judged.evaluation).items()],
             plainly=verdict_wording.plainly,
             signed=wording.signed,
+            test_results=verdict_wording.test_results,
             chance=wording.chance,
             weights=assessment.weights,
             correlation=assessment.held_out_correlation,

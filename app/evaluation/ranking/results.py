@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, median
@@ -10,7 +10,7 @@ from statistics import fmean, median
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.evaluation.ranking.actual import Actual, actual, mean_of
+from app.evaluation.ranking.actual import QUANTITIES, Actual, actual, mean_of
 from app.evaluation.schemas import TestedBefore
 from app.learning.snapshots.trajectories import trajectory_of
 from app.platform.errors import Invalid
@@ -41,7 +41,7 @@ class DrivenSession:
     Attributes:
         session_id, visit: its number, and that of its visit.
         controller, policy_id: what drove it; no policy for cDBS.
-        trajectory: its steps; None with `left_out`, the reason.
+        trajectory: its steps; None with `left_out`, the reason. stopped: for the participant's sake.
     """
 
     session_id: int
@@ -50,6 +50,7 @@ class DrivenSession:
     policy_id: int | None
     trajectory: SessionTrajectory | None
     left_out: str | None
+    stopped: bool = False
 
 
 def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller, sessions: ReadOnce | None = None) -> list[DrivenSession]:
@@ -71,17 +72,29 @@ def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller, sessi
     for session, arm in driven:
         read = _read(session, traces, arm, version, snapshot, failed)
         trajectory, reason = (None, read) if isinstance(read, str) else (read, None)
-        found.append(DrivenSession(session.id, session.visit.number, arm.controller, arm.policy_id, trajectory, reason))
+        found.append(
+            DrivenSession(
+                session.id, session.visit.number, arm.controller, arm.policy_id, trajectory, reason, session.stopped_reason is not None
+            )
+        )
     return found
 
 
 def results_by_policy(ran: list[DrivenSession], settings: MdpSettings, horizon_steps: int, cdbs: int | None) -> dict[int, TestedBefore]:
     """Actual results by policy, under the settings, horizon and discount of the estimates; those of cDBS under its reference's id."""
     results: dict[int, list[Actual]] = defaultdict(list)
+    by_visit: dict[int | None, dict[int, list[Actual]]] = defaultdict(lambda: defaultdict(list))
+    stopped: Counter[int] = Counter()
     for session in ran:
         policy_id = session.policy_id if session.policy_id is not None else cdbs
-        if policy_id is not None and session.trajectory is not None:
-            results[policy_id].append(actual(session.trajectory, settings, horizon_steps))
+        if session.trajectory is None:
+            continue
+        found_in = actual(session.trajectory, settings, horizon_steps)
+        by_visit[session.policy_id][session.visit].append(found_in)
+        if policy_id is not None:
+            results[policy_id].append(found_in)
+            stopped[policy_id] += session.stopped
+    apart = {i: _apart(by_visit[i], by_visit[None]) for i in results if i != cdbs}
     return {
         policy_id: TestedBefore(
             sessions=len(found),
@@ -91,10 +104,28 @@ def results_by_policy(ran: list[DrivenSession], settings: MdpSettings, horizon_s
             mean_end_reward=mean_of([a.end_reward for a in found]),
             energy=mean_of([a.energy for a in found]),
             mean_beta=mean_of([a.shown.get("mean_beta") for a in found]),
+            stopped=stopped[policy_id],
+            energy_difference=apart.get(policy_id, {}).get("energy"),
+            mean_beta_difference=apart.get(policy_id, {}).get("mean_beta"),
             **{o.field: mean_of([a.shown.get(o.field) for a in found]) for o in OUTCOMES},
+            **{f"{o.field}_difference": apart.get(policy_id, {}).get(o.field) for o in OUTCOMES},
         )
         for policy_id, found in results.items()
     }
+
+
+def _apart(ours: Mapping[int, Sequence[Actual]], cdbs: Mapping[int, Sequence[Actual]]) -> dict[str, float]:
+    """Return by quantity the mean over visits of a policy's mean less that of the same visit's cDBS; energy as a share of the latter."""
+    found = {}
+    for name in QUANTITIES:
+        apart = []
+        for visit in ours.keys() & cdbs.keys():
+            own, other = (mean_of([a.shown.get(name) for a in arm[visit]]) for arm in (ours, cdbs))
+            if own is not None and other is not None and (name != "energy" or other > 0):
+                apart.append((own - other) / (other if name == "energy" else 1.0))
+        if apart:
+            found[name] = fmean(apart)
+    return found
 
 
 def tested_before(

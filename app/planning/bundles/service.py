@@ -96,7 +96,7 @@ def refuse_after_events(db: Session, participant: Participant, policy: Policy) -
     events = events_against(db, participant)
     plans = [plan for plan, _ in repository.approved_plans(db, participant.id, policy.id)]
     if policy.id in events and all(policy.id in unanswered(plan, events) for plan in plans):
-        what = wording.happened(policy.name, [event.id for event in events[policy.id]])
+        what = wording.happened(policy.name, events[policy.id])
         raise Conflict(f"No bundle of the policy leaves: {what}.", wording.ANSWER_EVENT)
 
 

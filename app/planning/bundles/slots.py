@@ -24,7 +24,7 @@ from app.planning.sheet.content import BUNDLE, card_of
 from app.platform import files
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import service as study
-from app.study.adverse_events.repository import with_serious_events
+from app.study.adverse_events.repository import with_blocking_events
 from app.tables.audit import Signature
 from app.tables.participants import Hemisphere
 from app.tables.plans import PlanItem
@@ -104,7 +104,7 @@ def runnable(view: PlanView, day: date | None = None) -> Signature:
 def withdrawals(db: Session) -> bytes:
     """What was withdrawn, as a tablet takes it: a line of JSON, and its signature in a second one.
 
-    Plans that may not run after an adverse event are among it until the event is cleared: a bundle of theirs may have left before it.
+    Plans that may not run after an adverse event or a stop are among it until it is cleared: their bundles may have left before.
     """
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
     plans = frozenset(repository.withdrawn_plans(db)) | _stopped_plans(db)
@@ -114,9 +114,9 @@ def withdrawals(db: Session) -> bytes:
 
 
 def _stopped_plans(db: Session) -> frozenset[int]:
-    """Signed plans of this installation with a policy under which something serious happened that nobody has cleared or answered."""
+    """Signed plans of this installation with a policy that has a serious event or a stop that nobody has cleared or answered."""
     found: set[int] = set()
-    for participant in with_serious_events(db):
+    for participant in with_blocking_events(db):
         events = events_against(db, participant)
         found |= {plan.id for plan in repository.signed_plans(db, participant.id) if unanswered(plan, events)}
     return frozenset(found)

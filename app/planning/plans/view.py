@@ -16,7 +16,7 @@ from app.evaluation.ranking.answer import Row
 from app.evaluation.ranking.judged import Judged, judged
 from app.evaluation.ranking.service import evaluation_notes
 from app.evaluation.ranking.staleness import stale_reasons
-from app.planning.grounds import Events, events_against, unanswered
+from app.planning.grounds import events_against, unanswered
 from app.planning.notices import Code, PlanWarning, without_policies
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of
@@ -29,6 +29,7 @@ from app.planning.wording import ANSWER_EVENT, happened
 from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
 from app.platform.signatures.service import SignatureState
 from app.study import service as study
+from app.study.adverse_events.service import Events
 from app.study.characteristics.service import fields_of
 from app.tables.audit import Signature
 from app.tables.evaluations import Evaluation
@@ -118,11 +119,11 @@ def refuse_withdrawn(view: PlanView) -> None:
 
 
 def refuse_after_events(view: PlanView) -> None:
-    """Raises Conflict for a plan with a policy under which something serious happened that nobody has cleared or answered."""
+    """Refuse a plan with a policy with a serious event or a stop that was neither cleared nor answered. Raises Conflict."""
     names = {line.policy.id: line.policy.name for line in view.lines if line.policy}
     for policy_id, events in view.unanswered.items():
         # of a sealed plan neither policy nor event is named, for the event may tell the policy
-        what = happened(None if view.sealed else names[policy_id], [event.id for event in events])
+        what = happened(None if view.sealed else names[policy_id], events)
         may_not = "be signed" if view.plan.status == "draft" else "run"
         raise Conflict(f"Plan {view.plan.id} of visit {view.visit.number} may not {may_not}: {what}.", ANSWER_EVENT)
 
@@ -130,7 +131,7 @@ def refuse_after_events(view: PlanView) -> None:
 def refuse_running(view: PlanView) -> None:
     """Hold a plan against what may run in a participant: signed, unchanged since, no policy withdrawn, the cDBS amplitude that was signed.
 
-    Nor may one run with a policy under which something serious happened since, until a clinician has cleared it.
+    Nor may one run with a policy that a serious event or a stop stands against, until a clinician has cleared it.
 
     Raises:
         Conflict: one of these fails; it says which. Invalid: nobody knows the cDBS amplitude any more.
@@ -231,10 +232,7 @@ def _warnings(
     db: Session, visit: Visit, plan: Plan, lines: Sequence[PlanLine], found: Judged | None, stale: Sequence[str], against: Events
 ) -> list[PlanWarning]:
     names = {line.policy.id: line.policy.name for line in lines if line.policy}
-    warnings = [
-        PlanWarning(Code.ADVERSE_EVENT, policy_id, names[policy_id], {"events": tuple(event.id for event in events)})
-        for policy_id, events in against.items()
-    ]
+    warnings = [PlanWarning(Code.ADVERSE_EVENT, policy_id, names[policy_id], {"events": events}) for policy_id, events in against.items()]
     warnings += [PlanWarning(Code.STALE_RANKING, values={"reason": reason}) for reason in stale]
     if found:
         warnings += [PlanWarning(Code.RANKING_NOTE, values={"text": text}) for text in evaluation_notes(found)]

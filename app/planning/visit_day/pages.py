@@ -43,6 +43,7 @@ from app.platform.web.schemas import Model
 from app.platform.web.templates import STATIC, render
 from app.study.deps import CurrentVisit, VisitViewed
 from app.study.wording import DRUG_NAMES, EVENT_KINDS
+from app.tables.adverse_events import EventKind
 from app.tables.visits import Visit
 
 router = APIRouter()
@@ -212,7 +213,7 @@ def _frame() -> dict[str, Any]:
         "folder": folder,
         "modules": [n for n in _names() if n.endswith(".js") and n != "worker.js"],
         "note_rules": rules(),
-        "event_kinds": [(k.value, n) for k, n in EVENT_KINDS.items()],
+        "event_kinds": [(k.value, n) for k, n in EVENT_KINDS.items() if k is not EventKind.STOPPED],
         "drugs": list(DRUG_NAMES.items()),
         "drug_names": DRUG_NAMES,
     }

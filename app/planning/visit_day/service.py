@@ -19,18 +19,20 @@ from app.planning.plans import repository as plans
 from app.planning.plans.view import read_plan, refuse_running
 from app.planning.visit_day import repository
 from app.planning.visit_day.record import GRADED, SEVERE, moment
-from app.planning.visit_day.schemas import AdverseEventPayload, DosePayload, EntryIn, EntryResult, NotePayload, Unreadable
+from app.planning.visit_day.schemas import AdverseEventPayload, DosePayload, EntryIn, EntryResult, NotePayload, StopCausePayload, Unreadable
 from app.planning.visit_day.screening import screen
-from app.planning.visit_day.session_outcomes import take_outcomes
+from app.planning.visit_day.session_outcomes import is_stop, locked_session, stop_words, take_outcomes
 from app.platform.database import now
 from app.platform.errors import BetaloopError, Conflict, Forbidden, Invalid, NotFound
 from app.settings import get_settings
 from app.study import service as study
+from app.study.adverse_events import repository as events
 from app.study.adverse_events.schemas import AdverseEventIn
-from app.study.adverse_events.service import add_adverse_event
+from app.study.adverse_events.service import add_adverse_event, take_back_entry
 from app.study.doses import service as doses
 from app.study.doses.schemas import DoseIn
 from app.study.visits.service import require_unlocked
+from app.tables.adverse_events import EventKind, Severity
 from app.tables.learning import Policy
 from app.tables.plans import DayEntry, Plan, PlanItem
 from app.tables.visits import Visit
@@ -104,7 +106,7 @@ def add_entries(db: Session, visit: Visit, plan_id: int, entries: Sequence[Entry
                 _require_same(stored, entry, plan)
                 results.append(EntryResult(uuid=entry.uuid, outcome="known"))
                 continue
-            if entry.kind != "adverse_event":  # what harms a participant is written down whenever it becomes known
+            if not _tells_harm(entry):  # what harms a participant is written down whenever it becomes known
                 require_unlocked(visit)
             _check(entry, items)
             if entry.kind == "dose":
@@ -115,6 +117,7 @@ def add_entries(db: Session, visit: Visit, plan_id: int, entries: Sequence[Entry
             continue
         known[entry.uuid] = _store(db, plan, entry, caller)
         _record_event(db, visit, items.get(entry.plan_item_id or 0), known[entry.uuid], caller)
+        _take_back_stops(db, visit, known[entry.uuid], caller)
         results.append(EntryResult(uuid=entry.uuid, outcome="stored"))
     db.flush()
     if not visit.locked:
@@ -149,6 +152,10 @@ def _not_runnable(db: Session, visit: Visit, caller: Caller) -> str:
     except (Conflict, Invalid) as error:
         return f"{error.detail} {error.hint}".strip()
     return ""
+
+
+def _tells_harm(entry: EntryIn) -> bool:
+    return entry.kind == "adverse_event" or (isinstance(entry.payload, StopCausePayload) and entry.payload.cause == "participant")
 
 
 def _require_same(stored: DayEntry, entry: EntryIn, plan: Plan) -> None:
@@ -223,18 +230,29 @@ def _record_event(db: Session, visit: Visit, item: PlanItem | None, row: DayEntr
         about = {name: payload[name] for name in ("kind", "severity", "serious", "note")}
     elif row.kind in GRADED and payload["grade"] == SEVERE:
         about = {"kind": row.kind, "severity": SEVERE}
+    elif is_stop(row):
+        about = {"kind": EventKind.STOPPED, "severity": Severity.NOT_STATED, "note": stop_words(row)}
     else:
         return
+    session = locked_session(db, visit, row)
+    where = {"session_id": session.id} if session is not None else {"visit_id": visit.id, "policy_id": item.policy_id if item else None}
     draft = AdverseEventIn.model_validate(
         about
+        | where
         | {
-            "visit_id": visit.id,
-            "policy_id": item.policy_id if item else None,
             "occurred_at": moment(row) if moment(row).year >= FIRST_YEAR else None,
             "entry_key": str(row.uuid),
         }
     )
     add_adverse_event(db, visit.participant, draft, caller)
+
+
+def _take_back_stops(db: Session, visit: Visit, row: DayEntry, caller: Caller) -> None:
+    """Take back the stops that an entry corrects, each with the entry's own words where it is a stop too."""
+    for uuid in row.replaces:
+        event = events.event_by_key(db, visit.participant_id, str(uuid))
+        if event is not None and event.is_stop and row.kind == "stop_cause":
+            take_back_entry(db, event, wording.CORRECTED_ON_THE_DAY, caller)
 
 
 def _payload(entry: EntryIn) -> dict[str, object]:

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.planning import wording
 from app.planning.visit_day import repository
-from app.planning.visit_day.record import GRADED, MILD, attempt_at, moment, outcome_of, said_of, standing
+from app.planning.visit_day.record import GRADED, MILD, Entry, attempt_at, moment, outcome_of, said_of, standing
 from app.platform.database import set_reason
 from app.study.adverse_events import repository as events
 from app.study.adverse_events.schemas import AdverseEventIn
@@ -22,6 +22,7 @@ from app.study.outcomes.service import follow_day
 from app.study.visits.service import require_unlocked
 from app.tables.plans import DayEntry
 from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 
 QOCS = ("rating", "grasp_hz")
 """Outcomes that a clinic day has."""
@@ -94,17 +95,33 @@ def elapsed_s(entries: Sequence[DayEntry], item: int, number: int) -> float | No
 def _early_stop(session: StudySession, entries: Sequence[DayEntry], number: int, db: Session) -> None:
     """Let the session's stop follow the day's: a stop for the participant's sake counts while one such entry is not replaced."""
     mine = [e for e in entries if e.kind == "stop_cause" and e.plan_item_id == session.plan_item_id]
-    sake = [e for e in mine if e.payload["cause"] == "participant"]
+    sake = [e for e in mine if is_stop(e)]
     standing_ones = [e for e in standing(entries) if e in sake and e.attempt == number]
-    wanted = _stop_words(standing_ones[0]) if standing_ones else None
-    if session.stopped_reason not in (None, *(_stop_words(e) for e in sake)):
+    wanted = stop_words(standing_ones[0]) if standing_ones else None
+    if session.stopped_reason not in (None, *(stop_words(e) for e in sake)):
         return  # a person wrote a stop of their own
     if session.stopped_reason != wanted:
         set_reason(db, wording.from_the_day(sorted({e.entered_by for e in mine})))
         session.stopped_reason = wanted
 
 
-def _stop_words(entry: DayEntry) -> str:
+def locked_session(db: Session, visit: Visit, entry: DayEntry) -> StudySession | None:
+    """Return the confirmed session of a locked visit that a stop is about; None where it is none, or another attempt was recorded."""
+    if not visit.locked or not is_stop(entry):
+        return None
+    session = next((s for s in repository.sessions_in_place(db, entry.plan_id) if s.plan_item_id == entry.plan_item_id), None)
+    if session is None or attempt_at(repository.entries(db, entry.plan_id), session.plan_item_id or 0, session.started_at) != entry.attempt:
+        return None
+    return session
+
+
+def is_stop(entry: Entry) -> bool:
+    """Return whether an entry says that a session was stopped for the participant's sake."""
+    return bool(entry.kind == "stop_cause" and entry.payload["cause"] == "participant")
+
+
+def stop_words(entry: Entry) -> str:
+    """Return the reason of a stop in words."""
     return str(entry.payload["text"]).strip() or wording.STOPPED_FOR_PARTICIPANT
 
 

@@ -75,8 +75,8 @@ class AdverseEventOut(AdverseEventFields):
     )
     occurred_at: datetime | None
     revision: int
-    cleared_reason: str | None = Field(description="Why a clinician cleared it; null: not cleared, or not serious.")
-    blocks: bool = Field(description="Serious and not cleared: what ran counts as unsafe.")
+    cleared_reason: str | None = Field(description="Why a clinician cleared it; null: not cleared.")
+    blocks: bool = Field(description="Serious, or a stop, and not cleared: what ran counts as unsafe.")
     entered_by: str
     reason: str | None = Field(description="Of the newest revision.")
     created_at: datetime = Field(description="Of the newest revision.")

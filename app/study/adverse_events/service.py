@@ -5,7 +5,7 @@ A locked visit takes events too: what harms a participant is written down whenev
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
@@ -21,6 +21,9 @@ from app.study.adverse_events import repository
 from app.study.adverse_events.schemas import AdverseEventChange, AdverseEventFields, AdverseEventIn
 from app.tables.adverse_events import AdverseEvent, AdverseEventRevision, Severity
 from app.tables.participants import Participant
+
+Events = Mapping[int, tuple[AdverseEvent, ...]]
+"""Serious adverse events and stops that no clinician has cleared, by policy."""
 
 _BELONGS = ("session_id", "visit_id", "policy_id", "occurred_at")
 _KNOWN = ("kind", "severity", "serious", "note")
@@ -85,7 +88,7 @@ def take_back_entry(db: Session, event: AdverseEvent, reason: str, caller: Calle
 
 
 def clear_adverse_event(db: Session, event: AdverseEvent, revision: int, reason: str, caller: Caller) -> AdverseEvent:
-    """State as a clinician that a serious event does not stand against what ran.
+    """State as a clinician that a serious event, or a stop, does not stand against what ran.
 
     Args:
         revision: the one that the caller has read.
@@ -96,7 +99,8 @@ def clear_adverse_event(db: Session, event: AdverseEvent, revision: int, reason:
     """
     study.require(caller, can.CLEAR_EVENT, event.participant)
     if not event.blocks:
-        raise Conflict(f"Adverse event {event.id} is {'cleared already' if event.now.serious else 'not serious'}.", "Nothing waits for it.")
+        why = "not serious" if event.now.cleared_reason is None else "cleared already"
+        raise Conflict(f"Adverse event {event.id} is {why}.", "Nothing waits for it.")
     return _follow(db, event, revision, reason, caller, event.now, reason.strip())
 
 
@@ -113,7 +117,7 @@ def policy_of(event: AdverseEvent, caller: Caller) -> int | None:
 
 
 def blocking_events(events: Iterable[AdverseEvent], caller: Caller) -> dict[int, tuple[AdverseEvent, ...]]:
-    """By policy, what was serious under it and has not been cleared by a clinician, in the order of the events."""
+    """Return by policy the serious events and the stops under it that no clinician has cleared, in the order of the events."""
     found: dict[int, tuple[AdverseEvent, ...]] = {}
     for event in events:
         policy_id = policy_of(event, caller) if event.blocks else None
@@ -123,7 +127,7 @@ def blocking_events(events: Iterable[AdverseEvent], caller: Caller) -> dict[int,
 
 
 def blocked_policies(events: Iterable[AdverseEvent], caller: Caller) -> frozenset[int]:
-    """Policies under which something serious happened that no clinician has cleared."""
+    """Return the policies with serious events or stops that no clinician has cleared."""
     return frozenset(blocking_events(events, caller))
 
 

@@ -15,16 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
+from app.accounts.permissions import Caller
 from app.platform.database import now, set_reason
 from app.platform.errors import Invalid
 from app.platform.web.charts import counted
 from app.platform.web.numbers import stated
 from app.study import repository
+from app.study.adverse_events.repository import stops_of_session
 from app.study.outcomes import repository as of_files
 from app.study.outcomes import tremor
 from app.study.outcomes import values as outcome_values
 from app.study.outcomes.tremor import Minutes
 from app.study.outcomes.values import Derived
+from app.tables.adverse_events import AdverseEvent, AdverseEventRevision, EventKind, Severity
 from app.tables.outcomes import GraspTest, QocRevision, TremorSeries
 from app.tables.participants import Hemisphere
 from app.tables.sessions import StudySession
@@ -357,3 +360,33 @@ def _same(a: float | None, b: float | None) -> bool:
 
 def _when(moment: datetime) -> str:
     return moment.astimezone(UTC).strftime("%Y-%m-%d %H:%M")
+
+
+def follow_stop(db: Session, session: StudySession, previous: str | None, reason: str, caller: Caller) -> None:
+    """Let the adverse events follow a session's stop: a new one, its words corrected, or taken back.
+
+    Args:
+        session: with its stop. previous: the words of its stop until now. reason: of the change. caller: who made it.
+    """
+    after = session.stopped_reason
+    if after == previous:
+        return
+    known = stops_of_session(db, session)
+    if after is None:
+        for event in known:
+            event.revisions.append(_stop_revision(event, Severity.NONE, event.now.note, reason, caller))
+    elif known:
+        known[-1].revisions.append(_stop_revision(known[-1], known[-1].now.severity, after, reason, caller))
+    else:
+        event = AdverseEvent(participant_id=session.visit.participant_id, visit_id=session.visit_id, session_id=session.id)
+        event.revisions.append(_stop_revision(event, Severity.NOT_STATED, after, None, caller))
+        db.add(event)
+    db.flush()
+
+
+def _stop_revision(event: AdverseEvent, severity: Severity, note: str, reason: str | None, caller: Caller) -> AdverseEventRevision:
+    serious = bool(event.revisions) and event.now.serious and severity is not Severity.NONE
+    number = len(event.revisions) + 1
+    return AdverseEventRevision(
+        revision=number, kind=EventKind.STOPPED, severity=severity, serious=serious, note=note, reason=reason, entered_by=caller.label
+    )

@@ -26,6 +26,7 @@ from sqlalchemy.dialects.postgresql import aggregate_order_by
 from sqlalchemy.orm import Session
 
 from app.study.repository import CONFIRMED, sessions_of_participant
+from app.tables.adverse_events import AdverseEvent, AdverseEventRevision
 from app.tables.outcomes import QocRevision
 from app.tables.participants import SettingsVersion
 from app.tables.plans import SEALED, Plan, PlanItem
@@ -50,6 +51,7 @@ def fingerprints(db: Session, participant_ids: Collection[int]) -> dict[int, str
 def _row_versions() -> Select[Any]:
     """The query of `fingerprints`: to write it takes longer than to run it, and every page of results asks it."""
     visit, recording = Visit.participant_id, Recording.participant_id
+    of_event = (AdverseEvent, AdverseEvent.id == AdverseEventRevision.event_id)
     parts = [
         _versions("visit", Visit.id, visit),
         _versions("settings_version", SettingsVersion.id, SettingsVersion.participant_id),
@@ -67,6 +69,7 @@ def _row_versions() -> Select[Any]:
         _versions("session_segment", SessionSegment.session_id, visit, SessionSegment.session, StudySession.visit),
         _versions("recording", Recording.id, recording),
         _versions("trace", Trace.id, recording, Trace.recording),
+        _versions("adverse_event_revision", AdverseEventRevision.id, AdverseEvent.participant_id, of_event),
     ]
     asked: BindParameter[Any] = bindparam("participants", expanding=True)
     rows = union_all(*(part.where(owner.in_(asked)) for part, owner in parts)).subquery()

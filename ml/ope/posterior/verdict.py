@@ -10,7 +10,7 @@ conclusions, which rest on visits and not on estimates.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -34,7 +34,7 @@ SAME_AMPLITUDE = 0.05
 FEWEST_DRAWS = 50
 """Fewer draws cannot tell a probability of 0.8 from one of 0.9."""
 
-HAZARDS = frozenset({"adverse_event", "nearly_off", "beyond_margin"})
+HAZARDS = frozenset({"adverse_event", "stopped", "nearly_off", "beyond_margin"})
 """Codes of reasons for which a policy is not to be run without a clinician's word, whatever the verdict."""
 
 SETTLED_BY_SESSIONS = frozenset({"undecided", "few_near_sessions", "few_near_visits"})
@@ -95,7 +95,7 @@ class Verdict:
 
 
 def verdict(
-    own: Estimate, cdbs: Estimate | None, margins: Margins, levels: Levels, *, adverse_event: bool = False, unchecked: str | None = None
+    own: Estimate, cdbs: Estimate | None, margins: Margins, levels: Levels, *, harms: Sequence[Flag] = (), unchecked: str | None = None
 ) -> Verdict:
     """The verdict on a candidate.
 
@@ -103,14 +103,14 @@ def verdict(
         own: its posterior, with the details that `ml.ope.posterior` gives (draws, behaviour, support, skill).
         cdbs: that of cDBS; None where there is none.
         margins: by how much an outcome may be worse. levels: how sure the verdict must be.
-        adverse_event: whether a serious adverse event under it has not been cleared by a clinician.
+        harms: what happened under it that no clinician has cleared: `adverse_event` (a serious one), `stopped`.
         unchecked: why what the data cover could not be checked; None where it was.
     """
     gaps = slacks(own, cdbs, margins) if cdbs is not None else {}
     within = _share_within(gaps)
     saves = _saves(own, cdbs) if cdbs is not None else None
     chances = _chances(within, saves, levels)
-    hazards = _hazards(own, gaps, levels, adverse_event)
+    hazards = [*harms, *_hazards(own, gaps, levels)]
 
     def told(code: Code, *reasons: Flag, limit: float | None = None) -> Verdict:
         return Verdict(code, (*reasons, *chances), within, saves, limit)
@@ -219,8 +219,8 @@ def _chances(within: float | None, saves: float | None, levels: Levels) -> tuple
     return tuple(found)
 
 
-def _hazards(own: Estimate, gaps: Mapping[str, Floats], levels: Levels, adverse_event: bool) -> list[Flag]:
-    found = [Flag("adverse_event")] if adverse_event else []
+def _hazards(own: Estimate, gaps: Mapping[str, Floats], levels: Levels) -> list[Flag]:
+    found = []
     off = (own.details.get("behaviour") or {}).get("below_cdbs_20_percent")
     if off is not None and off > levels.nearly_off_share:
         found.append(Flag("nearly_off", float(off), levels.nearly_off_share, "share"))

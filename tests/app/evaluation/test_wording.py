@@ -136,7 +136,7 @@ def test_every_reason_of_a_verdict_is_told_in_a_clinicians_words() -> None:
 def test_the_strongest_reason_stands_first() -> None:
     off = {"below_cdbs_20_percent": 0.42}
     own = constructed(behaviour=off, outcome_draws={"tremor_percent": [45.0] * N})
-    found = verdict(own, cdbs(), Margins(0.1, 1.0, 10.0), Levels(), adverse_event=True)
+    found = verdict(own, cdbs(), Margins(0.1, 1.0, 10.0), Levels(), harms=(Flag("adverse_event"),))
     assert [reason.code for reason in found.hazards] == ["adverse_event", "nearly_off", "beyond_margin"]
     assert verdict_wording.plainly(found.hazards).startswith(
         "serious adverse event, not cleared by a clinician; nearly off 42 % of the time"

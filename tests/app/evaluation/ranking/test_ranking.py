@@ -166,7 +166,7 @@ def test_where_a_policy_ran_its_actual_return_stands_beside_the_estimate(
     tested = {p["policy_id"]: p["tested"] for p in ranked(client)["policies"]}
     assert [(p["tested"]["sessions"], p["tested"]["energy"]) for p in ranked(client)["references"]] == [(1, pytest.approx(1.0))]  # cDBS
     trace = client.get(f"/api/v1/sessions/{session}/trace").json()
-    beta = np.array(trace["beta"][10:])
+    beta, cdbs = np.array(trace["beta"][10:]), client.get("/api/v1/sessions/3/trace").json()
     steps = (np.where(beta < 1.0, 0.0, -1.0) - 0.3 * 0.8) * 0.99 ** np.arange(60)
     assert tested[policies[0]] == {
         "sessions": 1,
@@ -179,6 +179,12 @@ def test_where_a_policy_ran_its_actual_return_stands_beside_the_estimate(
         "grasp_hz": 2.0,
         "rating": 8.0,
         "tremor_percent": 20.0,
+        "stopped": 0,
+        "energy_difference": pytest.approx(0.64 - 1, abs=1e-5),
+        "mean_beta_difference": pytest.approx(beta.mean() - np.mean(cdbs["beta"][10:]), abs=1e-5),
+        "grasp_hz_difference": 0.0,
+        "rating_difference": 1.0,
+        "tremor_percent_difference": 10.0,
     }
     assert tested[policies[1]] is None
 

@@ -115,7 +115,7 @@ def test_a_sealed_plan_says_that_it_may_not_run_and_neither_policy_nor_event(
     before = [client.get(path, headers=PAGE).text for path in paths]
     for policy in policies:
         event(client, policy)
-    words = "a serious adverse event, which no clinician has cleared, stands against a policy of it"
+    words = "a serious adverse event or a stop, which no clinician has cleared, stands against a policy of it"
     refused = taken(client, study_world.visit, 1)
     assert (refused.status_code, words in refused.json()["detail"]) == (409, True)
     ((policy, text),) = warned(client, study_world.visit)

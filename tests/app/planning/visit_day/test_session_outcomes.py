@@ -49,8 +49,9 @@ def test_the_outcomes_of_its_place_become_those_of_the_session_once(clinic_day: 
     assert (in_place.qoc.rating, in_place.qoc.grasp_hz, in_place.qoc.tremor_percent, in_place.qoc.revision) == (7, 2.5, None, 1)
     assert in_place.qoc.reason == "entered on the clinic day by admin@clinic.example"
     assert in_place.stopped_reason == "asked for it"
-    (event,) = clinic_day.client.get("/api/v1/participants/P1/adverse-events").json()
-    assert (event["kind"], event["severity"], event["session_id"]) == ("gait", "mild", in_place.id)
+    stopped, gait = clinic_day.client.get("/api/v1/participants/P1/adverse-events").json()
+    assert (gait["kind"], gait["severity"], gait["session_id"]) == ("gait", "mild", in_place.id)
+    assert (stopped["kind"], stopped["note"]) == ("stopped", "asked for it")
 
 
 def test_what_the_session_has_already_stays_and_the_difference_is_told(clinic_day: Any, in_place: StudySession, db: Session) -> None:

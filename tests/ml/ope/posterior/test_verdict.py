@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ml.ope.flags import Flag
 from ml.ope.posterior.verdict import HAZARDS, Levels, Verdict, interval, verdict
 from ml.qoc import Margins
 from tests.ml.ope.posterior.draws import N, cdbs, constructed, share
@@ -14,7 +15,7 @@ from tests.ml.ope.posterior.draws import N, cdbs, constructed, share
 
 def of(reference: Any = None, margins: Margins | None = None, levels: Levels | None = None, **changed: Any) -> Verdict:
     """The verdict on a constructed candidate with the default margins and levels."""
-    told = {name: changed.pop(name) for name in ("adverse_event", "unchecked") if name in changed}
+    told = {name: changed.pop(name) for name in ("harms", "unchecked") if name in changed}
     return verdict(constructed(**changed), reference or cdbs(), margins or Margins(), levels or Levels(), **told)
 
 
@@ -87,7 +88,7 @@ def test_a_policy_that_is_nearly_off_is_unsafe_whatever_is_predicted(off: float,
 
 
 def test_a_serious_adverse_event_that_nobody_cleared_is_unsafe() -> None:
-    found = of(adverse_event=True)
+    found = of(harms=(Flag("adverse_event"),))
     assert (found.code, codes(found)[0], found.proposed) == ("unsafe", "adverse_event", False)
 
 
@@ -122,7 +123,7 @@ def test_a_policy_that_acts_like_cdbs_is_called_the_same() -> None:
         {"behaviour": {"closeness_to_cdbs": 0.0}},
         {"behaviour": {"below_cdbs_20_percent": 0.9}},
         {"outcome_draws": {"rating": [1.0] * N}},
-        {"adverse_event": True},
+        {"harms": (Flag("stopped", 1.0, None, "stops"),)},
         {"unchecked": "no session has a whole window"},
     ],
 )
@@ -130,7 +131,7 @@ def test_without_ordering_skill_nothing_can_be_told_and_hazards_still_stand(chan
     found = of(told=False, **changed)
     assert (found.code, found.proposed, codes(found)[0]) == ("cannot_tell", False, "no_ordering_skill")
     assert found.reasons[0].fact("reasons") == ("no_better_than_equal",)
-    dangerous = bool(changed.keys() & {"adverse_event"}) or "below_cdbs_20_percent" in str(changed) or "rating" in str(changed)
+    dangerous = bool(changed.keys() & {"harms"}) or "below_cdbs_20_percent" in str(changed) or "rating" in str(changed)
     assert bool(found.hazards) == dangerous
 
 
@@ -179,7 +180,11 @@ def test_draws_that_are_too_few_not_finite_or_not_aligned_tell_no_probability() 
 
 
 def test_every_hazard_is_a_reason_that_some_verdict_gives() -> None:
-    each = (of(adverse_event=True), of(behaviour={"below_cdbs_20_percent": 0.5}), of(outcome_draws={"rating": [1.0] * N}))
+    each = (
+        of(harms=(Flag("adverse_event"), Flag("stopped"))),
+        of(behaviour={"below_cdbs_20_percent": 0.5}),
+        of(outcome_draws={"rating": [1.0] * N}),
+    )
     assert {hazard.code for found in each for hazard in found.hazards} == HAZARDS
 
 
