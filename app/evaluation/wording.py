@@ -115,6 +115,7 @@ def _sessions_changed(flag: Flag) -> str:
         "decoded": "decoded anew",
         "cdbs": "with another cDBS amplitude",
         "doses": "with other doses of medication at their visit",
+        "retimed": "whose start was corrected, for its clock was wrong",
         "moved": "whose times, control channel, controller or stop were corrected",
     }
     return f"{counted(int(number(flag)), 'session')} {what[flag.fact('change')]}"

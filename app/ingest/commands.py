@@ -75,6 +75,12 @@ def redecode_(
         show({"dry_run": dry_run, "files": [vars(c) for c in changes]}, True, "")
     else:
         Console().print(table)
+        moved = [said for c in changes for said in c.sessions]
+        typer.echo(f"Sessions whose time or dose {'would change' if dry_run else 'changed'}: {len(moved)}")
+        for said in moved:
+            typer.echo(f"  {said}")
+        if moved:
+            typer.echo("Rankings and plans that rest on them say so on their pages; make new ones.")
     if any(c.state == "failed" for c in changes):
         raise typer.Exit(1)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import datetime, timedelta
 
-from sqlalchemy import func, or_, select, true
+from sqlalchemy import func, or_, select, text, true
 from sqlalchemy.orm import Session, joinedload, selectinload
 
 from app.accounts.permissions import Caller
@@ -228,3 +228,8 @@ def readable_files(db: Session, participant_id: int | None, upload_file_id: int 
     if upload_file_id is not None:
         query = query.where(UploadFile.id == upload_file_id)
     return db.scalars(query.order_by(UploadFile.id)).all()
+
+
+def defer_counting(db: Session, deferred: bool) -> None:
+    """Let minutes count twice until this is called again with False, which raises IntegrityError where they still do."""
+    db.execute(text(f"set constraints counted_time_once {'deferred' if deferred else 'immediate'}"))

@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from app.platform.web.schemas import Int, Model, Moment, Number, Text
-from app.study.schemas import SessionOut
+from app.study.schemas import SessionOut, VisitOut
 from app.tables.participants import Hemisphere
 from app.tables.sessions import Controller
 
@@ -203,3 +203,16 @@ class UploadOut(Model):
     proposals: list[ProposalOut]
     files: list[UploadedFileOut]
     report: list[FileReportOut]
+
+
+class VisitOfRecordingIn(Model):
+    """Which proposal, as the caller looked at it, a visit is added for."""
+
+    version: Int = Field(ge=1)
+
+
+class VisitOfRecordingOut(Model):
+    """A visit on the day of a recording, and the proposals of that day, which belong to it now."""
+
+    visit: VisitOut
+    proposals: list[ProposalOut]

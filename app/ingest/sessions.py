@@ -15,6 +15,7 @@ from app.ingest import channels, repository
 from app.platform.errors import Conflict, Invalid
 from app.study import blinding, cdbs_amplitude
 from app.study import repository as study
+from app.study.recordings.facts import unknown_clock
 from app.study.sessions import repeated
 from app.study.sessions import repository as session_repository
 from app.study.sessions.usable_steps import CONTROL_STREAMS
@@ -78,7 +79,7 @@ def makes_session(traces: Sequence[Trace], recording: Recording) -> bool:
 
 
 def together(recordings: Sequence[Recording]) -> list[list[Recording]]:
-    """Group recordings that belong to one session each, by start; recordings without a time stay with their run in the file."""
+    """Group recordings that belong to one session each, by start; those without a time, or on another device's unknown clock, by run."""
     groups: list[list[Recording]] = []
     for recording in sorted(recordings, key=lambda r: (r.started_at is None, r.started_at, r.id)):
         home = next((g for g in groups if any(_belong(recording, other) for other in g)), None)
@@ -90,7 +91,8 @@ def together(recordings: Sequence[Recording]) -> list[list[Recording]]:
 
 
 def _belong(a: Recording, b: Recording) -> bool:
-    if a.started_at is not None and b.started_at is not None:
+    apart = a.device_id != b.device_id and (unknown_clock(a) or unknown_clock(b))
+    if a.started_at is not None and b.started_at is not None and not apart:
         begin = max(a.started_at, b.started_at)
         end = min(a.started_at + timedelta(seconds=a.duration_s), b.started_at + timedelta(seconds=b.duration_s))
         return (end - begin).total_seconds() >= TOGETHER * min(a.duration_s, b.duration_s)

@@ -10,6 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 from ml.formats.archive import ZipFiles
+from ml.formats.facts.clocks import lead_in_words
 from ml.formats.options import ArchiveLimits, BetaMeasure, DecodeOptions
 from ml.formats.recording import (
     DECODE_VERSION,
@@ -63,6 +64,7 @@ __all__ = [
     "TremorLog",
     "UndecodableFile",
     "decode",
+    "lead_in_words",
     "left_out_of",
     "pseudonym",
     "redact",

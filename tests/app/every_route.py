@@ -15,6 +15,7 @@ from app.main import DESCRIPTION
 from app.platform.database import transaction
 from app.tables.accounts import Role
 from tests.app.filled_study import FilledStudy
+from tests.app.ingest.test_clocks import report as percept_report
 
 MAPPING = {
     "name": "two columns",
@@ -95,6 +96,7 @@ class World:
         self.send(f"/sessions/{derived}/qoc", method="put", json={"grasp_hz": 3.0, "reason": "counted by hand"})
         sampled = self.upload("s.csv", TABLE.replace(b"6,1,1", b"6,1.77,1", 1), visit="2", controller="other")["sessions"][0]["id"]
         drawn = self.upload("lfp.csv", SAMPLES, visit="2", controller="other")["sessions"][0]["id"]
+        dated = self.upload("r.json", percept_report(), visit="2", controller="other")["sessions"][0]["id"]
         self.ids: Json = {
             "code": "P1",
             "visit_id": visit,
@@ -156,6 +158,10 @@ class World:
             ("post", "/uploads"): {
                 "data": {"participant": "P3", "visit": "1", "controller": "cdbs"},
                 "files": {"file": ("other.csv", TABLE + b"42,1,1\n")},
+            },
+            ("put", "/sessions/{session_id}/clock"): {
+                "session_id": dated,
+                "json": {"ahead_s": 60, "uncertainty_s": 5, "reason": "compared on the day"},
             },
             ("get", "/proposals/{session_id}"): self.proposal(),
             ("patch", "/proposals/{session_id}"): self.proposal(),

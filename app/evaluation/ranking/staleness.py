@@ -35,6 +35,9 @@ NAMED = 5
 OF_STEPS = ("controller", "policy_id", "duration_s", "control_stream", "control_channel")
 """Columns of a session that its steps in a buffer depend on, beside what a snapshot pins."""
 
+TIMED = "started_at"
+"""Column that places the session among the others and among the visit's doses."""
+
 STOPPED = "stopped_reason"
 """Column that makes the session a failure in a buffer, whatever the reason."""
 
@@ -86,7 +89,7 @@ def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot, se
     added = [s for s in sessions if s.id not in before]
     both = [(before[i], now[i]) for i in sorted(before.keys() & now.keys())]
     heads = study_repository.trace_heads(db, {g.recording_id for s in sessions for g in s.segments})
-    moved, readmitted, redosed = _edited(db, [s for _, s in both], snapshot.created_at)
+    moved, readmitted, redosed, retimed = _edited(db, [s for _, s in both], snapshot.created_at)
     barrier = gate(db, participant, sessions)
     opened = barrier.is_open and barrier.decision is not None and barrier.decision.created_at > snapshot.created_at
     found = Counter({"newer": len(added), "unconfirmed": len(before.keys() - now.keys())})
@@ -104,7 +107,7 @@ def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot, se
             old = (pinned.beta_trace_id, pinned.amplitude_trace_id)
             found["decoded"] += (present.beta_trace_id, present.amplitude_trace_id) != old
             found["cdbs"] += present.cdbs_ma != pinned.cdbs_amplitude_ma
-    found["moved"], found["doses"] = len(moved), len(redosed)
+    found["moved"], found["doses"], found["retimed"] = len(moved), len(redosed), len(retimed - moved)
     visits = tuple(str(n) for n in sorted({s.visit.number for s in added}))
     return [Flag.of("sessions_changed", float(n), None, "sessions", change=change, visits=visits) for change, n in found.items() if n]
 
@@ -124,17 +127,22 @@ def _was_read(pinned: SnapshotSession) -> bool:
     )
 
 
-def _edited(db: Session, sessions: Sequence[StudySession], moment: datetime) -> tuple[set[int], set[int], set[int]]:
-    """Sessions whose steps are other ones since a moment, those that a person had excluded then and not any more, and those whose time
-    since medication, as the visit's doses give it, may be another.
+def _edited(db: Session, sessions: Sequence[StudySession], moment: datetime) -> tuple[set[int], set[int], set[int], set[int]]:
+    """Find sessions that changed since a moment.
+
+    Returns:
+        Sessions whose steps are other ones. Those that a person had excluded then and not any more. Those whose time since medication may
+        be another, by the visit's doses. Those whose start was on a wrong clock.
     """
     ids, visits = [s.id for s in sessions], {s.visit_id for s in sessions}
     wanted = {"session": ("id", ids), "session_segment": ("session_id", ids), "visit": ("id", visits), "dose": ("visit_id", visits)}
     changed = repository.changed_since(db, moment, wanted)
-    moved, readmitted = set(), set()
+    moved, readmitted, retimed = set(), set(), set()
     for before, after in _pairs(*changed["session"]):
         if any(before[name] != after[name] for name in OF_STEPS) or bool(before[STOPPED]) != bool(after[STOPPED]):
             moved.add(int(after["id"]))
+        if before[TIMED] != after[TIMED]:
+            retimed.add(int(after["id"]))
         if before["excluded_reason"] and not after["excluded_reason"]:
             readmitted.add(int(after["id"]))
     then, now = changed["session_segment"]
@@ -142,7 +150,7 @@ def _edited(db: Session, sessions: Sequence[StudySession], moment: datetime) -> 
     renumbered = {int(after["id"]) for before, after in _pairs(*changed["visit"]) if before["number"] != after["number"]}
     dosed = {int(row["visit_id"]) for rows in changed["dose"] for row in rows}
     redosed = {s.id for s in sessions if s.visit_id in dosed and s.medication_h is None}
-    return moved | {s.id for s in sessions if s.visit_id in renumbered}, readmitted, redosed
+    return moved | {s.id for s in sessions if s.visit_id in renumbered}, readmitted, redosed, retimed
 
 
 def _pairs(then: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:

@@ -10,8 +10,9 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.ingest import repository
 from app.ingest.deps import CurrentProposal
+from app.ingest.proposals import clocks
 from app.ingest.proposals import service as proposals
-from app.ingest.proposals.schemas import VisitOfRecordingIn, VisitOfRecordingOut
+from app.ingest.proposals.clocks import ClockIn, ClockOut
 from app.ingest.proposals.serializers import proposal_out, proposals_out
 from app.ingest.proposals.visit_of_recording import add_visit_of_recording
 from app.ingest.schemas import (
@@ -22,6 +23,8 @@ from app.ingest.schemas import (
     ProposalChange,
     ProposalOut,
     SplitIn,
+    VisitOfRecordingIn,
+    VisitOfRecordingOut,
 )
 from app.ingest.uploads import service
 from app.platform.database import Db
@@ -53,6 +56,12 @@ def correct_proposal(session: CurrentProposal, change: ProposalChange, db: Db, c
     """Correct a proposal without confirming it. 409 where somebody changed it after the stated version."""
     row = proposals.change(db, session, change, caller)
     return proposal_out(db, session, row, caller)
+
+
+@router.put("/sessions/{session_id}/clock", responses=problems(409))
+def correct_clock(session_id: RowId, offset: ClockIn, db: Db, caller: CurrentCaller) -> ClockOut:
+    """State how far the clock of a session's recording was ahead of UTC; its recordings and their sessions move."""
+    return clocks.correct(db, study.session(db, session_id, caller), offset, caller)
 
 
 @router.post("/proposals/{session_id}/confirm", responses=problems(409))

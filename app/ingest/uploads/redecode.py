@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 
 import numpy as np
 import structlog
 from sqlalchemy.orm import Session
 
 from app.ingest import repository
+from app.ingest.proposals import clocks
+from app.ingest.proposals.clocks import MOVED_S
 from app.ingest.sessions import in_milliamperes
 from app.ingest.stated_beta import name_beta
 from app.ingest.uploads import outcomes as outcomes_intake
@@ -23,7 +26,7 @@ from app.ingest.uploads.receiving import TABLES
 from app.ingest.uploads.service import options_of_file, stated_beta
 from app.platform import files
 from app.platform.database import transaction
-from app.platform.errors import NotFound
+from app.platform.errors import Conflict, NotFound
 from app.platform.jobs.children.child import places
 from app.study import repository as study
 from app.study.outcomes import repository as outcomes
@@ -48,6 +51,7 @@ class Change:
     Attributes:
         state: `up to date`, `read again`, or `failed` (then nothing of the file was changed).
         `said`: what changed, or why it failed.
+        sessions: whose time or dose changed, a sentence each.
     """
 
     upload_file_id: int
@@ -55,6 +59,7 @@ class Change:
     kind: str
     state: str
     said: list[str] = field(default_factory=list)
+    sessions: list[str] = field(default_factory=list)
 
 
 def redecode(participant_id: int | None, upload_file_id: int | None, dry_run: bool, actor: str) -> Iterator[Change]:
@@ -80,13 +85,13 @@ def redecode(participant_id: int | None, upload_file_id: int | None, dry_run: bo
             try:
                 with db.begin_nested() as savepoint:
                     repository.lock_participant(db, participant.id)
-                    change.said = _read_again(db, file, participant)
+                    change.said, change.sessions = _read_again(db, file, participant, actor)
                     if dry_run:
                         savepoint.rollback()
                 if not change.said:
                     change.state = "up to date"
-            except (UndecodableFile, Refused, files.MissingFile) as error:
-                change.state, change.said = "failed", [str(error)]
+            except (UndecodableFile, Refused, Conflict, files.MissingFile) as error:
+                change.state, change.said, change.sessions = "failed", [str(error)], []
             except Exception as fault:
                 # a fault of ours in one file must not keep the others at the old version
                 where = fault.places if isinstance(fault, ReaderFault) else places(fault)
@@ -95,19 +100,27 @@ def redecode(participant_id: int | None, upload_file_id: int | None, dry_run: bo
         yield change
 
 
-def _read_again(db: Session, file: UploadFile, participant: Participant) -> list[str]:
+def _read_again(db: Session, file: UploadFile, participant: Participant, actor: str) -> tuple[list[str], list[str]]:
+    """Read a file again; what changed, and the sessions whose time or dose did."""
     known = [*repository.recordings_of_file(db, file.id)]
     outcomes_only = file.kind in ("tremor", "grasp")
     if not outcomes_only and all(_version(db, r) >= DECODE_VERSION for r in known):
-        return []
+        return [], []
     decoded = _decoded(db, file, participant)
     if outcomes_only:
-        return _outcomes_again(db, file, decoded)
-    said = []
+        return _outcomes_again(db, file, decoded), []
+    said, dosed = [], []
+    starts: dict[Recording, datetime] = {}
     pairs, added = _matched(known, decoded.recordings)
     for recording, fresh in pairs:
         if _version(db, recording) < DECODE_VERSION:
-            said.append(_renew(db, recording, fresh))
+            fresh = clocks.keep_stated(recording, fresh)
+            renewed, doses = _renew(db, recording, fresh)
+            said.append(renewed)
+            dosed += doses
+            began = recordings.known_time(fresh.started_at)
+            if began is not None and (recording.started_at is None or abs((began - recording.started_at).total_seconds()) > MOVED_S):
+                starts[recording] = began
     for fresh in added:
         other = study.recording_by_fingerprint(db, participant.id, fresh.fingerprint)
         if other is None:
@@ -115,7 +128,9 @@ def _read_again(db: Session, file: UploadFile, participant: Participant) -> list
             said.append(f"recording {row.id} is new; send the file again to have its session proposed")
     for lost in [r for r in known if r not in {p[0] for p in pairs}]:
         raise Refused(f"the present decoder no longer finds recording {lost.id} in the file")
-    return said
+    why = f"decode version {DECODE_VERSION} reads another start"
+    timed = clocks.move(db, starts, actor, why, lambda r: _version(db, r) >= DECODE_VERSION) if starts else []
+    return said, [*timed, *dosed]
 
 
 def _decoded(db: Session, file: UploadFile, participant: Participant) -> DecodedFile:
@@ -175,18 +190,19 @@ def _same_stretch(recording: Recording, fresh: RecordingLog) -> bool:
         return False
     if recording.started_at is None or began is None:
         return recording.started_at is None and began is None
-    return abs((recording.started_at - began).total_seconds()) < 60
+    ahead_s = fresh.settings.get("clock", {}).get("ahead_s") or 0.0
+    apart_s = (recording.started_at - began).total_seconds()
+    return min(abs(apart_s), abs(apart_s - ahead_s)) < 60  # an earlier version took the dates as the clock showed them
 
 
-def _renew(db: Session, recording: Recording, fresh: RecordingLog) -> str:
-    """Add the traces of the present version to a recording; a sentence on what differs.
+def _renew(db: Session, recording: Recording, fresh: RecordingLog) -> tuple[str, list[str]]:
+    """Add the traces of the present version to a recording; a sentence on what differs, and one per session whose dose does.
 
     Raises:
-        Refused: sessions would lose their control trace, or their place in the recording.
+        Refused: sessions would lose their control trace.
     """
     before = {(t.stream, t.channel): t for t in study.traces_of_recording(db, recording.id)}
     session_ids = sorted(study.session_ids_of_recording(db, recording.id))
-    _refuse_shift(recording, fresh, session_ids)
     rows = [recordings.trace_row(recording.id, t) for t in fresh.traces]
     after = {(t.stream, t.channel): t for t in rows}
     for session in (db.get_one(StudySession, i) for i in session_ids):
@@ -203,15 +219,34 @@ def _renew(db: Session, recording: Recording, fresh: RecordingLog) -> str:
     listed = "; ".join(d for d in differences if d) or "the same numbers"
     old = max((t.decode_version for t in before.values()), default=0)
     used = f" (session{'s' if len(session_ids) > 1 else ''} {', '.join(map(str, session_ids))})" if session_ids else ""
-    return f"recording {recording.id}{used}, version {old} to {DECODE_VERSION}: {listed}"
+    doses = [_dose_change(db.get_one(StudySession, i), recording, before, after) for i in session_ids]
+    return f"recording {recording.id}{used}, version {old} to {DECODE_VERSION}: {listed}", [d for d in doses if d]
 
 
-def _refuse_shift(recording: Recording, fresh: RecordingLog, session_ids: Sequence[int]) -> None:
-    began = recordings.known_time(fresh.started_at)
-    if session_ids and recording.started_at is not None and began is not None:
-        shift = (began - recording.started_at).total_seconds()
-        if abs(shift) > 1.0:
-            raise Refused(f"recording {recording.id} would begin {shift:+.1f} s from where its sessions were placed: cut them anew by hand")
+def _dose_change(
+    session: StudySession, recording: Recording, old_traces: dict[tuple[str, str], Trace], new_traces: dict[tuple[str, str], Trace]
+) -> str | None:
+    """Describe how the amplitudes of a session's steps of a recording differ; None where they do not."""
+    parts = [(s.start_s, s.stop_s) for s in session.segments if s.recording_id == recording.id]
+    changed = unknown = 0
+    for key in {k for k in (*old_traces, *new_traces) if k[0] == AMPLITUDE_STREAM}:
+        old, new = (_rows(traces.get(key), parts) for traces in (old_traces, new_traces))
+        for end in sorted({*old, *new}):
+            one, other = old.get(end, np.nan), new.get(end, np.nan)
+            if not np.isclose(one, other, rtol=0, atol=1e-6, equal_nan=True):
+                changed, unknown = changed + 1, unknown + bool(np.isnan(other))
+    if not changed:
+        return None
+    lost = f", {unknown} of them an unknown one" if unknown else ""
+    return f"session {session.id} (visit {session.visit.number}): {changed} steps of recording {recording.id} have another amplitude{lost}"
+
+
+def _rows(trace: Trace | None, parts: Sequence[tuple[float, float]]) -> dict[float, float]:
+    """Collect the values of a trace by the ends of their rows within parts of the recording, s; NaN where invalid."""
+    if trace is None:
+        return {}
+    ends = np.round(trace.first_end_s + trace.dt_s * np.arange(trace.n), 3).tolist()
+    return {t: v for t, v in zip(ends, unpack(trace).tolist(), strict=True) if any(a < t <= b + trace.dt_s for a, b in parts)}
 
 
 def _refuse_loss(

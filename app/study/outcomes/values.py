@@ -15,6 +15,7 @@ from app.study import repository
 from app.study.outcomes import repository as of_files
 from app.study.outcomes import tremor
 from app.study.outcomes.tremor import SessionMinutes
+from app.study.recordings.facts import unknown_clock
 from app.tables.outcomes import GraspTest
 from app.tables.participants import CharacteristicsVersion, Hemisphere
 from app.tables.sessions import StudySession
@@ -27,6 +28,9 @@ session), so that with less the QoC would say too little."""
 
 MAX_UNKNOWN = 0.5
 """Share of a session that the watch may call unknown (active movement). It counts as time without tremor too, by the same division."""
+
+
+UNKNOWN_CLOCK = "the clock of the recording is unknown, so that the watch's minutes cannot be put to it; state its offset"
 
 
 @dataclass(frozen=True)
@@ -121,8 +125,9 @@ def tremor_outcome(db: Session, session: StudySession) -> TremorOutcome | None:
     if not chosen.upload_file_ids and not chosen.notes:
         return None
     m = chosen.minutes
+    unknown = any(s.is_control and unknown_clock(s.recording) for s in session.segments)
     reading = read_tremor(m.start_unix_s, m.duration_s, m.fractions, start, session.duration_s)
-    value, basis = _tremor_value(reading)
+    value, basis = (None, UNKNOWN_CLOCK) if unknown else _tremor_value(reading)
     files = tuple(sorted(set(chosen.upload_file_ids)))
     return TremorOutcome(chosen, start, reading, Derived("tremor_percent", value, "; ".join([basis, *chosen.notes]), files))
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from app.platform.web.numbers import stated
 from app.tables.recordings import Recording
+from ml.formats import lead_in_words
 from ml.formats.rejection import REJECTED_WORDS, Rejected
 
 CLOCKS = {
@@ -15,6 +16,30 @@ CLOCKS = {
     "device": "clock of the device, which may be off local time",
     "table": "times of the table",
 }
+
+
+def unknown_clock(recording: Recording) -> bool:
+    """Decide whether a start is on a clock of unknown offset from UTC, so that nothing of another clock can be joined to it."""
+    stored = _clock(recording)
+    return stored.get("known") is False
+
+
+def clock_words(recording: Recording) -> str:
+    """Describe what the times of a recording rest on."""
+    stored = _clock(recording)
+    if stored.get("known") is False:
+        return f"{stored.get('name', 'device')}'s clock, whose offset from UTC is unknown: {stored.get('why', '')}"
+    if stored.get("ahead_s") is None:
+        return CLOCKS[recording.clock]
+    by = f", stated by {stored['stated_by']}" if "stated_by" in stored else ""
+    off = f"{lead_in_words(float(stored['ahead_s']))} UTC within {stored.get('uncertainty_s') or 0:g} s{by} ({stored.get('why', '')})"
+    return f"{stored.get('name', 'device')}'s clock, which was {off}; corrected by that"
+
+
+def _clock(recording: Recording) -> Mapping[str, Any]:
+    stored = recording.details.get("settings", {}).get("clock")
+    return stored if isinstance(stored, Mapping) else {}
+
 
 _KNOWN = {
     *("packets", "samples", "missing", "missing_samples", "missing_s", "loss", "chunks", "rejected", "unusable", "clock", "loss_visible"),

@@ -17,11 +17,11 @@ from app.study.outcomes.service import Disagreement
 from app.study.outcomes.values import Derived, GraspOutcome, TremorOutcome
 from app.study.recordings.charts import Stretch, clock_chart, spectrum_charts, trace_charts, trace_name
 from app.study.recordings.facts import (
-    CLOCKS,
     SensingConfiguration,
     StreamQuality,
     adaptive_states,
     amplitude_limits,
+    clock_words,
     leads,
     quality_remarks,
     quality_rows,
@@ -137,7 +137,7 @@ def recording_blocks(
                 recording=recording,
                 is_control=any(s.is_control for s in parts),
                 part="; ".join(f"{s.start_s:.0f} to {s.stop_s:.0f} s" for s in parts) + f" of {recording.duration_s:.0f} s",
-                clock=CLOCKS[recording.clock],
+                clock=clock_words(recording),
                 charts=trace_charts(recording, rest, stretch),
                 spectra=spectrum_charts(recording, settings.beta_low_hz, settings.beta_high_hz),
                 quality=quality_rows(recording),

@@ -89,8 +89,12 @@ class Offset:
             raise OtherClock(f"the offset of the {self.clock} clock says nothing of a time of the {moment.clock} clock")
         return moment.value - timedelta(seconds=self.ahead_at(moment.value))
 
-    def as_settings(self) -> dict[str, Any]:
-        """Describe the offset as it is stored with a recording; seconds are None where it is unknown."""
+    def device_time(self, utc: datetime) -> datetime:
+        """Convert a time that `utc` gave back to what the clock showed."""
+        return utc + timedelta(seconds=self.ahead_at(utc + timedelta(seconds=self.ahead_at(utc))))
+
+    def as_settings(self, started_at: datetime | None = None) -> dict[str, Any]:
+        """Describe the offset as it is stored with a recording that begins at `started_at`; seconds are None where it is unknown."""
         begin, end = (self.pairs[0][1], self.pairs[-1][1]) if self.pairs else (None, None)
         return {
             "name": self.clock,
@@ -99,6 +103,7 @@ class Offset:
             "ahead_at_end_s": end,
             "uncertainty_s": self.uncertainty_s,
             "why": self.why,
+            "showed": None if started_at is None else self.device_time(started_at).isoformat(timespec="milliseconds"),
         }
 
 

@@ -109,8 +109,10 @@ def decode_report(report: dict[str, Any], said: FileReport, options: DecodeOptio
     recordings += [history] if history is not None else []
     if not recordings:
         said.flagged.append("a report without data: none of its sections holds samples, history or events")
-    offset = {"utc_offset_h": utc_offset_h(report.get("ProgrammerUtcOffset")), "clock": clock.as_settings()}
-    return tuple(replace(r, device_key=device, settings={**r.settings, **offset}) for r in recordings)
+    local = {"utc_offset_h": utc_offset_h(report.get("ProgrammerUtcOffset"))}
+    return tuple(
+        replace(r, device_key=device, settings={**r.settings, **local, "clock": clock.as_settings(r.started_at)}) for r in recordings
+    )
 
 
 def device_name(report: dict[str, Any]) -> str | None:

@@ -49,13 +49,14 @@ def test_the_real_report_gives_its_four_runs_with_their_samples_and_ticks(record
     assert right[0].started_at == datetime(2024, 3, 14, 10, 5, 52, tzinfo=UTC)
     assert {r.run for r in decoded.recordings} == {0, 1, 2, 3, None}
     assert any("SessionDate says 2022-12-16" in text for text in decoded.reports[0].flagged)
-    assert right[0].settings["clock"] | {"why": ""} == {
+    assert right[0].settings["clock"] | {"why": "", "showed": ""} == {
         "name": "implant",
         "known": False,
         "ahead_s": None,
         "ahead_at_end_s": None,
         "uncertainty_s": None,
         "why": "",
+        "showed": "",
     }
 
 
