@@ -147,7 +147,7 @@ def energies(codes: Iterable[str], updates: int) -> list[dict[str, Any]]:
         )
         full = train(buffer, config).policy
         small = distil(full, buffer, DistilConfig()).policy
-        lowest, rng = buffer.settings.lower_bound, np.random.default_rng(5)
+        lowest, rng = buffer.settings.bound, np.random.default_rng(5)
         rows = {
             "full": closed_loop(code, full, buffer),
             "distilled": closed_loop(code, small, buffer),

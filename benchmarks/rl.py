@@ -132,7 +132,7 @@ def random_sessions(count: int = 9, steps: int = 300) -> ReplayBuffer:
     for i in range(count):
         amplitude = rng.uniform(0.3, 1, steps)
         beta = 200 * np.exp(0.3 * rng.standard_normal(steps) - amplitude)
-        sessions.append(SessionTrajectory(i, 1, "random", np.full(WINDOW, 120.0), beta, amplitude, random_lower_bound=0.3))
+        sessions.append(SessionTrajectory(i, 1, "random", np.full(WINDOW, 120.0), beta, amplitude, random_bound=0.3))
     return ReplayBuffer(MdpSettings(xi_beta=100.0), tuple(sessions), "uV", "table")
 
 

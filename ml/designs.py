@@ -23,8 +23,6 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.trajectories import Hold
-
 Floats = NDArray[np.float64]
 DesignName = Literal["paper", "stratified"]
 SessionDesign = Literal["paper", "stratified", "ladder", "near"]
@@ -45,13 +43,63 @@ LADDER_STEP: Final = 0.2
 LADDER_SECONDS: Final = 120.0
 
 
+class Bound(float):
+    """Lower bound B of random sessions: the lowest amplitude that they try, as a fraction of the cDBS amplitude. It never bounds a policy.
+
+    It is a number, so that records store it as one.
+
+    Raises:
+        ValueError: a number outside [0, 1).
+    """
+
+    def __new__(cls, fraction: float) -> Bound:
+        """Check the range."""
+        if not 0 <= fraction < 1:
+            raise ValueError(f"the lower bound must be in [0, 1), not {fraction}")
+        return super().__new__(cls, fraction)
+
+    def allows(self, level: float) -> bool:
+        """Decide whether a session may stay near a level: from B to below cDBS."""
+        return self <= level < 1
+
+    def amplitudes(self, shares: Floats) -> Floats:
+        """Place shares of the range, any shape from 0 to 1, on [B, 1]."""
+        return np.asarray(self + (1 - self) * shares, dtype=np.float64)
+
+    @property
+    def early_lowest(self) -> float:
+        """Lowest amplitude of a session before its last `LOW_SECONDS`."""
+        return max(self, LOW_AMPLITUDE)
+
+    def steps(self, step: float) -> int:
+        """Count the steps of a device from 0 to the least of its amplitudes that is not below B; `step` is a fraction of cDBS."""
+        return math.ceil(self / step - 1e-6)
+
+
+DEFAULT_BOUND: Final = Bound(0.3)
+
+
+@dataclass(frozen=True)
+class Hold:
+    """One decision of an exploration design: an amplitude that is drawn once and then stays constant.
+
+    Attributes:
+        start, steps: first step and length. log_density: of the amplitude given the session's level and the bound in force. None where it
+            is unknown (sustained draws of no stated design) or where nothing was drawn (a titration ladder).
+    """
+
+    start: int
+    steps: int
+    log_density: float | None
+
+
 @dataclass(frozen=True, kw_only=True)
 class DesignSettings:
     """Settings of a design.
 
     Attributes:
         name: `stratified` (the default) or `paper`. visits, sessions: early visits, and random sessions in each.
-        steps: T of a session. period_s: seconds per step. lower_bound: B, in [0, 1).
+        steps: T of a session. period_s: seconds per step. bound: B.
         ladder: a titration ladder takes the place of the first random session of each visit (`stratified` alone).
         seed: the same one gives the same design.
 
@@ -64,7 +112,7 @@ class DesignSettings:
     steps: int
     name: DesignName = "stratified"
     period_s: float = 2.0
-    lower_bound: float = 0.3
+    bound: Bound = DEFAULT_BOUND
     ladder: bool = False
     seed: int = 0
 
@@ -72,8 +120,6 @@ class DesignSettings:
         for what in ("visits", "sessions", "steps"):
             if getattr(self, what) < 1:
                 raise ValueError(f"a design needs at least one of its {what}, not {getattr(self, what)}")
-        if not 0 <= self.lower_bound < 1:
-            raise ValueError(f"lower_bound must lie in [0, 1), not {self.lower_bound}")
         if not (math.isfinite(self.period_s) and self.period_s > 0):
             raise ValueError(f"period_s must be above 0 s, not {self.period_s}")
         if self.name not in ("paper", "stratified"):
@@ -165,7 +211,7 @@ def stratified_levels(settings: DesignSettings) -> Floats:
     place = np.arange(sessions) * visits + fine
     levels = (place + rng.random(place.shape)) / (visits * sessions)
     ordered = np.stack([row[rng.permutation(sessions)] for row in levels])
-    return np.asarray(settings.lower_bound + (1 - settings.lower_bound) * ordered)
+    return settings.bound.amplitudes(ordered)
 
 
 @dataclass(frozen=True)
@@ -213,26 +259,26 @@ def near_density(level: float, low: float) -> DrawDensity:
     return DrawDensity(level, low, NEAR_SPREAD, everywhere=0.0)
 
 
-def near_session(level: float, steps: int, period_s: float, lower_bound: float, seed: int, number: int) -> DesignedSession:
+def near_session(level: float, steps: int, period_s: float, bound: Bound, seed: int, number: int) -> DesignedSession:
     """Design a session near an amplitude; below `LOW_AMPLITUDE` in its last `LOW_SECONDS` alone, and as low as that allows before.
 
     Args:
-        level: fraction of cDBS. steps: T. period_s: of a step. lower_bound: B. seed, number: the same ones give the same draws.
+        level: fraction of cDBS. steps: T. period_s: of a step. bound: B. seed, number: the same ones give the same draws.
 
     Raises:
         ValueError: a level below B, or of cDBS itself.
     """
-    if not lower_bound <= level < 1:
-        raise ValueError(f"a session is held near an amplitude from B, {lower_bound:g}, to below 1, not near {level:g}")
+    if not bound.allows(level):
+        raise ValueError(f"a session is held near an amplitude from B, {bound:g}, to below 1, not near {level:g}")
     rng = np.random.default_rng([seed, 0x6E6561, number])
-    decisions = _sustained_draws(steps, period_s, lower_bound, rng, lambda low: near_density(level, low))
+    decisions = _sustained_draws(steps, period_s, bound, rng, lambda low: near_density(level, low))
     return DesignedSession("near", 1, number, level, seed, decisions)
 
 
-def near_doses(level: float, steps: int, period_s: float, lower_bound: float) -> tuple[float, float]:
+def near_doses(level: float, steps: int, period_s: float, bound: Bound) -> tuple[float, float]:
     """Compute the expected mean amplitude of a session near a level, over the session and over its last `LOW_SECONDS`."""
     late = min(steps, int(LOW_SECONDS / period_s))
-    before, after = (float(np.mean(near_density(level, low).near)) for low in (max(lower_bound, LOW_AMPLITUDE), lower_bound))
+    before, after = (float(np.mean(near_density(level, low).near)) for low in (bound.early_lowest, bound))
     return (before * (steps - late) + after * late) / steps, after
 
 
@@ -255,7 +301,7 @@ def ladder_session(settings: DesignSettings, visit: int, number: int) -> Designe
     for rung in range(min(round(1 / LADDER_STEP) + 1, max(1, settings.steps // length))):
         amplitude = round(1.0 - LADDER_STEP * rung, 6)
         low_s += length * settings.period_s * (amplitude < LOW_AMPLITUDE)
-        if amplitude < settings.lower_bound or low_s > LOW_SECONDS:
+        if amplitude < settings.bound or low_s > LOW_SECONDS:
             break
         rungs.append(amplitude)
     first = settings.steps - (len(rungs) - 1) * length
@@ -265,19 +311,19 @@ def ladder_session(settings: DesignSettings, visit: int, number: int) -> Designe
 
 
 def _paper_session(settings: DesignSettings, visit: int, number: int, rng: np.random.Generator) -> DesignedSession:
-    low = settings.lower_bound
+    low = settings.bound
     drawn = rng.uniform(low, 1.0, settings.steps)
     decisions = tuple(Decision(k, 1, float(a), -math.log(1 - low)) for k, a in enumerate(drawn))
     return DesignedSession("paper", visit, number, None, settings.seed, decisions)
 
 
 def _held_session(settings: DesignSettings, visit: int, number: int, level: float, rng: np.random.Generator) -> DesignedSession:
-    decisions = _sustained_draws(settings.steps, settings.period_s, settings.lower_bound, rng, lambda low: DrawDensity(level, low))
+    decisions = _sustained_draws(settings.steps, settings.period_s, settings.bound, rng, lambda low: DrawDensity(level, low))
     return DesignedSession("stratified", visit, number, level, settings.seed, decisions)
 
 
 def _sustained_draws(
-    steps: int, period_s: float, lower_bound: float, rng: np.random.Generator, law: Callable[[float], DrawDensity]
+    steps: int, period_s: float, bound: Bound, rng: np.random.Generator, law: Callable[[float], DrawDensity]
 ) -> tuple[Decision, ...]:
     """Draw sustained amplitudes by a density that depends on the bound in force."""
     # Low amplitudes come last: outcomes are measured there, and a session that is broken off has not been low without need.
@@ -286,7 +332,7 @@ def _sustained_draws(
     k = 0
     while k < steps:
         guarded = k < low_begins
-        density = law(max(lower_bound, LOW_AMPLITUDE) if guarded else lower_bound)
+        density = law(bound.early_lowest if guarded else bound)
         amplitude = density.draw(rng)
         length = min(hold_steps(rng, period_s), (low_begins if guarded else steps) - k)
         decisions.append(Decision(k, length, amplitude, float(np.log(density.density(amplitude)))))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.designs import Bound
 from ml.outcomes import OUTCOMES
 from ml.qoc import Qoc
 
@@ -63,10 +64,14 @@ class MdpSettings:
             raise ValueError(f"period_s must be positive, not {self.period_s}")
         if not 0 <= self.gamma < 1:
             raise ValueError(f"gamma must lie in [0, 1), not {self.gamma}")
-        if not 0 <= self.lower_bound < 1:
-            raise ValueError(f"lower_bound must lie in [0, 1), not {self.lower_bound}")
+        Bound(self.lower_bound)
         if self.r_a < self.r_b:
             raise ValueError(f"r_a ({self.r_a}) must not be below r_b ({self.r_b}): beta under the threshold is the better state")
+
+    @property
+    def bound(self) -> Bound:
+        """Lower bound B of random sessions."""
+        return Bound(self.lower_bound)
 
     def to_json(self) -> dict[str, Any]:
         """Return all constants, by name."""

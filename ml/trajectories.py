@@ -22,6 +22,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ml.arrow import to_arrow, to_numpy
+from ml.designs import Hold
 from ml.mdp import AMPLITUDE_TOLERANCE, MdpSettings, end_reward, step_reward
 from ml.qoc import Qoc, failed_qoc
 
@@ -56,20 +57,6 @@ def _carried_over(deviations: Floats) -> float:
 
 
 @dataclass(frozen=True)
-class Hold:
-    """One decision of an exploration design: an amplitude that is drawn once and then stays constant.
-
-    Attributes:
-        start, steps: first step and length. log_density: of the amplitude given the session's level and the bound in force. None where it
-            is unknown (sustained draws of no stated design) or where nothing was drawn (a titration ladder).
-    """
-
-    start: int
-    steps: int
-    log_density: float | None
-
-
-@dataclass(frozen=True)
 class SessionTrajectory:
     """One session: W beta amplitudes before it, then T steps.
 
@@ -82,7 +69,7 @@ class SessionTrajectory:
         beta: beta amplitude of each step's row, shape [T]; NaN where invalid.
         amplitude: amplitude fraction a_k, shape [T]; NaN where unknown. May exceed 1: such a step is not usable.
         qoc: end-of-session QoCs.
-        random_lower_bound: B in force for a random session; else None.
+        random_bound: B in force for a random session; else None.
         holds: decisions of a random session with sustained draws, in order and without gaps up to where it ended. Empty where every step is
             a decision of its own: a random session's density is then 1 / (1 - B) on [B, 1] at every step.
         lead_amplitude: amplitude fraction in force just before step 0, where it is known; else None.
@@ -104,7 +91,7 @@ class SessionTrajectory:
     amplitude: Floats
     qoc: Qoc = field(default_factory=Qoc)
     policy_id: int | None = None
-    random_lower_bound: float | None = None
+    random_bound: float | None = None
     lead_amplitude: float | None = None
     stopped_as: Qoc | None = None
     most_imputed: int = 0
@@ -130,7 +117,7 @@ class SessionTrajectory:
     @property
     def uniform_bound(self) -> float | None:
         """B where every step's amplitude was a new draw, uniform on [B, 1]; None for any other session."""
-        return None if self.holds else self.random_lower_bound
+        return None if self.holds else self.random_bound
 
     @property
     def measured_beta(self) -> Floats:
@@ -357,7 +344,7 @@ def from_parquet(content: bytes) -> ReplayBuffer:
                 beta=beta[body],
                 amplitude=amplitude[body],
                 qoc=Qoc(**m["qoc"]),
-                random_lower_bound=m["random_lower_bound"],
+                random_bound=m["random_lower_bound"],
                 lead_amplitude=m.get("lead_amplitude"),
                 stopped_as=Qoc(**m["stopped_as"]) if "stopped_as" in m else failed if m.get("stopped") else None,
                 most_imputed=m.get("most_imputed", 0),
@@ -385,6 +372,6 @@ def _session_meta(s: SessionTrajectory) -> dict[str, Any]:
         "visit": s.visit,
         "controller": s.controller,
         "policy_id": s.policy_id,
-        "random_lower_bound": s.random_lower_bound,
+        "random_lower_bound": s.random_bound,
         "qoc": asdict(s.qoc),
     }

@@ -30,7 +30,7 @@ from app.platform.web.forms import parse
 from app.tables.learning import Policy
 from app.tables.participants import Participant
 from app.tables.visits import Visit
-from ml.designs import EARLY_RANDOM_SESSIONS, LOW_AMPLITUDE
+from ml.designs import EARLY_RANDOM_SESSIONS, LOW_AMPLITUDE, Bound
 from ml.ope.posterior.further_sessions import MOST_HELD, Place
 
 LABELS = {
@@ -94,14 +94,14 @@ def shown_of(db: Session, visit: Visit, caller: Caller, full: PlanView | None, v
     defaults = rules_of(PlanOptions())
     choices = _choices(db, participant, found.answer if found is not None else None)
     slots, settings = most_policies(defaults), participant.current_settings
-    place = Place(settings.lower_bound, round(60 * defaults.session_minutes / settings.period_s), settings.period_s)
+    place = Place(settings.bound, round(60 * defaults.session_minutes / settings.period_s), settings.period_s)
     suggestions = suggested(found, slots)
     return {
         "ranking": found,
         "typed": values or {},
         "choices": choices,
         "suggestions": [(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],
-        "held_rows": held_rows(values, held_in(found, slots - len(suggestions), place), place.lower_bound, cdbs_amplitude_now(participant)),
+        "held_rows": held_rows(values, held_in(found, slots - len(suggestions), place), place.bound, cdbs_amplitude_now(participant)),
         "holding": wording.holding,
         "low_amplitude": LOW_AMPLITUDE,
         "most_held": MOST_HELD,
@@ -196,10 +196,10 @@ def held_of(values: FormData) -> list[HeldIn]:
     ]
 
 
-def held_rows(values: FormData | None, holds: Sequence[Held], lower_bound: float, cdbs_ma: float | None) -> list[HeldRow]:
+def held_rows(values: FormData | None, holds: Sequence[Held], bound: Bound, cdbs_ma: float | None) -> list[HeldRow]:
     """What the form shows: what is suggested, no session asked for, and a free row; what was sent where it was refused."""
     unit = "amplitude_ma" if cdbs_ma is not None else "amplitude_fraction"
-    rows = [HeldRow(unit, offered(h.hold.fraction, lower_bound, cdbs_ma), "", h) for h in holds]
+    rows = [HeldRow(unit, offered(h.hold.fraction, bound, cdbs_ma), "", h) for h in holds]
     rows = [*rows[: MOST_ROWS - 1], HeldRow(unit, "", "")]
     sent = [[str(v) for v in values.getlist(f"held_{name}")] for name in ("amplitude", "sessions")] if values is not None else [[], []]
     if len(sent[0]) != len(rows) or len(sent[1]) != len(rows):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from app.evaluation.verdict_wording import plainly
 from app.evaluation.wording import amplitude, chance, joined
 from app.planning.notices import OF_METHODS, Code, PlanWarning
-from app.planning.plans.designs import NEAR, Bound, Planned, delivered_ma, is_held
+from app.planning.plans.designs import NEAR, Planned, SideBound, delivered_ma, is_held
 from app.planning.plans.suggested import Held
 from app.planning.protocol.session_order import Order
 from app.planning.slots.matching import Deviation
@@ -229,7 +229,7 @@ def design_name(planned: Planned) -> str:
 def design_words(planned: Planned) -> str:
     """What a random session tries, in one clause."""
     if planned.design == "paper":
-        return f"the paper's design: a new draw every {planned.period_s:g} s, uniform from {planned.lower_bound:g} to 1 of cDBS"
+        return f"the paper's design: a new draw every {planned.period_s:g} s, uniform from {planned.bound:g} to 1 of cDBS"
     if planned.design == "ladder":
         steps = ", ".join(f"{h.amplitude:g}" for h in planned.holds)
         return f"titration ladder: {steps} of cDBS, {planned.holds[0].steps * planned.period_s / 60:g} min each"
@@ -248,12 +248,12 @@ def _near(planned: Planned) -> str:
     return f"{given} ({share})" if given else share
 
 
-def bound_words(planned: Planned, bounds: tuple[Bound, ...]) -> str:
+def bound_words(planned: Planned, bounds: tuple[SideBound, ...]) -> str:
     """What a random session never does, in milliamperes where the cDBS amplitude is known."""
     if not bounds:
-        return f"never below {planned.lower_bound:g} of cDBS; its cDBS amplitude is not known, so that no bound in mA can be given"
+        return f"never below {planned.bound:g} of cDBS; its cDBS amplitude is not known, so that no bound in mA can be given"
     lowest = ", ".join(_side(b, f"{b.lowest_ma:g} mA") for b in bounds)
-    words = f"never below {lowest} ({planned.lower_bound:g} of cDBS)"
+    words = f"never below {lowest} ({planned.bound:g} of cDBS)"
     if planned.low_seconds:
         low = ", ".join(_side(b, f"{b.low_ma:g} mA") for b in bounds)
         words += f"; below {low} ({LOW_AMPLITUDE:g}) for {planned.low_seconds / 60:.1f} of at most {LOW_SECONDS / 60:g} min"
@@ -261,7 +261,7 @@ def bound_words(planned: Planned, bounds: tuple[Bound, ...]) -> str:
     return words
 
 
-def schedule_words(planned: Planned, bounds: tuple[Bound, ...]) -> str:
+def schedule_words(planned: Planned, bounds: tuple[SideBound, ...]) -> str:
     """Every held amplitude with the minute it begins at: milliamperes by side, fractions of cDBS where those are not known."""
     held = [f"{_clock(h.start * planned.period_s)} {_given(h.amplitude, bounds)}" for h in planned.holds]
     last = planned.holds[-1]
@@ -324,7 +324,7 @@ def limits_ma(item: PlanItem) -> str:
     return f"{item.min_ma:g}" if item.min_ma == item.max_ma else f"{item.min_ma:g} to {item.max_ma:g}"
 
 
-def _given(fraction: float, bounds: tuple[Bound, ...]) -> str:
+def _given(fraction: float, bounds: tuple[SideBound, ...]) -> str:
     return "/".join(f"{delivered_ma(fraction, b):.1f}" for b in bounds) or f"{fraction:.2f}"
 
 
@@ -332,5 +332,5 @@ def _clock(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
-def _side(bound: Bound, words: str) -> str:
+def _side(bound: SideBound, words: str) -> str:
     return f"{words} {bound.side}" if bound.side else words

@@ -22,6 +22,7 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.platform.database import Base
 from app.tables.accounts import Site
+from ml.designs import Bound
 from ml.outcomes import OUTCOMES
 
 if TYPE_CHECKING:
@@ -230,3 +231,8 @@ class SettingsVersion(Base):
     created_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
     participant: Mapped[Participant] = relationship(back_populates="settings")
+
+    @property
+    def bound(self) -> Bound:
+        """Lower bound B of random sessions."""
+        return Bound(self.lower_bound)

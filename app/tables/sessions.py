@@ -25,6 +25,7 @@ from app.tables.outcomes import QocRevision
 from app.tables.participants import HEMISPHERE_CHECK, Hemisphere
 from app.tables.recordings import TIME_CHECK, Recording
 from app.tables.visits import Visit
+from ml.designs import Bound
 
 
 class Controller(StrEnum):
@@ -187,3 +188,8 @@ class SessionConditions(Base):
     entered_by: Mapped[str] = mapped_column(String(254))
     reason: Mapped[str | None] = mapped_column(Text)
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+
+    @property
+    def bound(self) -> Bound:
+        """Lower bound B of random sessions."""
+        return Bound(self.lower_bound)

@@ -43,7 +43,7 @@ from benchmarks.support.figure import Point, draw_curves
 from benchmarks.support.looks import look, said
 from benchmarks.support.ope_cases import CDBS, virtual_case
 from benchmarks.support.results import run_benchmark
-from ml.designs import near_session
+from ml.designs import Hold, near_session
 from ml.mdp import step_reward
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.estimator import FittedPosterior, build
@@ -58,7 +58,7 @@ from ml.population.virtual.sessions import Days
 from ml.population.virtual.world import STEPS, Part
 from ml.qoc import Margins, Qoc
 from ml.statistics.bootstrap import percentile_interval
-from ml.trajectories import Hold, ReplayBuffer, SessionTrajectory
+from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ class Clinic:
         s = self.world.settings
         rows: list[tuple[int, str, Floats, tuple[Hold, ...]]] = [(place, "cdbs", np.ones(STEPS), ()) for place in controls]
         for place, level in zip(free, levels, strict=True):
-            session = near_session(level, STEPS, s.period_s, s.lower_bound, number, place)
+            session = near_session(level, STEPS, s.period_s, s.bound, number, place)
             rows.append((place, "random", session.amplitudes, session.holds))
         found = []
         for place, controller, amplitudes, holds in rows:
@@ -102,7 +102,7 @@ class Clinic:
             first = TESTED + 1000 * number + (10 * list(self.policies).index(CDBS) if controller == "cdbs" else 500) + place
             run = self.world.run(amplitudes[None], self._day(number, place), first)
             qoc = Qoc(float(run.grasp_hz[0]), int(run.rating[0]), float(run.tremor_percent[0]))
-            bound = s.lower_bound if controller == "random" else None
+            bound = s.bound if controller == "random" else None
             found.append(
                 SessionTrajectory(
                     session_id=first,
@@ -112,7 +112,7 @@ class Clinic:
                     beta=run.beta[0],
                     amplitude=run.amplitude[0],
                     qoc=qoc,
-                    random_lower_bound=bound,
+                    random_bound=bound,
                     holds=holds,
                 )
             )
@@ -219,7 +219,7 @@ def waiting_for(estimates: Mapping[str, Estimate], buffer: ReplayBuffer) -> tupl
 
 
 def _place(buffer: ReplayBuffer) -> Place:
-    return Place(buffer.settings.lower_bound, STEPS, buffer.settings.period_s)
+    return Place(buffer.settings.bound, STEPS, buffer.settings.period_s)
 
 
 def suggested(estimates: Mapping[str, Estimate], respecting: bool, had: set[str]) -> tuple[str, ...]:

@@ -40,10 +40,10 @@ def of(fractions: NDArray[np.float64], manifest: BundleManifest) -> dict[str, An
         return facts
     asked_ma = fractions * manifest.cdbs_ma
     given = np.clip(asked_ma, manifest.min_ma, manifest.max_ma) / manifest.cdbs_ma
-    bound = manifest.logged_lower_bound
+    bound = manifest.logged_bound_ma
     return facts | {
         "asked_mean": float(fractions.mean()),
-        "asked_below_bound": None if bound is None else float(np.mean(fractions < bound - 1e-6)),
+        "asked_below_bound": None if bound is None else float(np.mean(fractions < bound / manifest.cdbs_ma - 1e-6)),
         "asked_below_minimum": float(np.mean(asked_ma < manifest.min_ma - 1e-6)),
         "energy_of_cdbs": float(np.mean(given**2)),
         "charge_of_cdbs": float(given.mean()),
@@ -104,8 +104,8 @@ def warnings(manifest: BundleManifest) -> list[BundleWarning]:
         return []
     if m.test_windows_from is None:
         return [BundleWarning(WarningCode.UNTRIED)]
-    if m.asked_below_bound is not None and m.logged_lower_bound is not None and m.asked_below_bound >= MANY:
-        out.append(BundleWarning(WarningCode.BELOW_LOGGED, m.asked_below_bound, m.logged_lower_bound * m.cdbs_ma))
+    if m.asked_below_bound is not None and m.logged_bound_ma is not None and m.asked_below_bound >= MANY:
+        out.append(BundleWarning(WarningCode.BELOW_LOGGED, m.asked_below_bound, m.logged_bound_ma))
     if m.asked_below_minimum is not None and m.asked_below_minimum >= MANY:
         out.append(BundleWarning(WarningCode.BELOW_MINIMUM, m.asked_below_minimum, m.min_ma))
     return out

@@ -171,6 +171,11 @@ class BundleManifest:
     files: dict[str, str] = field(default_factory=dict)
     schema_version: int = SCHEMA_VERSION
 
+    @property
+    def logged_bound_ma(self) -> float | None:
+        """Lowest amplitude that random sessions tried, mA; None where not known."""
+        return None if self.logged_lower_bound is None else self.logged_lower_bound * self.cdbs_ma
+
     def __post_init__(self) -> None:
         if self.schema_version != SCHEMA_VERSION:
             raise BundleError(f"this bundle has manifest version {self.schema_version}; this betaloop reads version {SCHEMA_VERSION}")

@@ -269,8 +269,8 @@ def _expectations(m: BundleManifest) -> list[tuple[str, str]]:
         return [("Not known", "no beta of this participant was logged with this window: neither amplitude nor energy can be estimated")]
     asked = f"{m.asked_mean * m.cdbs_ma:.2f} mA on average over {m.test_windows} recorded windows ({m.test_windows_from})"
     below = f"below {m.min_ma:g} mA (lowest) in {100 * (m.asked_below_minimum or 0):.0f} %"
-    if m.logged_lower_bound is not None and m.asked_below_bound is not None:
-        below += f", below {m.logged_lower_bound * m.cdbs_ma:.3g} mA (B, lowest tried at random) in {100 * m.asked_below_bound:.0f} %"
+    if m.logged_bound_ma is not None and m.asked_below_bound is not None:
+        below += f", below {m.logged_bound_ma:.3g} mA (B, lowest tried at random) in {100 * m.asked_below_bound:.0f} %"
     if m.card is not None:  # the card has the prediction of the session, so no second number of it here
         return [("Asked for", f"{asked}; {below}. On logged beta: in closed loop beta answers to the amplitude.")]
     return [

@@ -14,7 +14,7 @@ LARGEST_SHARE_BELOW = 0.05
 
 def random_bound(buffer: ReplayBuffer) -> float | None:
     """Find B of the buffer's random sessions, the lowest where they differ; None where there is no random session."""
-    return min((s.random_lower_bound for s in buffer.sessions if s.random_lower_bound is not None), default=None)
+    return min((s.random_bound for s in buffer.sessions if s.random_bound is not None), default=None)
 
 
 def share_below_bound(policy: Policy, buffer: ReplayBuffer) -> float | None:

@@ -101,7 +101,7 @@ def run_day(
             seeds=[_session_seed(seed, visit, number)],
             steps=planned.steps,
             lead_steps=settings.window,
-            lower_bound=settings.lower_bound,
+            bound=settings.bound,
             resolution_ma=resolution_ma,
             study_seed=seed,
             keep_lfp=keep_lfp,
@@ -146,7 +146,7 @@ def random_controller_buffer(
             seeds=[_session_seed(seed, plan[i].visit, plan[i].number) for i in own],
             steps=length,
             lead_steps=constants.window,
-            lower_bound=constants.lower_bound,
+            bound=constants.bound,
             study_seed=seed,
             threads=threads,
         )

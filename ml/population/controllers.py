@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.designs import Bound
 from ml.policies.policy import Policy
 from ml.population.participants import ParticipantModel
 from ml.population.physiology import brain
@@ -26,12 +26,10 @@ def is_random(controller: Controller) -> bool:
     return isinstance(controller, np.ndarray) or (isinstance(controller, str) and controller == "random")
 
 
-def chooser(controller: Controller, counters: NDArray[np.uint64], lower_bound: float) -> Callable[[Floats], Floats]:
+def chooser(controller: Controller, counters: NDArray[np.uint64], bound: Bound) -> Callable[[Floats], Floats]:
     """Make the function that chooses an amplitude at each step, from the beta windows [N, W]."""
     if isinstance(controller, str) and controller == "random":
-        if not 0 <= lower_bound < 1:
-            raise ValueError(f"the random controller needs a lower bound in [0, 1), not {lower_bound}")
-        return lambda states: np.array([lower_bound + (1 - lower_bound) * brain.uniform(row, STREAM_CONTROLLER) for row in counters])
+        return lambda states: bound.amplitudes(np.array([brain.uniform(row, STREAM_CONTROLLER) for row in counters]))
     if isinstance(controller, np.ndarray):
         laid_out = iter(controller)
         return lambda states: np.full(len(states), next(laid_out))
@@ -52,10 +50,10 @@ def chooser(controller: Controller, counters: NDArray[np.uint64], lower_bound: f
     return act
 
 
-def delivery(participant: ParticipantModel, resolution_ma: float | None, lower_bound: float) -> Callable[[Floats], Floats]:
+def delivery(participant: ParticipantModel, resolution_ma: float | None, bound: Bound) -> Callable[[Floats], Floats]:
     """Make the function from requested to delivered fractions; rounding never goes below a random controller's bound."""
     if resolution_ma is None:
         return lambda asked: asked
     unit = resolution_ma / participant.cdbs_amplitude_ma
-    lowest = math.ceil(lower_bound / unit - 1e-9)
+    lowest = bound.steps(unit)
     return lambda asked: np.minimum(np.maximum(np.rint(asked / unit), lowest) * unit, 1.0)

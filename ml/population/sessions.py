@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ml.designs import DEFAULT_BOUND, Bound
 from ml.population.controllers import Controller, chooser, delivery, is_random
 from ml.population.days import DayEffect, day_effect
 from ml.population.outcomes import GRASP_TEST_STEPS, Outcomes, measure
@@ -40,7 +41,7 @@ class SimulatedSession:
         participant: code. controller: `random`, `cdbs`, `no_dbs`, `rl`, ... visit, hour, seed: as asked for.
         lead_beta: P_beta before step 0, [L], oldest first. beta: P_beta of each step, [T]. amplitude: amplitude fraction of each step, [T].
         lead_amplitude: amplitude fraction in force before step 0.
-        lower_bound: B of a random session, else None.
+        bound: B of a random session, else None.
         lfp: 250 Hz, float32 mV, [(L + T) * 500], or None where it was not kept.
         outcomes: open-fist times, rating, tremor minutes and QoCs.
         hidden: what no device sees: `medication`, `activity`, `brady`, `tremor`, `overload`, each [T].
@@ -55,7 +56,7 @@ class SimulatedSession:
     beta: Floats
     amplitude: Floats
     lead_amplitude: float
-    lower_bound: float | None
+    bound: Bound | None
     lfp: NDArray[np.float32] | None
     outcomes: Outcomes
     hidden: dict[str, Floats] = field(repr=False)
@@ -96,7 +97,7 @@ class SimulatedSession:
             amplitude=self.amplitude,
             qoc=self.qoc,
             policy_id=policy_id,
-            random_lower_bound=self.lower_bound,
+            random_bound=self.bound,
         )
 
 
@@ -113,7 +114,7 @@ class SessionBatch:
     beta: Floats
     amplitude: Floats
     lead_amplitude: float
-    lower_bound: float | None
+    bound: Bound | None
     lfp: NDArray[np.float32] | None
     outcomes: tuple[Outcomes, ...]
     hidden: dict[str, Floats] = field(repr=False)
@@ -133,7 +134,7 @@ class SessionBatch:
             beta=self.beta[i],
             amplitude=self.amplitude[i],
             lead_amplitude=self.lead_amplitude,
-            lower_bound=self.lower_bound,
+            bound=self.bound,
             lfp=None if self.lfp is None else self.lfp[i],
             outcomes=self.outcomes[i],
             hidden={name: values[i] for name, values in self.hidden.items()},
@@ -229,7 +230,7 @@ def run_sessions(
     seeds: ArrayLike,
     steps: int,
     lead_steps: int = 10,
-    lower_bound: float = 0.3,
+    bound: Bound = DEFAULT_BOUND,
     lead_amplitude: float = 1.0,
     resolution_ma: float | None = None,
     study_seed: ArrayLike = 0,
@@ -242,7 +243,7 @@ def run_sessions(
 
     Args:
         participant: a model or its code.
-        controller: a policy, `random` (a new uniform draw on [lower_bound, 1] at each step), `cdbs`, `no_dbs`, or a design's amplitudes,
+        controller: a policy, `random` (a new uniform draw on [bound, 1] at each step), `cdbs`, `no_dbs`, or a design's amplitudes,
             [T].
         visits, hours, seeds, study_seed: of each session, [N] or one for all; `hours` since the first session of the day (0-6).
         steps: T. lead_steps: L, beta amplitudes before step 0, which is also the window W that a policy sees.
@@ -253,13 +254,11 @@ def run_sessions(
 
     Raises:
         ValueError: an unknown participant or controller, no step, or a policy that leaves [0, 1] or answers in another shape. Also a design
-            of another length or below `lower_bound`.
+            of another length or below `bound`.
     """
     model = _model(participant)
-    if isinstance(controller, np.ndarray) and (
-        controller.shape != (steps,) or not bool(np.all((controller >= lower_bound) & (controller <= 1)))
-    ):
-        raise ValueError(f"a design needs {steps} amplitudes from {lower_bound:g} to 1, not {controller.shape} from {controller.min():g}")
+    if isinstance(controller, np.ndarray) and (controller.shape != (steps,) or not bool(np.all((controller >= bound) & (controller <= 1)))):
+        raise ValueError(f"a design needs {steps} amplitudes from {bound:g} to 1, not {controller.shape} from {controller.min():g}")
     if steps < 1 or lead_steps < 1:
         raise ValueError(f"a session needs at least one step and one beta amplitude before it, not steps={steps}, lead_steps={lead_steps}")
     seed = np.atleast_1d(np.asarray(seeds)).astype(np.uint64)
@@ -278,8 +277,8 @@ def run_sessions(
         lead_amplitude=lead_amplitude,
         threads=threads,
     )
-    choose = chooser(controller, simulation.counters, lower_bound)
-    deliver = delivery(model, resolution_ma, lower_bound if is_random(controller) else 0.0)
+    choose = chooser(controller, simulation.counters, bound)
+    deliver = delivery(model, resolution_ma, bound if is_random(controller) else Bound(0.0))
     beta, amplitude = np.empty((n, total)), np.full((n, total), lead_amplitude)
     hidden = {key: np.empty((n, steps)) for key in ("medication", "activity", "brady", "tremor", "overload")}
     lfp = np.empty((n, total * SAMPLES_PER_PERIOD), dtype=np.float32) if keep_lfp else None
@@ -313,7 +312,7 @@ def run_sessions(
         beta=np.ascontiguousarray(beta[:, lead_steps:]),
         amplitude=amplitude,
         lead_amplitude=lead_amplitude,
-        lower_bound=lower_bound if is_random(controller) else None,
+        bound=bound if is_random(controller) else None,
         lfp=lfp,
         outcomes=outcomes,
         hidden=hidden,
@@ -329,7 +328,7 @@ def run_session(
     seed: int,
     steps: int,
     lead_steps: int = 10,
-    lower_bound: float = 0.3,
+    bound: Bound = DEFAULT_BOUND,
     resolution_ma: float | None = None,
     study_seed: int = 0,
     name: str = "rl",
@@ -343,7 +342,7 @@ def run_session(
         seeds=[seed],
         steps=steps,
         lead_steps=lead_steps,
-        lower_bound=lower_bound,
+        bound=bound,
         resolution_ma=resolution_ma,
         study_seed=study_seed,
         name=name,

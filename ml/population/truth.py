@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.designs import DEFAULT_BOUND, Bound
 from ml.mdp import MdpSettings, end_reward, step_reward
 from ml.policies.policy import ConstantPolicy
 from ml.population.controllers import Controller
@@ -77,7 +78,7 @@ def true_return(
     """Estimate the expected return of a controller over days, hours and noise (eq:ope_total_return).
 
     Args:
-        policy: a policy, `random` (on [settings.lower_bound, 1]), `cdbs` or `no_dbs`.
+        policy: a policy, `random` (on [settings.bound, 1]), `cdbs` or `no_dbs`.
         settings: MDP constants; the window is that of the state, the period must be 2 s.
         sessions: number of independent sessions, each on a day of its own, at a uniform hour of the day.
         steps: horizon H.
@@ -92,7 +93,7 @@ def true_return(
         seed=seed,
         steps=steps,
         window=settings.window,
-        lower_bound=settings.lower_bound,
+        bound=settings.bound,
         threads=threads,
         report=report,
     )
@@ -126,7 +127,7 @@ def sample_sessions(
     seed: int,
     steps: int,
     window: int = 10,
-    lower_bound: float = 0.3,
+    bound: Bound = DEFAULT_BOUND,
     threads: int = 1,
     report: Report = silent,
 ) -> SessionBatch:
@@ -144,7 +145,7 @@ def sample_sessions(
         study_seed=rng.integers(1, 2**62, sessions),
         steps=steps,
         lead_steps=window,
-        lower_bound=lower_bound,
+        bound=bound,
         threads=threads,
         report=report,
     )

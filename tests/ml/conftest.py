@@ -12,10 +12,10 @@ def random_sessions(settings: MdpSettings, count: int = 4, steps: int = 60, seed
     rng = np.random.default_rng(seed)
     sessions = []
     for i in range(count):
-        amplitude = rng.uniform(settings.lower_bound, 1, steps)
+        amplitude = rng.uniform(settings.bound, 1, steps)
         beta = 200 * np.exp(noise * rng.standard_normal(steps) - amplitude)
         lead = 120 * np.exp(noise * rng.standard_normal(settings.window))
-        sessions.append(SessionTrajectory(i, 1, "random", lead, beta, amplitude, random_lower_bound=settings.lower_bound))
+        sessions.append(SessionTrajectory(i, 1, "random", lead, beta, amplitude, random_bound=settings.bound))
     return ReplayBuffer(settings, tuple(sessions), "uV", "table")
 
 

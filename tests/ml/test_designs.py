@@ -17,6 +17,7 @@ from ml.designs import (
     LOW_SECONDS,
     NEAR_SPREAD,
     SPREAD,
+    Bound,
     DesignSettings,
     DrawDensity,
     hold_steps,
@@ -38,7 +39,7 @@ def stratified(**changes):
 
 @given(seed=seeds, bound=bounds, visits=st.integers(1, 6), sessions=st.integers(1, 6), steps=st.integers(1, 600), ladder=st.booleans())
 def test_no_step_is_below_the_bound_and_low_ones_end_after_five_minutes(seed, bound, visits, sessions, steps, ladder):
-    designed = lay_out(stratified(seed=seed, lower_bound=bound, visits=visits, sessions=sessions, steps=steps, ladder=ladder))
+    designed = lay_out(stratified(seed=seed, bound=Bound(bound), visits=visits, sessions=sessions, steps=steps, ladder=ladder))
     assert [(s.visit, s.number) for s in designed] == [(v, n) for v in range(1, visits + 1) for n in range(sessions)]
     for session in designed:
         a = session.amplitudes
@@ -53,7 +54,7 @@ def test_no_step_is_below_the_bound_and_low_ones_end_after_five_minutes(seed, bo
 
 @given(seed=seeds, bound=bounds, visits=st.integers(1, 6), sessions=st.integers(1, 6), ladder=st.booleans())
 def test_levels_are_stratified_exactly_within_and_across_visits(seed, bound, visits, sessions, ladder):
-    levels = stratified_levels(stratified(seed=seed, lower_bound=bound, visits=visits, sessions=sessions, ladder=ladder))
+    levels = stratified_levels(stratified(seed=seed, bound=Bound(bound), visits=visits, sessions=sessions, ladder=ladder))
     own = sessions - ladder
     assert levels.shape == (visits, own)
     unit = (levels - bound) / (1 - bound)
@@ -132,7 +133,7 @@ def test_sustained_doses_are_tried_by_the_stratified_design_and_not_by_the_paper
 
 @pytest.mark.parametrize(("bound", "rungs"), [(0.3, [1, 0.8, 0.6, 0.4]), (0.5, [1, 0.8, 0.6]), (0.0, [1, 0.8, 0.6, 0.4, 0.2]), (0.85, [1])])
 def test_the_ladder_goes_down_by_fifths_to_the_bound_or_the_limit(bound, rungs):
-    session = lay_out(stratified(lower_bound=bound, ladder=True))[0]
+    session = lay_out(stratified(bound=Bound(bound), ladder=True))[0]
     assert session.design == "ladder"
     assert [d.amplitude for d in session.decisions] == pytest.approx(rungs)
     assert all(d.log_density is None for d in session.decisions)
@@ -156,7 +157,6 @@ def test_the_same_seed_gives_the_same_design_and_another_one_another():
     ("changes", "words"),
     [
         ({"visits": 0}, "visits"),
-        ({"lower_bound": 1.0}, "lower_bound"),
         ({"period_s": 0.0}, "period_s"),
         ({"name": "held"}, "no design 'held'"),
         ({"name": "paper", "ladder": True}, "ladder"),
@@ -196,7 +196,7 @@ def test_constant_and_too_short_sessions_are_neither():
 @given(seed=seeds, bound=st.floats(0.0, 0.9), place=st.floats(0.0, 0.99), steps=st.integers(1, 600))
 def test_a_session_near_an_amplitude_stays_near_it_within_the_rules_of_safety(seed, bound, place, steps):
     level = bound + place * (1 - bound)
-    session = near_session(level, steps, 2.0, bound, seed, 0)
+    session = near_session(level, steps, 2.0, Bound(bound), seed, 0)
     assert (session.design, session.level, session.seed) == ("near", level, seed)
     a = session.amplitudes
     assert a.size == steps
@@ -224,8 +224,8 @@ def test_the_density_near_an_amplitude_integrates_to_one_and_is_that_of_the_draw
 
 @pytest.mark.parametrize("level", [0.4, 0.55, 0.62, 0.8, 0.97])
 def test_the_dose_of_a_session_near_an_amplitude_is_the_mean_of_many(level):
-    runs = np.stack([near_session(level, 300, 2.0, 0.3, seed, 0).amplitudes for seed in range(300)])
-    mean, late = near_doses(level, 300, 2.0, 0.3)
+    runs = np.stack([near_session(level, 300, 2.0, Bound(0.3), seed, 0).amplitudes for seed in range(300)])
+    mean, late = near_doses(level, 300, 2.0, Bound(0.3))
     assert runs.mean() == pytest.approx(mean, abs=0.003)
     assert runs[:, -150:].mean() == pytest.approx(late, abs=0.003)
 
@@ -233,4 +233,19 @@ def test_the_dose_of_a_session_near_an_amplitude_is_the_mean_of_many(level):
 @pytest.mark.parametrize("level", [0.29, 1.0])
 def test_no_session_is_held_below_the_bound_or_at_cdbs(level):
     with pytest.raises(ValueError, match="held near"):
-        near_session(level, 300, 2.0, 0.3, 1, 0)
+        near_session(level, 300, 2.0, Bound(0.3), 1, 0)
+
+
+@pytest.mark.parametrize("fraction", [-0.1, 1.0, float("nan")])
+def test_a_lower_bound_is_a_fraction_below_cdbs(fraction):
+    with pytest.raises(ValueError, match="lower bound"):
+        Bound(fraction)
+
+
+def test_a_lower_bound_allows_levels_from_itself_to_below_cdbs_and_counts_steps_of_a_device():
+    bound = Bound(0.45)
+    assert [bound.allows(level) for level in (0.44, 0.45, 0.99, 1.0)] == [False, True, True, False]
+    assert (bound.early_lowest, Bound(0.7).early_lowest) == (0.6, 0.7)
+    assert bound.amplitudes(np.array([0.0, 0.5, 1.0])).tolist() == pytest.approx([0.45, 0.725, 1.0])
+    # of 3 mA in steps of 0.1: 1.35 mA needs 14 steps; 0.3 * 3 = 0.9 mA is nine, whatever floating point makes of it
+    assert (bound.steps(0.1 / 3), Bound(0.3).steps(0.1 / 3)) == (14, 9)

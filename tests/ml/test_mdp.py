@@ -59,7 +59,7 @@ def test_step_rewards_stay_in_the_papers_range(beta: float, amplitude: float) ->
         ({"gamma": 1.0}, "gamma"),
         ({"window": 0}, "window"),
         ({"period_s": 0}, "period_s"),
-        ({"lower_bound": 1.0}, "lower_bound"),
+        ({"lower_bound": 1.0}, "lower bound"),
         ({"xi_beta": float("nan")}, "xi_beta"),
         ({"r_a": -2.0}, "r_a"),
     ],

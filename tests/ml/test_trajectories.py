@@ -11,9 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from ml.designs import Hold
 from ml.mdp import MdpSettings
 from ml.qoc import Qoc, failed_qoc
-from ml.trajectories import Hold, ReplayBuffer, SessionTrajectory, content_hash, from_parquet, to_parquet
+from ml.trajectories import ReplayBuffer, SessionTrajectory, content_hash, from_parquet, to_parquet
 
 SETTINGS = MdpSettings(xi_beta=0.5, window=3)
 
@@ -28,7 +29,7 @@ def session(session_id: int = 1, steps: int = 4, **changes: object) -> SessionTr
         beta=0.1 * np.arange(1, steps + 1),
         amplitude=0.1 * np.arange(steps),
         qoc=Qoc(2.0, 7, 10.0),
-        random_lower_bound=0.3,
+        random_bound=0.3,
     )
     return replace(whole, **changes)  # type: ignore[arg-type]
 
@@ -159,7 +160,7 @@ def test_a_buffer_without_a_usable_step_says_so() -> None:
 
 
 def test_the_stored_form_keeps_everything_and_its_hash() -> None:
-    buffer = ReplayBuffer(SETTINGS, (session(1), session(7, 9, qoc=Qoc(), random_lower_bound=None, policy_id=3)), "uV", "table")
+    buffer = ReplayBuffer(SETTINGS, (session(1), session(7, 9, qoc=Qoc(), random_bound=None, policy_id=3)), "uV", "table")
     buffer.sessions[1].beta[2] = np.nan
     content = to_parquet(buffer)
     again = from_parquet(content)
@@ -169,13 +170,13 @@ def test_the_stored_form_keeps_everything_and_its_hash() -> None:
     for a, b in zip(again.sessions, buffer.sessions, strict=True):
         for name in ("lead_beta", "beta", "amplitude"):
             assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
-        assert (a.session_id, a.visit, a.controller, a.policy_id, a.qoc, a.random_lower_bound) == (
+        assert (a.session_id, a.visit, a.controller, a.policy_id, a.qoc, a.random_bound) == (
             b.session_id,
             b.visit,
             b.controller,
             b.policy_id,
             b.qoc,
-            b.random_lower_bound,
+            b.random_bound,
         )
 
 
@@ -191,7 +192,7 @@ def test_held_draws_survive_storing_and_a_buffer_without_them_keeps_its_bytes() 
     again = from_parquet(to_parquet(held))
     assert again.sessions[0].holds == holds
     assert again.sessions[0].uniform_bound is None
-    assert again.sessions[0].random_lower_bound == 0.3
+    assert again.sessions[0].random_bound == 0.3
     plain = ReplayBuffer(SETTINGS, (session(1),), "uV", "table")
     assert from_parquet(to_parquet(plain)).sessions[0].uniform_bound == 0.3
     assert b'"schema_version": 1' in to_parquet(plain)

@@ -88,7 +88,7 @@ def _page(
         curves=curve_charts(policy.metrics.get("curve", {}), f"policy {policy.name}"),
         config={k: v for k, v in policy.config.items() if not k.endswith("_every")},
         row=row,
-        picture=judged.picture(participant.current_settings.lower_bound, policy.id) if judged and row else None,
+        picture=judged.picture(participant.current_settings.bound, policy.id) if judged and row else None,
         other=other_than(policy, learning.candidates(db, participant.id), answered),
         same=_same(policy, answered) if answered else [],
         plainly=verdict_wording.plainly,

@@ -157,7 +157,7 @@ def assess(
         participant.current_margins,
         coverage_failed(evaluation),
         session_noise(evaluation),
-        Place(version.lower_bound, evaluation.horizon_steps, version.period_s),
+        Place(version.bound, evaluation.horizon_steps, version.period_s),
         cdbs_ma,
         tuple((held, table[i][POSTERIOR]) for i in references if (held := policies[i].amplitude) is not None and POSTERIOR in table[i]),
     )

@@ -34,6 +34,7 @@ from app.study.sessions.repository import ReadOnce
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot
 from app.tables.participants import Participant, SettingsVersion
+from ml.designs import Bound
 from ml.ope import Estimate, Flag, method_keys
 
 T = TypeVar("T")
@@ -122,20 +123,20 @@ class Judged:
             return None
         return random_sessions(self.sessions.rows, self.caller, settings, self.participant.margins_in_force, self.cdbs_ma)
 
-    def picture(self, lower_bound: float, policy_id: int | None = None) -> Picture:
+    def picture(self, bound: Bound, policy_id: int | None = None) -> Picture:
         """The picture of the candidates, those that act like cDBS last, or of one candidate.
 
         Args:
-            lower_bound: B, fraction of cDBS. policy_id: a candidate, which is drawn under its own name where it is a twin.
+            bound: B, fraction of cDBS. policy_id: a candidate, which is drawn under its own name where it is a twin.
         """
 
         def read() -> Picture:
             found, unit = self._answer_with_draws, self.db.get_one(BufferSnapshot, self.evaluation.snapshot_id).beta_unit
             one = None if policy_id is None else found.everyone().get(policy_id)
             rows = [*found.rows, *found.like_off, *found.like_cdbs] if policy_id is None else [replace(one, twins=())] if one else []
-            return picture(self.with_draws, rows, unit, lower_bound)
+            return picture(self.with_draws, rows, unit, bound)
 
-        return self.kept(("picture", lower_bound, policy_id), read)
+        return self.kept(("picture", bound, policy_id), read)
 
 
 def _with_copies(events: Events, heads: Mapping[int, PolicyHead]) -> dict[int, tuple[Flag, ...]]:

@@ -97,7 +97,7 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             random_sessions=EARLY_RANDOM_SESSIONS,
             ranking=found,
             answer=answered,
-            picture=judged.picture(settings.lower_bound),
+            picture=judged.picture(settings.bound),
             next=what_next(judged, may_run=may_run),
             held=held_out.of_evaluation(judged.evaluation),
             pooling=[wording.shape_pooling(o, told) for o, told in dose_shapes.pooling(judged.evaluation).items()],

@@ -13,6 +13,7 @@ from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.platform.web.charts import Cell, written
 from app.platform.web.numbers import number
 from app.platform.web.svg import Plane, apart, drawing
+from ml.designs import Bound
 from ml.ope import DOSES, BehaviourMap, Estimate, interval, outcome_draws
 from ml.outcomes import OUTCOMES
 
@@ -97,11 +98,11 @@ class Picture:
     greyed: bool
 
 
-def picture(found: Assessment, rows: Sequence[Row], unit: str, lower_bound: float) -> Picture:
+def picture(found: Assessment, rows: Sequence[Row], unit: str, bound: Bound) -> Picture:
     """The picture of some candidates.
 
     Args:
-        found: the assessment. rows: candidates, what matters first. unit: of beta. lower_bound: B, fraction of cDBS.
+        found: the assessment. rows: candidates, what matters first. unit: of beta. bound: B, fraction of cDBS.
     """
     scale = Scale.of(found.cdbs_ma)
     everyone = _drawn(rows)
@@ -113,7 +114,7 @@ def picture(found: Assessment, rows: Sequence[Row], unit: str, lower_bound: floa
         key=lambda a: _dose(a.posterior) or 0.0,
     )
     return Picture(
-        behaviour=_behaviour(known, behaviours, scale, unit, lower_bound) if known else None,
+        behaviour=_behaviour(known, behaviours, scale, unit, bound) if known else None,
         doses=_doses(everyone, references, scale),
         behaviour_columns=(f"Beta from ({unit})", f"to ({unit})", "Recorded steps", *(f"{n} ({scale.unit})" for n in named.values())),
         behaviour_rows=_behaviour_rows(known, list(named), scale) if known else (),
@@ -138,7 +139,7 @@ def _drawn(rows: Sequence[Row]) -> list[Drawn]:
     return found
 
 
-def _behaviour(known: BehaviourMap, behaviours: Sequence[Drawn], scale: Scale, unit: str, lower_bound: float) -> Markup:
+def _behaviour(known: BehaviourMap, behaviours: Sequence[Drawn], scale: Scale, unit: str, bound: Bound) -> Markup:
     shown, more = behaviours[:MOST], behaviours[MOST:]
     plane = Plane(56, 34, W - 56 - 108, H - 34 - 46, (known.edges[0], known.edges[-1]), (0.0, 1.08 * scale.factor))
     most = max((n for column in known.tried for n in column), default=0)
@@ -150,7 +151,7 @@ def _behaviour(known: BehaviourMap, behaviours: Sequence[Drawn], scale: Scale, u
                 plane.cell(known.edges[k], known.edges[k + 1], low, high, "muted", dark)
     plane.axes(f"Beta, mean of the policy's window ({written(unit)})", f"Amplitude ({scale.unit})")
     plane.level(scale.factor, f"cDBS {scale.words(1.0)}", "cdbs")
-    plane.level(lower_bound * scale.factor, f"lowest of random sessions {scale.words(lower_bound)}", "muted", "2 3")
+    plane.level(bound * scale.factor, f"lowest of random sessions {scale.words(bound)}", "muted", "2 3")
     centres = [(a + b) / 2 for a, b in zip(known.edges[:-1], known.edges[1:], strict=True)]
     ends: list[tuple[Drawn, float]] = []
     for d in reversed(behaviours):  # what matters first lies on top

@@ -344,7 +344,7 @@ def _digest(s: SessionTrajectory) -> str:
     digest = hashlib.sha256()
     for values in (s.lead_beta, s.beta, s.amplitude):
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes() + b"|")
-    digest.update(repr((s.random_lower_bound, s.lead_amplitude, *s.holds)).encode())
+    digest.update(repr((s.random_bound, s.lead_amplitude, *s.holds)).encode())
     if s.stopped_as is not None:
         digest.update(f"|stopped as {s.stopped_as}".encode())
     return digest.hexdigest()

@@ -40,7 +40,7 @@ def trajectory_of(session: StudySession, table: StepTable, arm: Arm, version: Se
         beta=table.beta[window:],
         amplitude=table.fraction[window:],
         qoc=qoc_of(session),
-        random_lower_bound=conditions.lower_bound if by_design and conditions and by_design.density_told else None,
+        random_bound=conditions.bound if by_design and conditions and by_design.density_told else None,
         holds=by_design.holds if by_design else (),
         lead_amplitude=lead_ma / table.cdbs_ma if lead_ma is not None and table.cdbs_ma else None,
         most_imputed=min(version.most_imputed, window - 1),

@@ -223,11 +223,11 @@ def _schedule(view: PlanView, item: PlanItem, period_s: float) -> Schedule:
             "Draft the visit anew.",
         )
     if planned.holds:
-        return Schedule(planned.design, planned.level, planned.seed, planned.lower_bound, _holds(planned.holds))
+        return Schedule(planned.design, planned.level, planned.seed, planned.bound, _holds(planned.holds))
     seed = seed_of(f"{view.visit.participant.code}/{item.id}", view.plan.id)
-    wanted = DesignSettings(name="paper", visits=1, sessions=1, steps=steps, period_s=period_s, lower_bound=planned.lower_bound, seed=seed)
+    wanted = DesignSettings(name="paper", visits=1, sessions=1, steps=steps, period_s=period_s, bound=planned.bound, seed=seed)
     (session,) = lay_out(wanted)
-    return Schedule("paper", None, seed, planned.lower_bound, _holds(session.decisions))
+    return Schedule("paper", None, seed, planned.bound, _holds(session.decisions))
 
 
 def _holds(decisions: tuple[Decision, ...]) -> tuple[ScheduledHold, ...]:

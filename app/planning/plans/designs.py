@@ -16,7 +16,7 @@ from app.study.cdbs_amplitude import held_settings, plausible
 from app.tables.participants import SettingsVersion
 from app.tables.plans import PlanItem
 from app.tables.visits import Visit
-from ml.designs import LOW_AMPLITUDE, Decision, DesignedSession, DesignSettings, amplitudes, lay_out, near_session
+from ml.designs import LOW_AMPLITUDE, Bound, Decision, DesignedSession, DesignSettings, amplitudes, lay_out, near_session
 
 RESOLUTION_MA: Final = 0.1
 """What a stimulator rounds amplitudes to."""
@@ -31,7 +31,7 @@ def is_held(item: PlanItem) -> bool:
 
 
 @dataclass(frozen=True)
-class Bound:
+class SideBound:
     """Milliamperes of one side.
 
     Attributes:
@@ -63,7 +63,7 @@ class Planned:
     lower_bound: float
     period_s: float
     holds: tuple[Decision, ...]
-    bounds: tuple[Bound, ...] = ()
+    bounds: tuple[SideBound, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """For storage."""
@@ -72,12 +72,17 @@ class Planned:
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> Planned:
         """The inverse of `as_json`."""
-        nested = {"holds": tuple(Decision(**h) for h in stored["holds"]), "bounds": tuple(Bound(**b) for b in stored["bounds"])}
+        nested = {"holds": tuple(Decision(**h) for h in stored["holds"]), "bounds": tuple(SideBound(**b) for b in stored["bounds"])}
         return cls(**stored | nested)
 
     def first_steps(self, steps: int) -> NDArray[np.float64]:
         """Amplitude fraction of so many steps, [steps]: cDBS after the last hold."""
         return amplitudes(self.holds, steps)
+
+    @property
+    def bound(self) -> Bound:
+        """Lower bound B in force."""
+        return Bound(self.lower_bound)
 
     @property
     def low_seconds(self) -> float:
@@ -114,7 +119,7 @@ def planned_sessions(settings: SettingsVersion, code: str, earlier_visits: int, 
         sessions=count,
         steps=max(1, round(60 * minutes / settings.period_s)),
         period_s=settings.period_s,
-        lower_bound=bound,
+        bound=Bound(bound),
         ladder=settings.design_ladder,
         seed=seed_of(code, number),
     )
@@ -144,8 +149,8 @@ def near_sessions(
     steps = max(1, round(60 * minutes / settings.period_s))
     found = []
     for number, level in enumerate(levels):
-        if not settings.lower_bound <= level < 1:
-            wanted, lowest, highest = (_amplitude(share, cdbs_ma) for share in (level, settings.lower_bound, 1.0))
+        if not settings.bound.allows(level):
+            wanted, lowest, highest = (_amplitude(share, cdbs_ma) for share in (level, settings.bound, 1.0))
             raise Invalid(
                 f"A session held near {wanted} cannot be planned: the participant's lower bound is {lowest}, and cDBS {highest}.",
                 "Name an amplitude from the lower bound to below that of cDBS.",
@@ -156,7 +161,7 @@ def near_sessions(
                 f"{_amplitude(bound, cdbs_ma)}.",
                 "Lower the limit, or hold the session at or above it.",
             )
-        session = near_session(level, steps, settings.period_s, bound, seed, number)
+        session = near_session(level, steps, settings.period_s, Bound(bound), seed, number)
         found.append(Planned(NEAR, level, seed, bound, settings.period_s, session.decisions))
     return found
 
@@ -171,7 +176,7 @@ def seed_of(code: str, number: int) -> int:
     return int.from_bytes(digest[:8], "big") % MAX_SEED
 
 
-def bounds_of(visit: Visit, settings: SettingsVersion, lower_bound: float) -> tuple[Bound, ...]:
+def bounds_of(visit: Visit, settings: SettingsVersion, bound: Bound) -> tuple[SideBound, ...]:
     """The bounds of a visit's random sessions in milliamperes, by side.
 
     Raises:
@@ -187,7 +192,7 @@ def bounds_of(visit: Visit, settings: SettingsVersion, lower_bound: float) -> tu
             "The plan has random sessions with a lower bound, and the cDBS amplitude that it is a fraction of is not known.",
             "State the cDBS amplitude at the visit or in the participant's settings; then approve the plan.",
         )
-    return tuple(Bound(side, ma, rounded_up(lower_bound * ma), rounded_up(LOW_AMPLITUDE * ma)) for side, ma in sides)
+    return tuple(SideBound(side, ma, rounded_up(bound * ma), rounded_up(LOW_AMPLITUDE * ma)) for side, ma in sides)
 
 
 def rounded_up(milliamperes: float) -> float:
@@ -195,18 +200,18 @@ def rounded_up(milliamperes: float) -> float:
     return round(math.ceil(milliamperes / RESOLUTION_MA - 1e-6) * RESOLUTION_MA, 6)
 
 
-def offered(fraction: float, lower_bound: float, cdbs_ma: float | None) -> str:
+def offered(fraction: float, bound: Bound, cdbs_ma: float | None) -> str:
     """An amplitude as the plan's form proposes it: in steps of 0.1 mA, or 0.01 of cDBS, and one that the plan takes.
 
     Args:
-        fraction: of cDBS, that is to be held. lower_bound: B. cdbs_ma: None where it is not known.
+        fraction: of cDBS, that is to be held. bound: B. cdbs_ma: None where it is not known.
     """
     scale, step, digits = (1.0, 0.01, 2) if cdbs_ma is None else (cdbs_ma, RESOLUTION_MA, 1)
-    least, below_cdbs = math.ceil(lower_bound * scale / step - 1e-6), math.ceil(scale / step - 1e-6) - 1
+    least, below_cdbs = bound.steps(step / scale), math.ceil(scale / step - 1e-6) - 1
     return f"{max(least, min(below_cdbs, round(fraction * scale / step))) * step:.{digits}f}"
 
 
-def delivered_ma(fraction: float, bound: Bound) -> float:
+def delivered_ma(fraction: float, bound: SideBound) -> float:
     """What a stimulator gives for a fraction of cDBS: rounded to its resolution, within the bound and cDBS, mA.
 
     Rounding makes no amplitude one of those at which a session stays for `LOW_SECONDS` at most.
@@ -217,4 +222,4 @@ def delivered_ma(fraction: float, bound: Bound) -> float:
 
 
 def _planned(session: DesignedSession, wanted: DesignSettings) -> Planned:
-    return Planned(session.design, session.level, session.seed, wanted.lower_bound, wanted.period_s, session.decisions)
+    return Planned(session.design, session.level, session.seed, wanted.bound, wanted.period_s, session.decisions)

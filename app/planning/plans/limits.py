@@ -145,10 +145,10 @@ def lowest_draw(db: Session, visit: Visit, stated: StatedLimits, hemisphere: Hem
     try:
         cdbs_ma = planned_cdbs_ma(visit, hemisphere)
     except Invalid:
-        return settings.lower_bound  # the limits of the plan say what is missing, and signing is refused
+        return settings.bound  # the limits of the plan say what is missing, and signing is refused
     device = device_limits(db, visit.participant, hemisphere)
-    least = slot_limits(cdbs_ma, Controller.RANDOM, settings.period_s, stated, device, settings.lower_bound).min_ma
-    return least / cdbs_ma if least > settings.lower_bound * cdbs_ma + _ROUNDING_MA else settings.lower_bound
+    least = slot_limits(cdbs_ma, Controller.RANDOM, settings.period_s, stated, device, settings.bound).min_ma
+    return least / cdbs_ma if least > settings.bound * cdbs_ma + _ROUNDING_MA else settings.bound
 
 
 def set_limits(db: Session, visit: Visit, items: Sequence[PlanItem], stated: StatedLimits, hemisphere: Hemisphere | None) -> None:

@@ -302,5 +302,5 @@ def _fix_designs(visit: Visit, plan: Plan) -> None:
     for item in plan.items:
         if item.design is not None and item.design["holds"]:
             design = Planned.from_json(item.design)
-            bounds = bounds_of(visit, visit.participant.current_settings, design.lower_bound)
+            bounds = bounds_of(visit, visit.participant.current_settings, design.bound)
             item.design = replace(design, bounds=bounds).as_json()

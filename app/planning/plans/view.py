@@ -206,7 +206,7 @@ def _design(visit: Visit, item: PlanItem) -> Planned | None:
     if design.bounds or not design.holds:
         return design
     try:
-        return replace(design, bounds=bounds_of(visit, visit.participant.current_settings, design.lower_bound))
+        return replace(design, bounds=bounds_of(visit, visit.participant.current_settings, design.bound))
     except Invalid:
         return design  # a warning of the plan says what is missing, and approving it is refused
 

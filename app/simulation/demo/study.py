@@ -86,7 +86,7 @@ class DemoSession:
             beta=ran.beta,
             amplitude=ran.amplitude,
             qoc=ran.qoc,
-            random_lower_bound=PARTICIPANTS[self.code].mdp_settings().lower_bound if self.design else None,
+            random_bound=PARTICIPANTS[self.code].mdp_settings().bound if self.design else None,
             holds=self.design.holds if self.design else (),
         )
 

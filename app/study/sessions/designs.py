@@ -14,8 +14,7 @@ from app.study import blinding, repository
 from app.study.sessions import logged
 from app.study.traces import StepTable
 from app.tables.sessions import Controller, SessionConditions, StudySession
-from ml.designs import recognise, unstated_holds
-from ml.trajectories import Hold
+from ml.designs import Hold, recognise, unstated_holds
 
 Kind = Literal["paper", "stratified", "ladder", "near", "held", "unstated"]
 """The stated design; `held` where nobody stated one and the amplitudes are held; `unstated` where they are not: taken for the paper's."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.designs import LOW_AMPLITUDE, NEAR_SPREAD, near_doses
+from ml.designs import NEAR_SPREAD, Bound, near_doses
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.support import FEWEST_SESSIONS, FEWEST_VISITS, NEAR
 from ml.ope.posterior.verdict import Levels, outcome_draws, slacks
@@ -127,7 +127,7 @@ def worth_holding(waiting: Mapping[str, tuple[Further, float | None]], slots: in
 
 def worth_exploring(place: Place, slots: int) -> tuple[Hold, ...]:
     """What to hold where the data cannot order policies: the lowest amplitude that a whole session may hold, beside cDBS."""
-    level = max(place.lower_bound, LOW_AMPLITUDE) + NEAR_SPREAD
+    level = place.bound.early_lowest + NEAR_SPREAD
     return (Hold(level, min(slots, MOST_HELD), None),) if slots >= 1 and level <= 1.0 - 2 * NEAR_SPREAD else ()
 
 
@@ -183,7 +183,7 @@ def _within_groups(groups: Sequence[Sequence[float | None]]) -> float:
 class Place:
     """Within what a plan holds sessions: B (fraction of cDBS), the steps of a session, seconds of a step."""
 
-    lower_bound: float
+    bound: Bound
     steps: int = 300
     period_s: float = 2.0
 
@@ -209,7 +209,7 @@ def reachable(dose: float, place: Place) -> Reachable | None:
         dose: of the policy, fraction of cDBS. place: within what sessions are held.
     """
     mean_within, late_within = float(NEAR[0]) - _SLACK, float(NEAR[1]) - _SLACK
-    lowest, highest = place.lower_bound, 1.0 - NEAR_SPREAD
+    lowest, highest = place.bound, 1.0 - NEAR_SPREAD
     wanted = min(max(dose, lowest), highest)
     tried = [wanted, *(float(v) for v in np.arange(max(lowest, dose - NEAR_SPREAD), highest, STEP))]
     for level in sorted(tried, key=lambda level: abs(level - wanted)):

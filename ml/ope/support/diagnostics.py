@@ -161,7 +161,7 @@ def diagnose(
     support, table = AmplitudeSupport(buffer), usable_steps(buffer)
     weights = ImportanceSampling("wis").fit(buffer)
     near = _Neighbours(table)
-    bounds = [s.random_lower_bound for s in buffer.sessions if s.random_lower_bound is not None]
+    bounds = [s.random_bound for s in buffer.sessions if s.random_bound is not None]
     result = {}
     for k, (name, policy) in enumerate(policies.items()):
         report(k / len(policies), "checking what the data cover")

@@ -16,7 +16,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.designs import DesignSettings, lay_out
+from ml.designs import DesignSettings, Hold, lay_out
 from ml.mdp import MdpSettings, step_reward
 from ml.outcomes import PREDICTED
 from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
@@ -25,7 +25,7 @@ from ml.population.virtual.patient import MECHANISMS, Patient, draw_patient
 from ml.population.virtual.sessions import Days, Sessions, new_days, simulate, visit_days
 from ml.population.virtual.traits import TRAITS, with_trait
 from ml.qoc import Margins, Qoc
-from ml.trajectories import Hold, ReplayBuffer, SessionTrajectory
+from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
 Part = Literal["A", "B", "C"]
@@ -137,7 +137,7 @@ class World:
             own = Days(days.effects[i : i + 1], days.hours[i : i + 1])
             run = self.run(row.amplitudes[None, :], own, _DATA + 4096 * seed + i, row.amplitudes.size)
             qoc = Qoc(float(run.grasp_hz[0]), int(run.rating[0]), float(run.tremor_percent[0]))
-            bound = self.settings.lower_bound if row.controller == "random" else None
+            bound = self.settings.bound if row.controller == "random" else None
             sessions.append(
                 SessionTrajectory(
                     session_id=i + 1,
@@ -147,7 +147,7 @@ class World:
                     beta=run.beta[0],
                     amplitude=run.amplitude[0],
                     qoc=qoc,
-                    random_lower_bound=bound,
+                    random_bound=bound,
                     holds=row.holds,
                     medication_h=self.medication_h(row.hour),
                 )
@@ -204,7 +204,7 @@ def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int
             sessions=RANDOM_SESSIONS,
             steps=STEPS,
             period_s=settings.period_s,
-            lower_bound=settings.lower_bound,
+            bound=settings.bound,
             ladder=design == "ladder",
             seed=seed,
         )
@@ -231,12 +231,12 @@ def world(part: Part, index: int) -> World:
     kind, trait = make_up(part)[index]
     rng = np.random.default_rng([PARTS[part], index, 0x776F])
     patient = with_trait(draw_patient(kind, rng), trait, rng)
-    lower_bound = float(rng.choice((0.3, 0.3, 0.3, 0.4)))
+    bound = float(rng.choice((0.3, 0.3, 0.3, 0.4)))
     weight = 0.0 if rng.random() < WITHOUT_END else 10.0
     key = PARTS[part] * 1000 + index
     days = new_days(key, _CALIBRATION, 100)
     full, low = (simulate(patient, 1.0, ConstantPolicy(a), days=days, key=key, first=_CALIBRATION).beta for a in (1.0, 0.3))
-    settings = MdpSettings(xi_beta=float(full.mean() + low.mean()) / 2, c2=weight, c3=weight, c4=weight, lower_bound=lower_bound)
+    settings = MdpSettings(xi_beta=float(full.mean() + low.mean()) / 2, c2=weight, c3=weight, c4=weight, lower_bound=bound)
     return World(part, index, patient, trait, settings, float(np.concatenate([full, low]).std()), key)
 
 

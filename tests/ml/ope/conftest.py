@@ -69,7 +69,7 @@ class Simulator:
                     beta=beta[0, WINDOW:],
                     amplitude=amplitude[0],
                     qoc=Qoc(float(qoc[0, 0]), int(qoc[0, 1]), float(qoc[0, 2])),
-                    random_lower_bound=0.3 if controller == "random" else None,
+                    random_bound=0.3 if controller == "random" else None,
                 )
             )
         return ReplayBuffer(self.settings, tuple(sessions), "uV", "table")

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ml.designs import Hold
 from ml.ope.behaviour import clones
 from ml.ope.doubly_robust import DoublyRobust
 from ml.ope.fqe.estimator import FqeConfig
@@ -16,7 +17,7 @@ from ml.ope.importance import ImportanceSampling, kernel_log_density
 from ml.policies.logged_range import random_bound
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.population.virtual import world
-from ml.trajectories import Hold, ReplayBuffer
+from ml.trajectories import ReplayBuffer
 
 WIDTH = 0.1
 

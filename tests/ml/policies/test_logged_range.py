@@ -23,8 +23,8 @@ def test_the_share_below_the_bound_counts_the_buffers_states(buffer):
 
 def test_the_lowest_of_several_bounds_counts_and_without_a_random_session_nothing_is_claimed(buffer):
     first, *rest = buffer.sessions
-    assert random_bound(replace(buffer, sessions=(replace(first, random_lower_bound=0.1), *rest))) == 0.1
-    unknown = replace(buffer, sessions=tuple(replace(s, controller="cdbs", random_lower_bound=None) for s in buffer.sessions))
+    assert random_bound(replace(buffer, sessions=(replace(first, random_bound=0.1), *rest))) == 0.1
+    unknown = replace(buffer, sessions=tuple(replace(s, controller="cdbs", random_bound=None) for s in buffer.sessions))
     assert share_below_bound(ConstantPolicy(0.0), unknown) is None
     assert stays_in_range(ConstantPolicy(0.0), unknown)
 

@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from ml.designs import Bound
 from ml.policies.policy import ConstantPolicy
 from ml.population import PARTICIPANTS, plan_day, random_controller_buffer, run_day, run_sessions
 
@@ -44,7 +45,7 @@ def test_an_early_buffer_holds_random_cdbs_and_few_no_dbs_sessions_in_order():
     assert buffer.transitions().actions.size == 200
     for session in buffer.sessions:
         if session.controller == "random":
-            assert session.random_lower_bound == 0.3
+            assert session.random_bound == 0.3
             assert 0.3 <= session.amplitude.min() < 0.5
             assert 0.8 < session.amplitude.max() <= 1
         assert None not in (session.qoc.grasp_hz, session.qoc.rating, session.qoc.tremor_percent)
@@ -64,10 +65,10 @@ def test_the_first_visits_of_a_buffer_do_not_depend_on_later_ones():
 
 def test_a_session_can_follow_the_amplitudes_of_a_design():
     laid_out = np.repeat([1.0, 0.55, 0.7], 10)
-    batch = run_sessions("P2", laid_out, seeds=[1, 2], steps=30, lower_bound=0.3, resolution_ma=0.1)
+    batch = run_sessions("P2", laid_out, seeds=[1, 2], steps=30, bound=Bound(0.3), resolution_ma=0.1)
     unit = 0.1 / PARTICIPANTS["P2"].cdbs_amplitude_ma
     np.testing.assert_allclose(batch.amplitude, np.tile(np.rint(laid_out / unit) * unit, (2, 1)))
-    assert (batch.controller, batch.lower_bound) == ("random", 0.3)
+    assert (batch.controller, batch.bound) == ("random", 0.3)
     for wrong in (laid_out[:20], np.full(30, 0.2), np.full(30, 1.1)):
         with pytest.raises(ValueError, match="a design needs 30 amplitudes"):
-            run_sessions("P2", wrong, seeds=[1], steps=30, lower_bound=0.3)
+            run_sessions("P2", wrong, seeds=[1], steps=30, bound=Bound(0.3))

@@ -259,9 +259,9 @@ def test_data_are_three_visits_of_logged_sessions(design):
     assert [s.controller for s in buffer.sessions if s.visit == 2] == ["cdbs", "random", "random", "cdbs", "random", "random", "no_dbs"]
     assert {s.visit for s in buffer.sessions} == {1, 2, 3}
     random = [s for s in buffer.sessions if s.controller == "random"]
-    assert all(s.amplitude.min() >= w.settings.lower_bound for s in random)
-    assert {s.random_lower_bound for s in random} == {w.settings.lower_bound}
-    assert {s.uniform_bound for s in random} == ({w.settings.lower_bound} if design == "paper" else {None})
+    assert all(s.amplitude.min() >= w.settings.bound for s in random)
+    assert {s.random_bound for s in random} == {w.settings.bound}
+    assert {s.uniform_bound for s in random} == ({w.settings.bound} if design == "paper" else {None})
     assert all(s.usable().all() and s.end_reward(w.settings) is not None for s in buffer.sessions)
 
 

@@ -20,7 +20,7 @@ WITH_CRITICS = ("ddpg", "td3_bc", "rebrac", "iql")
 def session(amplitude: list[float], lead: float | None = None) -> SessionTrajectory:
     steps = len(amplitude)
     beta = np.random.default_rng(steps).uniform(0.5, 1.5, steps)
-    return SessionTrajectory(1, 1, "random", np.ones(10), beta, np.array(amplitude), random_lower_bound=0.0, lead_amplitude=lead)
+    return SessionTrajectory(1, 1, "random", np.ones(10), beta, np.array(amplitude), random_bound=0.0, lead_amplitude=lead)
 
 
 def test_a_held_dose_is_remembered_with_each_span_s_time_constant() -> None:

@@ -37,7 +37,7 @@ def sessions(lead: float = 1.0) -> tuple[SessionTrajectory, ...]:
             beta[t] = max(level, 0.05)
         qoc = Qoc(grasp_hz=2.5 - beta.mean() / 2, rating=float(8 - round(beta.mean())), tremor_percent=40 * (1 - a.mean()))
         lower = 0.3 if controller == "random" else None
-        made.append(SessionTrajectory(k + 1, 1 + k // 5, controller, np.full(10, lead), beta, a, qoc, random_lower_bound=lower))
+        made.append(SessionTrajectory(k + 1, 1 + k // 5, controller, np.full(10, lead), beta, a, qoc, random_bound=lower))
     return tuple(made)
 
 

@@ -15,6 +15,7 @@ from pypdf import PdfReader
 from app.evaluation.ranking.decisions import Circumstances, decide
 from app.learning.policies.baselines import constant_onnx
 from app.tables.participants import MarginsVersion
+from ml.designs import Bound
 from ml.ope.flags import Flag
 from ml.ope.posterior.further_sessions import Place
 from tests.app.evaluations import judged
@@ -364,7 +365,7 @@ def test_the_fold_says_how_well_outcomes_of_a_day_to_come_are_predicted(client: 
 
 
 def test_a_serious_event_is_unsafe_without_a_posterior_and_of_a_retired_policy_too() -> None:
-    given = Circumstances(1, datetime(2026, 1, 1, tzinfo=UTC), MarginsVersion(), MarginsVersion(), None, {}, Place(0.3), None)
+    given = Circumstances(1, datetime(2026, 1, 1, tzinfo=UTC), MarginsVersion(), MarginsVersion(), None, {}, Place(Bound(0.3)), None)
     found = decide({}, {}, "dlsm", given, 7, harms=(Flag("adverse_event"),))
     assert (found.decision, found.reasons[0].code) == ("unsafe", "adverse_event")
     retired = decide({}, {}, "dlsm", given, 7, retired_reason="replaced", harms=(Flag("adverse_event"),))

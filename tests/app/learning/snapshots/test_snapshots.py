@@ -41,7 +41,7 @@ def reasons(snapshot: BufferSnapshot) -> dict[int, str]:
 def test_a_snapshot_holds_what_was_uploaded(upload: Upload, client: TestClient, db: Session) -> None:
     first, second = upload("random", steps=50), upload("cdbs", steps=70)
     snapshot, buffer = taken(db)
-    assert [(s.session_id, s.steps, s.controller, s.random_lower_bound) for s in buffer.sessions] == [
+    assert [(s.session_id, s.steps, s.controller, s.random_bound) for s in buffer.sessions] == [
         (first, 50, "random", 0.3),
         (second, 70, "cdbs", None),
     ]
@@ -226,12 +226,12 @@ def test_a_random_session_keeps_its_own_bound_whatever_the_settings_say_today(up
     client.put("/api/v1/participants/P1/settings", json={"settings": {"lower_bound": 0.5}})
     second = upload("random")
     before, buffer = taken(db)
-    assert {s.session_id: s.random_lower_bound for s in buffer.sessions} == {first: 0.3, second: 0.5}
+    assert {s.session_id: s.random_bound for s in buffer.sessions} == {first: 0.3, second: 0.5}
     client.put("/api/v1/participants/P1/settings", json={"settings": {"lower_bound": 0.1}})
-    assert {s.session_id: s.random_lower_bound for s in taken(db)[1].sessions} == {first: 0.3, second: 0.5}
+    assert {s.session_id: s.random_bound for s in taken(db)[1].sessions} == {first: 0.3, second: 0.5}
     state(client, first, lower_bound=0.2)
     after, corrected = taken(db)
-    assert {s.session_id: s.random_lower_bound for s in corrected.sessions} == {first: 0.2, second: 0.5}
+    assert {s.session_id: s.random_bound for s in corrected.sessions} == {first: 0.2, second: 0.5}
     pinned = {m.session_id: m.conditions_id for m in before.members}
     again = {m.session_id: m.conditions_id for m in after.members}
     assert pinned[first] != again[first]
@@ -242,7 +242,7 @@ def test_a_session_of_a_held_design_has_no_density_per_step(upload: Upload, clie
     held, drawn = upload("random"), upload("random")
     state(client, held, design="stratified", seed=4)
     state(client, drawn, design="paper")
-    assert {s.session_id: s.random_lower_bound for s in taken(db)[1].sessions} == {held: None, drawn: 0.3}
+    assert {s.session_id: s.random_bound for s in taken(db)[1].sessions} == {held: None, drawn: 0.3}
 
 
 def test_the_amplitude_before_a_session_stands_in_the_buffer(upload: Upload, client: TestClient, db: Session) -> None:

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.learning.snapshots.service import take_snapshot
-from app.planning.plans.designs import Bound, delivered_ma, rounded_up
+from app.planning.plans.designs import SideBound, delivered_ma, rounded_up
 from app.platform import files
 from app.study.repository import participant_by_code
 from ml.designs import LOW_AMPLITUDE, LOW_SECONDS, DrawDensity, near_density
@@ -89,7 +89,7 @@ def test_safety_comes_before_information(client: TestClient, participant_code: s
             assert low.size == 0 or low.min() * 2.0 >= 1200 - LOW_SECONDS
             (bound,) = d["bounds"]
             assert (bound["side"], bound["cdbs_ma"], bound["lowest_ma"]) == (None, 3.3, 1.2)  # 0.35 x 3.3 = 1.155, rounded up
-            assert min(delivered_ma(a, Bound(**bound)) for a in steps) >= 0.35 * 3.3
+            assert min(delivered_ma(a, SideBound(**bound)) for a in steps) >= 0.35 * 3.3
             for h in d["holds"]:
                 law = DrawDensity(d["level"], LOW_AMPLITUDE if h["start"] < 450 else 0.35)
                 assert h["log_density"] == pytest.approx(float(np.log(law.density(h["amplitude"]))))
@@ -122,7 +122,7 @@ def test_no_draw_lies_below_the_lowest_amplitude_of_the_plan(client: TestClient,
 def test_rounding_never_goes_below_the_bound() -> None:
     assert rounded_up(0.9) == 0.9
     assert rounded_up(0.901) == 1.0
-    bound = Bound(None, 3.1, rounded_up(0.3 * 3.1), rounded_up(0.6 * 3.1))
+    bound = SideBound(None, 3.1, rounded_up(0.3 * 3.1), rounded_up(0.6 * 3.1))
     assert delivered_ma(0.3, bound) == 1.0
     assert delivered_ma(1.0, bound) == 3.1
     assert delivered_ma(0.5, bound) in (1.5, 1.6)
@@ -215,7 +215,7 @@ def test_a_session_that_followed_the_plan_keeps_its_level_seed_and_densities(
     assert kept["design_parameters"] == {"level": second["level"], "holds": second["holds"]}
     (held,) = buffer_of(db).sessions
     assert [(h.start, h.steps, h.log_density) for h in held.holds] == [(h["start"], h["steps"], h["log_density"]) for h in second["holds"]]
-    assert (held.random_lower_bound, held.uniform_bound) == (0.3, None)
+    assert (held.random_bound, held.uniform_bound) == (0.3, None)
     assert (
         f"stratified, level {second['level']:.2f} of cDBS, {len(second['holds'])} held amplitudes"
         in client.get(f"/sessions/{session}").text

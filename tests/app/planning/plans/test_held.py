@@ -14,11 +14,11 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.planning.draft_form import held_rows
-from app.planning.plans.designs import Bound, Planned, delivered_ma
+from app.planning.plans.designs import Planned, SideBound, delivered_ma
 from app.planning.plans.suggested import Held
 from app.planning.wording import design_words
 from ml.deploy.bundle import open_bundle
-from ml.designs import LOW_AMPLITUDE, LOW_SECONDS, NEAR_SPREAD, near_session
+from ml.designs import LOW_AMPLITUDE, LOW_SECONDS, NEAR_SPREAD, Bound, near_session
 from ml.ope.posterior.further_sessions import Hold, Place, reachable
 from tests.app.planning.plans.test_designs import amplitudes, buffer_of, settle, upload, visit
 
@@ -60,17 +60,17 @@ def test_a_plan_holds_sessions_near_stated_amplitudes_within_the_rules_of_safety
 @pytest.mark.parametrize("lower_bound", [0.2, 1 / 3, 0.45, 0.5, 0.65])
 @pytest.mark.parametrize("cdbs_ma", [None, 0.9, 1.7, 2.3, 2.9, 3.1, 4.3])
 def test_an_amplitude_that_the_form_proposes_is_one_that_the_plan_takes(lower_bound: float, cdbs_ma: float | None) -> None:
-    place = Place(lower_bound, 300, 2.0)
+    place = Place(Bound(lower_bound), 300, 2.0)
     near = [found for dose in np.arange(0.45, 1.0, 0.05) if (found := reachable(float(dose), place)) is not None]
     assert near
     for one in near:
-        proposed = float(held_rows(None, [Held(Hold(one.level, 1, None), ())], lower_bound, cdbs_ma)[0].amplitude)
+        proposed = float(held_rows(None, [Held(Hold(one.level, 1, None), ())], Bound(lower_bound), cdbs_ma)[0].amplitude)
         assert lower_bound <= round(proposed / (cdbs_ma or 1.0), 6) < 1
         assert abs(proposed - one.level * (cdbs_ma or 1.0)) <= 0.1
 
 
 def test_a_session_near_a_low_amplitude_is_told_to_be_there_in_its_last_minutes_alone() -> None:
-    low, high = (Planned("near", level, 1, 0.3, 2.0, near_session(level, 300, 2.0, 0.3, 1, 0).decisions) for level in (0.45, 0.7))
+    low, high = (Planned("near", level, 1, 0.3, 2.0, near_session(level, 300, 2.0, Bound(0.3), 1, 0).decisions) for level in (0.45, 0.7))
     assert low.holds[0].amplitude > 0.45 + NEAR_SPREAD
     assert design_words(low).endswith("; just above 0.6 until the last 5 min")
     assert "until" not in design_words(high)
@@ -117,7 +117,7 @@ def test_milliamperes_need_a_known_cdbs_amplitude_and_fractions_wait_for_it(clie
 
 
 def test_rounding_keeps_the_minutes_above_the_low_limit_above_it() -> None:
-    bound = Bound(None, 3.2, 1.0, 2.0)
+    bound = SideBound(None, 3.2, 1.0, 2.0)
     assert delivered_ma(0.6, bound) == 2.0, "the nearest step of 0.1 mA is 1.9 mA, below 0.6 of 3.2 mA"
     assert delivered_ma(0.59, bound) == 1.9
 
@@ -156,5 +156,5 @@ def test_a_session_that_followed_it_is_kept_with_level_seed_and_density_as_the_r
     assert kept["design_parameters"] == {"level": 0.5, "holds": design["holds"]}
     (logged,) = buffer_of(db).sessions
     assert [h.log_density for h in logged.holds] == [h["log_density"] for h in design["holds"]]
-    assert (logged.controller, logged.random_lower_bound) == ("random", 0.3)
+    assert (logged.controller, logged.random_bound) == ("random", 0.3)
     assert "held near 0.50 of cDBS" in client.get(f"/sessions/{session}").text

@@ -40,7 +40,7 @@ def held_doses(slope: float, n: int = 8, controller: str = "random", steps: int 
             level = 0.5 * level + 0.5 * slope * a[max(t - 10, 0)]
             beta[t] = 5.0 + 0.3 * (k % 3) + level + noise * rng.standard_normal()
         qoc = Qoc(grasp_hz=2.0, rating=7, tremor_percent=10.0)
-        sessions.append(SessionTrajectory(k, 1 + k // 4, controller, beta[:10], beta[10:], a, qoc, random_lower_bound=0.3))
+        sessions.append(SessionTrajectory(k, 1 + k // 4, controller, beta[:10], beta[10:], a, qoc, random_bound=0.3))
     return ReplayBuffer(MdpSettings(xi_beta=5.0), tuple(sessions), "uV", "table")
 
 

@@ -34,7 +34,7 @@ def known_system(seed, n=16, steps=400, phi=(0.5, 0.2), fall=0.8, day=0.3, sessi
         beta = level - fall * dose + eta[50:]
         lower = None if i % 4 == 3 else 0.3
         kind = "cdbs" if lower is None else "random"
-        sessions.append(SessionTrajectory(i, 1 + i // 4, kind, beta[:W], beta[W:], a, random_lower_bound=lower))
+        sessions.append(SessionTrajectory(i, 1 + i // 4, kind, beta[:W], beta[W:], a, random_bound=lower))
         levels.append(level)
     return ReplayBuffer(SETTINGS, tuple(sessions), "uV", "table"), np.array(levels)
 
@@ -144,7 +144,7 @@ def walking(seed, n=14, steps=200):
             dose[k] = dose[k - 1] + 0.1 * (a[k - W] - dose[k - 1])
         beta = 3.0 + level - 1.0 * dose + 0.15 * rng.normal(size=W + steps)
         kind = "random" if lower else ("cdbs" if i % 7 == 5 else "other")
-        sessions.append(SessionTrajectory(i, 1, kind, beta[:W], beta[W:], a, random_lower_bound=lower))
+        sessions.append(SessionTrajectory(i, 1, kind, beta[:W], beta[W:], a, random_bound=lower))
     return ReplayBuffer(MdpSettings(xi_beta=2.35, c2=0.0, c3=0.0, c4=0.0), tuple(sessions), "uV", "table")
 
 
@@ -185,7 +185,7 @@ def test_a_bad_day_is_not_taken_for_a_bad_amplitude():
         for k in range(200):
             beta[W + k] -= 0.5 * a[k]
         lower = 0.3 if kind == "random" else None
-        sessions.append(SessionTrajectory(i, visit, kind, beta[:W], beta[W:], a, random_lower_bound=lower))
+        sessions.append(SessionTrajectory(i, visit, kind, beta[:W], beta[W:], a, random_bound=lower))
     buffer = ReplayBuffer(MdpSettings(xi_beta=2.0, c2=0.0, c3=0.0, c4=0.0), tuple(sessions), "uV", "table")
     found = LinearModel(LinearConfig(draws=20)).fit(buffer).evaluate({"low": ConstantPolicy(0.4), "high": ConstantPolicy(0.9)}, 200)
     fall = found["low"].predicted["mean_beta"] - found["high"].predicted["mean_beta"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from ml.designs import LOW_AMPLITUDE, NEAR_SPREAD, near_session
+from ml.designs import LOW_AMPLITUDE, NEAR_SPREAD, Bound, near_session
 from ml.mdp import MdpSettings
 from ml.ope.posterior.further_sessions import (
     Further,
@@ -95,19 +95,19 @@ def test_what_would_not_surely_save_energy_is_told_by_no_session() -> None:
 
 @pytest.mark.parametrize("dose", [0.44, 0.5, 0.6, 0.75, 0.9])
 def test_what_is_named_is_held_so_near_that_it_supports_the_policy(dose: float) -> None:
-    found = reachable(dose, Place(0.3, 300, 2.0))
+    found = reachable(dose, Place(Bound(0.3), 300, 2.0))
     assert found is not None
     assert found.level >= dose - NEAR_SPREAD
     for seed in range(50):
-        a = near_session(found.level, 300, 2.0, 0.3, seed, 0).amplitudes
+        a = near_session(found.level, 300, 2.0, Bound(0.3), seed, 0).amplitudes
         assert abs(a.mean() - dose) <= NEAR[0]
         assert abs(a[-LATE_STEPS:].mean() - dose) <= NEAR[1]
 
 
 def test_a_dose_that_no_session_may_hold_is_not_named() -> None:
-    assert reachable(0.4, Place(0.3, 300, 2.0)) is None, "of ten minutes the first five are above 0.6"
-    assert reachable(0.4, Place(0.3, 150, 2.0)) is not None, "five minutes may be low all along"
-    assert reachable(0.45, Place(0.6, 300, 2.0)) is None, "below B"
+    assert reachable(0.4, Place(Bound(0.3), 300, 2.0)) is None, "of ten minutes the first five are above 0.6"
+    assert reachable(0.4, Place(Bound(0.3), 150, 2.0)) is not None, "five minutes may be low all along"
+    assert reachable(0.45, Place(Bound(0.6), 300, 2.0)) is None, "below B"
 
 
 def test_slots_hold_what_would_tell_soonest_and_the_same_sessions_once() -> None:
@@ -120,11 +120,11 @@ def test_slots_hold_what_would_tell_soonest_and_the_same_sessions_once() -> None
 
 
 def test_exploring_holds_the_lowest_amplitude_that_a_whole_session_may_hold() -> None:
-    (found,) = worth_exploring(Place(0.3), 3)
+    (found,) = worth_exploring(Place(Bound(0.3)), 3)
     assert (found.here, found.further) == (3, None)
     for seed in range(20):
-        assert near_session(found.fraction, 300, 2.0, 0.3, seed, 0).amplitudes.min() >= LOW_AMPLITUDE
-    assert worth_exploring(Place(0.9), 3) == worth_exploring(Place(0.3), 0) == ()
+        assert near_session(found.fraction, 300, 2.0, Bound(0.3), seed, 0).amplitudes.min() >= LOW_AMPLITUDE
+    assert worth_exploring(Place(Bound(0.9)), 3) == worth_exploring(Place(Bound(0.3)), 0) == ()
 
 
 def buffer_of(*rows: tuple[int, str, int | None]) -> ReplayBuffer:

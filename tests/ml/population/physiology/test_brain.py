@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.signal import sosfilt, welch
 
+from ml.designs import Bound
 from ml.policies.policy import ProportionalPolicy
 from ml.population import PARTICIPANTS, run_session, run_sessions
 from ml.population.physiology.brain import (
@@ -154,7 +155,7 @@ def test_importing_the_cohort_loads_no_compiler():
         (lambda: run_sessions("P9", "cdbs", seeds=[1], steps=5), "no synthetic participant 'P9'"),
         (lambda: run_sessions("P1", "dbs", seeds=[1], steps=5), "no controller 'dbs'"),
         (lambda: run_sessions("P1", "cdbs", seeds=[1], steps=0), "at least one step"),
-        (lambda: run_sessions("P1", "random", seeds=[1], steps=5, lower_bound=1.0), "lower bound"),
+        (lambda: run_sessions("P1", "random", seeds=[1], steps=5, bound=Bound(1.0)), "lower bound"),
     ],
 )
 def test_impossible_sessions_are_refused_by_name(asked, message):
