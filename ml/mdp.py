@@ -96,7 +96,7 @@ def step_reward(settings: MdpSettings, beta: NDArray[Any], amplitude: NDArray[An
 
 
 def end_reward(settings: MdpSettings, qoc: Qoc) -> float | None:
-    """End-of-session reward r_end: the weighted outcomes of `ml.outcomes` (eq:end_of_session_reward).
+    """Compute the end-of-session reward r_end: the weighted outcomes of `ml.outcomes` (eq:end_of_session_reward).
 
     Returns:
         The reward, or None when a QoC with a weight above zero is missing: that masks r_end of the session, never the session.

@@ -131,7 +131,7 @@ class SessionTrajectory:
 
     @property
     def imputed(self) -> Mask:
-        """Mark which of `padded_beta` are imputed, shape [W + T]."""
+        """Imputed elements of `padded_beta` as a mask, shape [W + T]."""
         return self._fill_gaps()[1]
 
     def _fill_gaps(self) -> tuple[Floats, Mask]:
@@ -173,7 +173,7 @@ class SessionTrajectory:
 
     @property
     def stopped(self) -> bool:
-        """Whether the session ended for the participant's sake."""
+        """True where the session ended for the participant's sake."""
         return self.stopped_as is not None
 
     @property
@@ -185,7 +185,7 @@ class SessionTrajectory:
         return self.stopped_as if self.stopped_as is not None and self.controller != "cdbs" else self.qoc
 
     def end_reward(self, settings: MdpSettings) -> float | None:
-        """r_end of the QoCs that count, or None where one it needs is missing."""
+        """Compute r_end of the QoCs that count, or None where one it needs is missing."""
         return end_reward(settings, self.counted_qoc)
 
 
@@ -315,7 +315,7 @@ def to_parquet(buffer: ReplayBuffer) -> bytes:
 
 
 def from_parquet(content: bytes) -> ReplayBuffer:
-    """The inverse of `to_parquet`. Raises ValueError when the bytes are not such a buffer."""
+    """Read what `to_parquet` wrote. Raises ValueError when the bytes are not such a buffer."""
     import pyarrow.parquet as pq
 
     table = pq.ParquetFile(io.BytesIO(content)).read()

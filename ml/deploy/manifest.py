@@ -201,7 +201,7 @@ class BundleManifest:
         self._check_device_limits()
 
     def _check_kind(self) -> None:
-        """A network or a schedule runs; what is sealed is not told."""
+        """Check that a network or a schedule runs; the message does not report what is sealed."""
         if self.card is not None and self.slot is None:
             raise BundleError("a bundle without a slot has no card of a plan")
         if self.schedule is not None and (self.policy_id is not None or self.layers):

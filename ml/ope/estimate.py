@@ -70,7 +70,7 @@ class Estimate:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Estimate:
-        """The inverse of `to_json`.
+        """Read what `to_json` made.
 
         Raises:
             ValueError: another version than this betaloop knows.

@@ -70,7 +70,7 @@ class Flag:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Flag:
-        """The inverse of `to_json`."""
+        """Read what `to_json` made."""
         facts = {name: tuple(v) if isinstance(v, list) else v for name, v in stored["facts"].items()}
         plain = {name: stored[name] for name in ("value", "limit", "unit", "refuses", "source")}
         return cls(stored["code"], **plain, facts=tuple(facts.items()))

@@ -104,29 +104,30 @@ for _method in (
 
 
 def methods() -> tuple[Method, ...]:
-    """Every method in the order of the pages, the combination last."""
+    """List every method in the order of the pages, the combination last."""
     return tuple(sorted(_METHODS.values(), key=lambda m: m.family == "combination"))
 
 
 def method_keys() -> tuple[str, ...]:
-    """The keys of `methods`."""
+    """List the keys of `methods`."""
     return tuple(m.key for m in methods())
 
 
 def shown(key: str) -> Method:
-    """The record of a key for a page; a stored estimate of a method that this betaloop does not have stands under its key."""
+    """Return the record of a key for a page. A stored estimate of a method that this version does not have is named by its key."""
     unknown = Method(key=key, name=key, short=key, family="model", needs="", factory=None)
     return _METHODS.get(key, unknown)
 
 
 def preference() -> tuple[str, ...]:
-    """The usual order, in which a method is taken for a ranking where the data do not decide; docs/evaluation.md has what is behind it."""
+    """List the usual order, in which a method is taken for a ranking where the data do not decide; docs/evaluation.md has what is behind
+    it."""
     placed = [(m.preference, m.key) for m in methods() if m.preference is not None]
     return tuple(key for _, key in sorted(placed))
 
 
 def build(key: str, seed: int, size: Size) -> Estimator:
-    """The estimator of a method.
+    """Build the estimator of a method.
 
     Raises:
         ValueError: there is no such method, or it is computed from the others.
@@ -141,10 +142,10 @@ def build(key: str, seed: int, size: Size) -> Estimator:
 
 
 def estimators(seed: int = 0, *, demo: bool = False) -> dict[str, Estimator]:
-    """Every method that is fitted, at its full size or at that of a demonstration."""
+    """Build every method that is fitted, at its full size or at that of a demonstration."""
     return {m.key: build(m.key, seed, "demo" if demo else "full") for m in methods() if m.factory}
 
 
 def quick_estimators(seed: int = 0) -> dict[str, Estimator]:
-    """The methods that can be fitted once for each controller left out, at the size for that (`skill.choose_default`)."""
+    """Build the methods that can be fitted once for each held-out controller, at the size for that."""
     return {m.key: build(m.key, seed, "held_out") for m in methods() if m.held_out}

@@ -44,30 +44,31 @@ class Scale:
     outcome_seen: tuple[bool, ...]
 
     def beta(self, raw: NDArray[Any]) -> Floats:
-        """Participant's unit to standardised."""
+        """Convert the participant's unit to standardised."""
         values = np.asarray(raw, dtype=np.float64)
         if self.log:
             values = np.log(np.maximum(values, 1e-3 * self.beta_low))
         return (values - self.beta_mean) / self.beta_std
 
     def raw_beta(self, scaled: NDArray[Any]) -> Floats:
-        """Standardised to the participant's unit."""
+        """Convert standardised values to the participant's unit."""
         values = np.asarray(scaled, dtype=np.float64) * self.beta_std + self.beta_mean
         return np.exp(values) if self.log else values
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers, by name."""
+        """Return all numbers, by name."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Scale:
-        """The inverse of `to_json`."""
+        """Read what `to_json` made."""
         fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         return cls(**fields)
 
 
 def outcome_table(buffer: ReplayBuffer) -> Floats:
-    """`OUTCOMES` of every session, shape [n, K]; NaN where not measured. Where none has a weight r_end is 0 for all, measured or not."""
+    """Stack `OUTCOMES` of every session, shape [n, K]; NaN where not measured. Where none has a weight r_end is 0 for all, measured or
+    not."""
     settings = buffer.settings
     weighted = any(o.end is not None and o.end.weight(settings) for o in RECORDS)
     rows = []
@@ -78,7 +79,7 @@ def outcome_table(buffer: ReplayBuffer) -> Floats:
 
 
 def learn_scale(buffer: ReplayBuffer) -> Scale:
-    """Standardisation of a buffer. Raises ValueError when it has no usable step."""
+    """Learn the standardisation of a buffer. Raises ValueError when it has no usable step."""
     beta = np.concatenate([s.measured_beta for s in buffer.sessions])
     beta = beta[np.isfinite(beta)]
     rewards = buffer.transitions().rewards
@@ -103,7 +104,7 @@ def learn_scale(buffer: ReplayBuffer) -> Scale:
 
 
 def session_folds(sessions: Sequence[SessionTrajectory], folds: int, seed: int) -> list[list[int]]:
-    """Indices of sessions in `folds` groups, every kind of controller spread over the groups as evenly as it goes."""
+    """Split the sessions into `folds` groups of indices, every kind of controller spread over the groups as evenly as it goes."""
     order = np.random.default_rng(seed).permutation(len(sessions))
     ranked = sorted(order.tolist(), key=lambda i: sessions[i].controller)
     return [sorted(ranked[k::folds]) for k in range(min(folds, len(sessions)))]
@@ -116,5 +117,5 @@ def _skewness(values: Floats) -> float:
 
 
 def _positive(deviation: float, largest: float) -> float:
-    """A standard deviation; 1 where it is but rounding of values up to the largest."""
+    """Return a standard deviation; 1 where it is only the rounding of values up to the largest."""
     return deviation if deviation > 1e-12 * largest else 1.0

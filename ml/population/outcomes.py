@@ -1,4 +1,4 @@
-"""What is measured at the end of a session: open-fist times, the rating, tremor class per minute; and the paper's formulas over them."""
+"""Measurements at the end of a session: open-fist times, the rating, tremor class per minute; and the paper's formulas over them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TREMOR_FULL = 2.5  # assumed: severity at which tremor costs its full share of 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """End-of-session measurements of one session.
+    """Measurements at the end of one session.
 
     Attributes:
         open_fist_s: times of open fists in the 10 s test, [N], seconds from its start.
@@ -48,7 +48,7 @@ def measure(
     tremor: NDArray[np.float64],
     overload: NDArray[np.float64],
 ) -> Outcomes:
-    """End-of-session measurements of one session.
+    """Make the end-of-session measurements of one session.
 
     Args:
         participant: who. counters: the session's random streams, [STREAMS], advanced in place.
@@ -70,14 +70,14 @@ def measure(
 
 
 def tremor_minutes(tremor: NDArray[np.float64]) -> tuple[str, ...]:
-    """Class of each minute from the severity of its steps, [T]; a last part of a minute counts as one."""
+    """Classify each minute from the severity of its steps, [T]; a last part of a minute counts as one."""
     starts = range(0, tremor.size, STEPS_PER_MINUTE)
     means = [tremor[i : i + STEPS_PER_MINUTE].mean() for i in starts]
     return tuple(TREMOR_CLASSES[int(np.searchsorted(TREMOR_BOUNDS, mean, side="right"))] for mean in means)
 
 
 def minute_seconds(minutes: tuple[str, ...], steps: int) -> dict[str, float]:
-    """Seconds of a session per tremor class; `steps` says how long the last minute was."""
+    """Count the seconds of a session per tremor class; `steps` says how long the last minute was."""
     seconds: dict[str, float] = {}
     for i, name in enumerate(minutes):
         seconds[name] = seconds.get(name, 0.0) + PERIOD_S * min(STEPS_PER_MINUTE, steps - i * STEPS_PER_MINUTE)
@@ -85,7 +85,7 @@ def minute_seconds(minutes: tuple[str, ...], steps: int) -> dict[str, float]:
 
 
 def _open_fists(counters: NDArray[np.uint64], frequency_hz: float, brady: float) -> NDArray[np.float64]:
-    """Open-fist times: intervals vary around 1 / frequency and lengthen with bradykinesia as the hand tires."""
+    """Draw open-fist times: intervals vary around 1 / frequency and lengthen with bradykinesia as the hand tires."""
     first, _ = gauss_pair(counters, STREAM_OUTCOMES)
     times = [0.5 / frequency_hz * (1 + _INTERVAL_CV * min(max(first, -3.0), 3.0))]
     planned = frequency_hz * GRASP_TEST_S

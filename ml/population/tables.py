@@ -27,7 +27,7 @@ def session_table_csv(session: SimulatedSession) -> bytes:
 
 
 def strivepd_csv(session: SimulatedSession, *, started_ms: int) -> bytes:
-    """Tremor as a watch export: one row per minute, fractions of classes in alphabetical columns; one class per minute here."""
+    """Write tremor as a watch exports it: one row per minute, fractions of classes in alphabetical columns; one class per minute here."""
     lines = ["time," + ",".join(TREMOR_COLUMNS)]
     for i, name in enumerate(session.tremor_minutes):
         assert name in TREMOR_CLASSES
@@ -37,5 +37,5 @@ def strivepd_csv(session: SimulatedSession, *, started_ms: int) -> bytes:
 
 
 def grasps_csv(session: SimulatedSession) -> bytes:
-    """Open-fist times of the grasp test: one column `open_fist_s`, seconds from the start of the test."""
+    """Write open-fist times of the grasp test: one column `open_fist_s`, seconds from the start of the test."""
     return ("open_fist_s\n" + "".join(f"{t:.3f}\n" for t in session.open_fist_s)).encode()

@@ -64,7 +64,7 @@ class Outcome:
 
 
 def slot_of(manifest: Mapping[str, Any]) -> Slot:
-    """The slot of a bundle. Raises NotAllowed where it has none, as bundles that are taken without a plan."""
+    """Return the slot of a bundle. Raises NotAllowed where it has none, as bundles that are taken without a plan."""
     stored = manifest.get("slot")
     if stored is None:
         raise NotAllowed(

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 
 def error_matrix(estimates: Mapping[str, Mapping[str, Estimate]], methods: list[str], bias: Mapping[str, float] | None = None) -> Floats:
-    """Estimated mean product of the errors of two methods, averaged over policies, [M, M].
+    """Estimate the mean product of the errors of two methods, averaged over policies, [M, M].
 
     Draws of two methods count together where both were made on the same resamples of the sessions, which they name (`resampled`): the first
     ones are then the same sessions. Draws from a posterior or of an ensemble stand side by side with no others, and their chance products
@@ -47,13 +47,13 @@ def error_matrix(estimates: Mapping[str, Mapping[str, Estimate]], methods: list[
 
 
 def _same_resamples(one: Estimate, other: Estimate) -> bool:
-    """Whether the draws of two estimates were made on the same resamples of the same sessions."""
+    """Decide whether the draws of two estimates were made on the same resamples of the same sessions."""
     mine = one.details.get("resampled")
     return mine is not None and mine == other.details.get("resampled")
 
 
 def convex_weights(errors: Floats) -> Floats:
-    """Weights that minimise w^T errors w, not negative and summing to 1, [M]."""
+    """Compute the weights that minimise w^T errors w, not negative and summing to 1, [M]."""
     values, vectors = np.linalg.eigh(0.5 * (errors + errors.T))
     size = float(np.abs(values).max())
     if size == 0:
@@ -66,12 +66,12 @@ def convex_weights(errors: Floats) -> Floats:
 
 
 def common_policies(estimates: Mapping[str, Mapping[str, Estimate]], methods: list[str]) -> list[str]:
-    """Policies that every method has estimated, in the order of the first."""
+    """List the policies that every method has estimated, in the order of the first."""
     return [p for p in estimates[methods[0]] if all(p in estimates[m] for m in methods)]
 
 
 def combine(estimates: Mapping[str, Mapping[str, Estimate]], bias: Mapping[str, float] | None = None) -> dict[str, Estimate]:
-    """Combined estimate of every policy.
+    """Combine the estimates of every policy.
 
     Args:
         estimates: method -> policy -> estimate. A method takes part when it is supported for at least one policy; combinations, and

@@ -13,7 +13,8 @@ from ml.returns import FEWEST_DRAWS, Gain, gain
 
 
 def gain_over(policy: Estimate, reference: Estimate) -> Gain:
-    """Difference of two estimates of one method: over their aligned draws, in which what both share cancels, where both kept them.
+    """Compute the difference of two estimates of one method: over their aligned draws, in which what both share cancels, where both kept
+    them.
 
     The interval is widened by the method's error of differences between controllers that it had not seen, where that is known.
     """

@@ -1,4 +1,4 @@
-"""How good a set of off-policy estimates is against actual returns. Source: Gao et al. 2023, appendix on OPE metrics; Fu et al. 2021."""
+"""Metrics of off-policy estimates against actual returns. Source: Gao et al. 2023, appendix on OPE metrics; Fu et al. 2021."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Accuracy:
 
 
 def accuracy(actual: ArrayLike, estimated: ArrayLike, seed: int = 0, least_range: float = 0.0) -> Accuracy:
-    """All metrics of one method.
+    """Compute all metrics of one method.
 
     Args:
         actual: actual return of each policy, shape [P].
@@ -74,14 +74,15 @@ def accuracy(actual: ArrayLike, estimated: ArrayLike, seed: int = 0, least_range
 
 
 def spearman(x: ArrayLike, y: ArrayLike) -> float | None:
-    """Spearman's rank correlation with mean ranks for ties; None where one side has no spread."""
+    """Compute Spearman's rank correlation with mean ranks for ties; None where one side has no spread."""
     rx, ry = _centred_ranks(x), _centred_ranks(y)
     scale = float(np.sqrt(np.sum(rx**2) * np.sum(ry**2)))
     return float(np.sum(rx * ry) / scale) if scale > 0 else None
 
 
 def spearman_p(x: ArrayLike, y: ArrayLike, *, draws: int = 20_000, seed: int = 0) -> float:
-    """Two-sided permutation p-value of Spearman's rho: exact up to 8 policies, else from random permutations and the observed order."""
+    """Compute the two-sided permutation p-value of Spearman's rho: exact up to 8 policies, else from random permutations and the
+    observed order."""
     rx, ry = _centred_ranks(x), _centred_ranks(y)
     observed = abs(float(np.sum(rx * ry))) - 1e-9
     if rx.size <= EXACT_PERMUTATIONS_UP_TO:

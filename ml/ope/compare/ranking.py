@@ -31,7 +31,9 @@ class Ranked:
 
 
 def default_method(estimates: Mapping[str, Mapping[str, Estimate]]) -> str:
-    """The method that the ranking rests on: the first of the usual order that speaks about a policy as supported, else the first there is.
+    """Choose the method that the ranking rests on.
+
+    It is the first of the usual order that supports a policy, else the first there is.
 
     Raises:
         ValueError: no method has any estimate.
@@ -45,7 +47,7 @@ def default_method(estimates: Mapping[str, Mapping[str, Estimate]]) -> str:
 def rank_policies(
     estimates: Mapping[str, Mapping[str, Estimate]], method: str | None = None, draws: int = 4000, seed: int = 0
 ) -> list[Ranked]:
-    """Policies from best to worst by one method.
+    """Rank policies from best to worst by one method.
 
     Args:
         estimates: method -> policy -> estimate.
@@ -67,7 +69,7 @@ def rank_policies(
 
 
 def probability_best(estimates: Mapping[str, Estimate], draws: int = 4000, seed: int = 0) -> dict[str, float]:
-    """Probability that each policy has the highest return, summing to 1.
+    """Compute the probability that each policy has the highest return, summing to 1.
 
     Where every estimate keeps as many draws (aligned over policies, so that what is common to them cancels), those are counted; else
     independent normals of value and standard error.

@@ -1,4 +1,4 @@
-"""Which of several policies to prefer, if any, from estimates alone: by the lower bound of the gain over a reference, such as cDBS.
+"""Choice of a policy from estimates alone, if any: by the lower bound of the gain over a reference, such as cDBS.
 
 The best of several noisy estimates is the luckiest as much as the best. Two things keep luck out. Draws of one method share their
 resampled sessions over all policies, so what a good day adds to every policy cancels in a difference; and the bound, not the estimate, is
@@ -14,7 +14,7 @@ from ml.returns import Gain
 
 
 def surest(gains: Mapping[str, Gain]) -> str | None:
-    """Name of the policy with the largest lower bound of its gain over the reference; None where no bound lies above 0.
+    """Name the policy with the largest lower bound of its gain over the reference; None where no bound is above 0.
 
     Each bound stands for itself: the best of many bounds is above 0 by luck more often than one.
     """

@@ -34,7 +34,7 @@ NINETY = 1.645
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a method said of a controller that it had not seen, and what was observed."""
+    """Prediction of a method for a controller that it has not seen, and the observed return."""
 
     method: str
     controller: str
@@ -68,7 +68,7 @@ class Skill:
     pairs_in_order: float
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers, by name."""
+        """Return all numbers, by name."""
         return asdict(self)
 
 
@@ -114,7 +114,7 @@ def held_out_skill(
 
 
 def with_held_out_error(estimate: Estimate, error: float) -> Estimate:
-    """The estimate with its interval widened by what left-out controllers showed of the method's errors (`Skill.excess`).
+    """Widen an estimate's interval by what held-out controllers showed of the method's errors (`Skill.excess`).
 
     Resampled sessions see how uncertain a model's numbers are, not that the model is wrong; a controller that it has not seen shows that.
     The two are independent, so their reaches add up as the sides of a right angle, like their standard errors.
@@ -129,7 +129,7 @@ def with_held_out_error(estimate: Estimate, error: float) -> Estimate:
 
 
 def reach_with(reach: float, error: float) -> float:
-    """Half of a 90 % interval that has an independent error of standard deviation `error` besides."""
+    """Compute half of a 90 % interval that has an independent error of standard deviation `error` besides."""
     return float(np.hypot(reach, NINETY * error))
 
 
@@ -142,7 +142,7 @@ def held_out_predictions(
     seed: int,
     report: Report,
 ) -> tuple[tuple[Prediction, ...], dict[str, str]]:
-    """Predictions of every method for every controller that can be left out, and the methods that failed."""
+    """Predict every controller that can be held out by every method; return the methods that failed too."""
     groups, stand_ins, truth = controllers(buffer), clones(buffer, seed), observed(buffer, horizon, seed)
     groups, whole = _comparable(groups, truth)
     predictions: list[Prediction] = []
@@ -163,7 +163,7 @@ def held_out_predictions(
 
 
 def skills(predictions: tuple[Prediction, ...]) -> list[Skill]:
-    """Skill of every method that predicted at least two controllers."""
+    """Compute the skill of every method that predicted at least two controllers."""
     result = []
     for method in dict.fromkeys(p.method for p in predictions):
         own = [p for p in predictions if p.method == method]
@@ -210,7 +210,7 @@ def _combined(found: Mapping[str, Estimate]) -> dict[str, Estimate]:
 
 
 def _comparable(groups: Mapping[Key, list[int]], truth: Mapping[Key, Observed]) -> tuple[dict[Key, list[int]], bool]:
-    """Controllers that can be held against each other, and whether by whole returns.
+    """Find the controllers that can be compared, and whether by whole returns.
 
     A return with r_end and one without differ by r_end alone. Where enough controllers have it, the others are left out; else all are
     compared by their steps.

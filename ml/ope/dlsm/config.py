@@ -14,7 +14,7 @@ from ml.ope.registry import Size
 
 @dataclass(frozen=True, kw_only=True)
 class DlsmConfig:
-    """How a DLSM is built, trained and rolled out.
+    """Settings by which a DLSM is built, trained and rolled out.
 
     Attributes:
         latent, hidden, heads: size of z, units of both LSTMs, hidden layers of the heads.
@@ -108,17 +108,17 @@ class DlsmConfig:
 
     @classmethod
     def demo(cls, seed: int = 0) -> DlsmConfig:
-        """Small and quick: about twenty sessions of 300 steps in well under a minute of one core."""
+        """Give settings that are small and quick: about twenty sessions of 300 steps in well under a minute of one core."""
         return cls(members=2, rollouts=128, seed=seed)
 
     @classmethod
     def of_size(cls, size: Size, seed: int = 0) -> DlsmConfig:
-        """Settings at a size of `ml.ope.registry`."""
+        """Give the settings of a size of `ml.ope.registry`."""
         return cls.demo(seed) if size == "demo" else cls(seed=seed)
 
     @classmethod
     def expert(cls, size: Size = "full", seed: int = 0) -> DlsmConfig:
-        """What a job's DLSM is, with every feature."""
+        """Give the settings of a job's DLSM, with every feature."""
         return replace(
             cls.of_size(size, seed),
             residual=True,
@@ -133,7 +133,7 @@ class DlsmConfig:
 
     @classmethod
     def paper(cls, size: Size = "full", seed: int = 0) -> DlsmConfig:
-        """The plain form: theorem 5.1 as the objective, eq:encoder and eq:decoder without additions, roll-outs by the decoder alone.
+        """Give the plain form: theorem 5.1 as the objective, eq:encoder and eq:decoder without additions, roll-outs by the decoder alone.
 
         Every roll-out starts from z_0 ~ N(0, I), draws all of s_t from z_t, takes rewards from the reward head and r_end from z_T;
         training runs to its last step. Sizes and rates, of which the paper says nothing, are those of `of_size`.
@@ -155,5 +155,5 @@ class DlsmConfig:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """All settings, by name."""
+        """Return all settings, by name."""
         return asdict(self)

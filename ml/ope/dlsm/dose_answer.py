@@ -1,4 +1,4 @@
-"""Whether the members of an ensemble answer to a lasting dose as the data do.
+"""Check of whether the members of an ensemble answer to a lasting dose as the data do.
 
 In a random session the dose is drawn, so how beta moves with it within the session is an experiment; the level of the session cancels. A
 controller that follows beta gives more where beta is high, which would turn the sign: its sessions do not count.
@@ -50,22 +50,22 @@ class DoseAnswer:
 
     @property
     def told(self) -> bool:
-        """Whether it can be told from zero, and members can be asked for theirs."""
+        """True where the answer differs clearly from zero, so that members are asked for theirs."""
         if self.sessions < FEWEST_SESSIONS or not self.high > self.low:
             return False
         return abs(self.slope) > float(stdtrit(self.sessions - 1, TOLD)) * self.error
 
     def holds_against(self, slope: float) -> bool:
-        """Whether a member's answer is null, or of the other sign, where the data tell theirs."""
+        """Decide whether a member's answer is null, or of the other sign, where that of the data is known."""
         return self.told and slope / self.slope < LEAST_SHARE
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers, by name, and whether it is told."""
+        """Return all numbers, by name, and whether the answer is known."""
         return asdict(self) | {"told": self.told}
 
 
 def answer_of_data(batch: Batch) -> DoseAnswer:
-    """The answer of the random sessions of a whole buffer."""
+    """Compute the answer of the random sessions of a whole buffer."""
     usable = batch.usable.numpy() > 0
     found, doses = [], []
     for j in np.flatnonzero(batch.randomised.numpy() > 0):
@@ -85,7 +85,7 @@ def answer_of_data(batch: Batch) -> DoseAnswer:
 
 
 def answer_of_member(networks: DlsmNetworks, batch: Batch, low: float, high: float, seed: int) -> float:
-    """The same of a model: free runs of all sessions of the whole buffer at the two doses with the same noise."""
+    """Compute the same of a model: free runs of all sessions of the whole buffer at the two doses with the same noise."""
     means = []
     for dose in (low, high):
         steps = min(STEPS, batch.size[0])
@@ -102,18 +102,18 @@ def answer_of_member(networks: DlsmNetworks, batch: Batch, low: float, high: flo
 
 @dataclass(frozen=True)
 class Judged:
-    """What the data say of every member: their answer, those of the members, and which of these are to be left out."""
+    """Judgement of every member by the data: their answer, those of the members, and the members to exclude."""
 
     data: DoseAnswer
     members: tuple[float, ...]
     discarded: tuple[int, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers, by name."""
+        """Return all numbers, by name."""
         return {"data": self.data.to_json(), "members": list(self.members), "discarded": list(self.discarded)}
 
     def sentence(self) -> str:
-        """Why no member is left, with the numbers."""
+        """Explain why no member is left, with the numbers."""
         data, said = self.data, ", ".join(f"{slope:+.2f}" for slope in self.members)
         return (
             f"no two members of the DLSM answer to a lasting dose as the data do: within {data.sessions} random sessions beta changes by "
@@ -122,7 +122,7 @@ class Judged:
 
 
 def judge(networks: Sequence[DlsmNetworks], batch: Batch, seed: int) -> Judged:
-    """Hold the members against the random sessions; where those tell nothing, nobody is asked and all stay."""
+    """Compare the members with the random sessions; where those show nothing, all members stay."""
     data = answer_of_data(batch)
     if not data.told:
         return Judged(data, (), ())

@@ -158,7 +158,7 @@ class FittedDlsm:
         return "latent" if float(np.mean(residuals**2)) <= self.end.by_session.residual[0] ** 2 else "summaries"
 
     def held_out_skill(self) -> dict[str, Any]:
-        """Held-out free-running skill of the members together: 1 is perfect, 0 no better than the mean of the learnt sessions.
+        """Compute the held-out free-running skill of the members together: 1 is perfect, 0 no better than the mean of the learnt sessions.
 
         `answer_skill` is that of the differences in mean beta between controllers, of sessions that some member did not learn from; None
         where these are of one controller.
@@ -197,7 +197,7 @@ class FittedDlsm:
         }
 
     def _run(self, member: Member, policies: Mapping[str, Policy], horizon: int, k: int, *, prior: bool, report: Report) -> Rollouts:
-        """Roll-outs of one member; those of the start that is only reported beside the estimate are fewer."""
+        """Roll one member out; roll-outs from the start that is only reported next to the estimate are fewer."""
         per_policy = self.config.rollouts
         if prior != (self.config.start == "prior"):
             per_policy = max(16, per_policy // 8)
@@ -216,17 +216,17 @@ class FittedDlsm:
         )
 
     def _parts(self, run: Rollouts) -> tuple[Floats, Floats]:
-        """Step return and r_end per policy, [P] each; r_end is 0 where the buffer has none."""
+        """Compute the step return and r_end per policy, [P] each; r_end is 0 where the buffer has none."""
         step = run.return_head if self.reward_source == "head" else run.return_known
         end = self._outcomes(run)[:, :, 0] if self.scale.outcome_seen[0] else np.zeros_like(step)
         return step.mean(1), end.mean(1)
 
     def _outcomes(self, run: Rollouts) -> Floats:
-        """r_end and QoCs of the simulated sessions, [P, M, 4]."""
+        """Compute r_end and QoCs of the simulated sessions, [P, M, 4]."""
         return run.outcomes if self.end_source == "latent" else self.end.predict(run.minutes)
 
     def _uncertainty(self, values: Floats, runs: list[Rollouts], horizon: int) -> tuple[Floats, Floats]:
-        """Draws around the values, [DRAWS, P], and standard errors, [P].
+        """Draw around the values, [DRAWS, P], and standard errors, [P].
 
         Spread of the ensemble (correlated over policies), error of the level from held-out sessions and from few days (common to all
         policies), coefficients of the outcome model where it is used (correlated), Monte-Carlo error (of each policy).
@@ -244,7 +244,7 @@ class FittedDlsm:
         return draws, np.sqrt(variance)
 
     def _end_draws(self, runs: list[Rollouts]) -> Floats:
-        """Errors of r_end's differences between policies by the outcome model, [DRAWS, P]; its level is in `level_error`."""
+        """Draw the errors of r_end's differences between policies by the outcome model, [DRAWS, P]; its level is in `level_error`."""
         if self.end_source == "latent" or not self.scale.outcome_seen[0]:
             return np.zeros((DRAWS, runs[0].outcomes.shape[0]))
         drawn = fit_end_model(self.buffer, draws=DRAWS, seed=self.config.seed)
@@ -260,7 +260,7 @@ class FittedDlsm:
         return step + (self._outcomes(run)[:, :, 0] if self.scale.outcome_seen[0] else 0.0)
 
     def level_error(self) -> float:
-        """Standard error of the mean held-out residual of the return: how far the level of all estimates may be off."""
+        """Compute the standard error of the mean held-out residual of the return: how far the level of all estimates may be off."""
         name = f"residual_{self.reward_source}"
         residuals = [np.concatenate([np.asarray(getattr(c, name)) for c in self.checks])]
         total = 0.0
@@ -348,7 +348,7 @@ class FittedDlsm:
 
 
 def _warnings(skill: dict[str, Any]) -> list[Flag]:
-    """What the held-out sessions hold against the model."""
+    """List the flags that the held-out sessions raise against the model."""
     found = []
     if skill["score"] >= 1:
         found.append(Flag("no_better_than_mean", skill["score"], 1.0, "share"))
@@ -358,10 +358,10 @@ def _warnings(skill: dict[str, Any]) -> list[Flag]:
 
 
 def build(key: str, seed: int, size: Size) -> Dlsm:
-    """The estimator at a size of `ml.ope.registry`."""
+    """Build the estimator at a size of `ml.ope.registry`."""
     return Dlsm(DlsmConfig.expert(size, seed), key)
 
 
 def build_paper(key: str, seed: int, size: Size) -> Dlsm:
-    """The paper's plain form at a size of `ml.ope.registry`."""
+    """Build the paper's plain form at a size of `ml.ope.registry`."""
     return Dlsm(DlsmConfig.paper(size, seed), key)

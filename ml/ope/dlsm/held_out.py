@@ -31,7 +31,7 @@ FEWEST_BLOCKS, LEAST_DOSE = 3, 0.03
 
 @dataclass(frozen=True)
 class Constant:
-    """What a model that has learnt nothing predicts: means of the learnt sessions, standardised; outcomes [4]."""
+    """Predictions of a model that has learnt nothing: means of the learnt sessions, standardised; outcomes [4]."""
 
     beta: float
     reward: float
@@ -39,7 +39,7 @@ class Constant:
 
     @classmethod
     def of(cls, batch: Batch) -> Constant:
-        """Means of a batch."""
+        """Compute the means of a batch."""
         usable = batch.usable > 0
         mask = batch.outcome_mask
         outcomes = (batch.outcomes * mask).sum(0) / mask.sum(0).clamp(min=1)
@@ -97,13 +97,13 @@ class Shares:
 
     @property
     def score(self) -> float:
-        """What selection minimises: the mean of the parts, the reward by whichever of its two sources predicts better."""
+        """Criterion that selection minimises: the mean of the parts, the reward by whichever of its two sources predicts better."""
         parts = [self.beta, min(self.head, self.known), self.outcomes, self.contrast, self.dose]
         return float(np.mean([p for p in parts if p is not None]))
 
 
 def shares(groups: Sequence[Sequence[SessionError]], kinds: Mapping[int, object] | None = None) -> Shares:
-    """Errors of groups of sessions, each left out together and counting alike, however many it has.
+    """Average the errors of groups of sessions, each held out together; groups count alike, whatever their size.
 
     Args:
         groups: errors by group. kinds: controller of every session, for the contrast.
@@ -178,12 +178,12 @@ class FreeRuns:
     sessions: tuple[int, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers, by name."""
+        """Return all numbers, by name."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> FreeRuns:
-        """The inverse of `to_json`."""
+        """Read what `to_json` made."""
         fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         return cls(**fields | {"errors": tuple(SessionError(**e) for e in values["errors"])})
 
@@ -261,7 +261,7 @@ def _session_error(
     constant: Constant,
     contrast: bool,
 ) -> SessionError | None:
-    """Errors of the batch's j-th session; None where it has no usable step."""
+    """Compute the errors of the batch's j-th session; None where it has no usable step."""
     beta = batch.states[1:, j, -1].numpy().astype(np.float64)
     reward = batch.rewards[:, j].numpy().astype(np.float64)
     steps = int(batch.lengths[j])
@@ -296,7 +296,8 @@ def _session_error(
 
 
 def block_error(seen: Floats, predicted: Floats) -> Floats:
-    """Mean over blocks of the squared difference of block means, [C], for a trace [T] with NaN gaps and predictions of it, [C, T].
+    """Compute the mean over blocks of the squared difference of block means, [C], for a trace [T] with NaN gaps and predictions of it, [C,
+    T].
 
     A block counts when a third of it is known; where none does, all known steps are one block, and without any the result is NaN.
     """
@@ -310,7 +311,7 @@ def block_error(seen: Floats, predicted: Floats) -> Floats:
 
 
 def dose_slopes(actions: NDArray[Any], usable: NDArray[np.bool_], *betas: Floats) -> tuple[float, ...]:
-    """Sum of squares of a session's doses over blocks, and the slope of each beta [T] on them; zeros where doses hardly differ.
+    """Compute the sum of squares of a session's doses over blocks, and the slope of each beta [T] on them; zeros where doses hardly differ.
 
     The dose is the average over about 20 steps (`ml.ope.doses`); blocks as in `block_error`, of which three at least must count.
     """

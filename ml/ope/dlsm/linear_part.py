@@ -1,4 +1,4 @@
-"""What a linear model predicts of beta one step ahead, to which the heads of a DLSM add what it leaves.
+"""Linear prediction of beta one step ahead, to which the heads of a DLSM add what it leaves.
 
 The model is that of `ml.ope.linear.dynamics` (answer to the amplitude, autoregression of order W) at the mean level of the sessions it was
 fitted to: the level of a day or a session is for the latent state to find.
@@ -60,17 +60,19 @@ class LinearPart:
         return cls(fitted.phi, fitted.beta[0], level, max(noise, 1e-6), lead_doses(buffer.sessions, otherwise))
 
     def response(self, first: Floats, before: Floats) -> LinearResponse:
-        """The answer to amplitudes that come step by step, the first of them [P, 1, m], after the doses `before` them, [m]."""
+        """Begin the answer to amplitudes that come step by step, the first of them [P, 1, m], after the doses `before` them, [m]."""
         return LinearResponse(self.answer[None], after_doses(first, before))
 
     def resting(self, actions: Floats, before: Floats) -> Floats:
-        """Level and answer, to which beta returns, [W + T, B], under amplitudes [T, B]: over the window before, then at every step."""
+        """Compute the level and the answer to which beta returns, [W + T, B], under amplitudes [T, B]: over the window before, then at
+        every step."""
         response = self.response(actions[:1, None], before)
         lead = np.repeat(response.lasting()[:, 0], self.phi.size, axis=0)
         return self.level + np.concatenate([lead, *(response.step(a[None, None])[:, 0] for a in actions)])
 
     def of(self, batch: Batch) -> Batch:
-        """The whole buffer's batch with `resting`, and with what one-step predictions of beta leave of it, in units of `noise`, `left`."""
+        """Add to the whole buffer's batch `resting`, and with what one-step predictions of beta leave of it, in units of `noise`,
+        `left`."""
         rest = self.resting(batch.actions.numpy().astype(np.float64), self.before)
         beta = np.concatenate([batch.states[0].numpy().T, batch.states[1:, :, -1].numpy()]).astype(np.float64)
         windows = np.lib.stride_tricks.sliding_window_view(beta - rest, self.phi.size, axis=0)[:-1]
@@ -80,7 +82,7 @@ class LinearPart:
         return replace(batch, resting=torch.as_tensor(rest, dtype=dtype), left=torch.as_tensor(left, dtype=dtype))
 
     def run(self, lead: Floats, rest: Floats, mean: Floats, std: Floats, noise: Floats) -> Floats:
-        """Means of beta given the simulated past, [T, B], where heads say what the linear prediction leaves.
+        """Compute the means of beta given the simulated past, [T, B], where heads say what the linear prediction leaves.
 
         Args:
             lead: window before the first step, [B, W]. rest: `resting`, [W + T, B].

@@ -45,22 +45,22 @@ class LatentRecurrence(nn.Module):
         self.w_out, self.b_out = weight(hidden, 2 * latent), nn.Parameter(torch.zeros(2 * latent))
 
     def run(self, x: Tensor, z0: Tensor, eps: Tensor, fast: bool = True) -> tuple[Tensor, Tensor, Tensor]:
-        """z_1 ... z_T with means and log standard deviations, each [T, B, Z]; x is [T, B, X], z0 [B, Z], eps [T, B, Z]."""
+        """Draw z_1 ... z_T with means and log standard deviations, each [T, B, Z]; x is [T, B, X], z0 [B, Z], eps [T, B, Z]."""
         weights = LatentWeights(self.w_x, self.bias, self.a_x, self.w_z, self.w_h, self.a_z, self.w_out, self.b_out)
         return (stochastic_lstm if fast else stochastic_lstm_loop)(x, z0, eps, weights)
 
     def recurrent(self, x: Tensor, z: Tensor, fast: bool = True) -> Tensor:
-        """h_1 ... h_T along a path, [T, B, H]; z is z_0 ... z_{T-1}."""
+        """Compute h_1 ... h_T along a path, [T, B, H]; z is z_0 ... z_{T-1}."""
         return (lstm if fast else lstm_loop)(torch.cat([x, z], dim=2), torch.cat([self.w_x, self.w_z]), self.bias, self.w_h)
 
     def follow(self, x: Tensor, z: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-        """Means and log standard deviations of z_t given the z_{t-1} of another path and its `recurrent`, [T, B, Z]."""
+        """Compute the means and log standard deviations of z_t given the z_{t-1} of another path and its `recurrent`, [T, B, Z]."""
         given = torch.cat([x, z], dim=2)
         head, raw = (h @ self.w_out + self.b_out).chunk(2, dim=2)
         return given @ torch.cat([self.a_x, self.a_z]) + head, bounded(raw)
 
     def step(self, x: Tensor, z: Tensor, h: Tensor, c: Tensor, eps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One step of a roll-out: z_t, h_t, c_t."""
+        """Take one step of a roll-out: z_t, h_t, c_t."""
         gates = torch.addmm(self.bias, x, self.w_x).addmm_(z, self.w_z).addmm_(h, self.w_h)
         i, f, o = torch.sigmoid(gates[:, self.hidden :]).chunk(3, dim=1)
         c = torch.addcmul(i * torch.tanh(gates[:, : self.hidden]), f, c)
@@ -123,7 +123,7 @@ class DlsmNetworks(nn.Module):
             self.state.affine.bias.copy_(torch.tensor([0.0, unbounded(0.0)]))
 
     def noise(self, steps: int, sessions: int, generator: torch.Generator) -> Noise:
-        """Fresh draws."""
+        """Draw fresh noise."""
         dtype = self.decoder.bias.dtype
         z = self.config.latent
         first = torch.randn(sessions, z, generator=generator, dtype=dtype)
@@ -138,7 +138,7 @@ class DlsmNetworks(nn.Module):
         return torch.cat([z, actions.unsqueeze(-1)] if self.config.action_emission else [z], dim=-1)
 
     def posterior_terms(self, batch: Batch, noise: Noise, fast: bool = True) -> Terms:
-        """Theorem 1: reconstruction from samples of the encoder, decoder following the encoder's path."""
+        """Compute the terms of theorem 1: reconstruction from samples of the encoder, decoder following the encoder's path."""
         z0, kl_first, first_states = self._first(batch, noise)
         a = batch.actions.unsqueeze(-1)
         z, mean_q, log_std_q = self.encoder.run(torch.cat([a, batch.states[1:]], dim=2), z0, noise.encoder, fast)
@@ -152,7 +152,7 @@ class DlsmNetworks(nn.Module):
         return Terms(first_states + states, rewards, outcomes, kl_first, kl_path)
 
     def free_running_terms(self, batch: Batch, noise: Noise, fast: bool = True) -> Terms:
-        """Algorithm 1 to the letter: reconstruction along the decoder's own path, its actions replayed.
+        """Compute the terms of algorithm 1 to the letter: reconstruction along the decoder's own path, its actions replayed.
 
         z_0 comes from the prior or from q(z_0 | s_0) by `start`. The encoder beyond t = 0 would only see its divergence from the decoder,
         which is 0 at the optimum whatever the data: it is left out.
@@ -169,7 +169,7 @@ class DlsmNetworks(nn.Module):
         return Terms(first_states + states, rewards, outcomes, kl_first, torch.zeros_like(kl_first))
 
     def _along_posterior(self, batch: Batch, noise: Noise, z0: Tensor, fast: bool) -> Tensor:
-        """The decoder's noise, [T, B, Z], with that in the first `start` steps under which its own run is the encoder's path."""
+        """Compute the decoder's noise, [T, B, Z], with that in the first `start` steps under which its own run is the encoder's path."""
         a = batch.actions.unsqueeze(-1)
         with torch.no_grad():
             z, _, _ = self.encoder.run(torch.cat([a, batch.states[1:]], dim=2), z0, noise.encoder, fast)
@@ -178,7 +178,7 @@ class DlsmNetworks(nn.Module):
             return torch.cat([((z - mean) * torch.exp(-log_std))[: noise.start], noise.decoder[noise.start :]])
 
     def loss(self, batch: Batch, noise: Noise, fast: bool = True) -> Tensor:
-        """The training objective, negated, per living step of the batch."""
+        """Compute the training objective, negated, per living step of the batch."""
         c = self.config
         total = self.posterior_terms(batch, noise, fast).bound().sum()
         if c.objective == "sum":
@@ -186,7 +186,7 @@ class DlsmNetworks(nn.Module):
         return -total / batch.alive.sum()
 
     def _first(self, batch: Batch, noise: Noise) -> tuple[Tensor, Tensor, Tensor]:
-        """z_0 ~ q(z_0 | s_0), KL(q(z_0 | s_0) || N(0, I)) and log p(s_0 | z_0), [B, Z], [B], [B]."""
+        """Draw z_0 ~ q(z_0 | s_0); compute KL(q(z_0 | s_0) || N(0, I)) and log p(s_0 | z_0), [B, Z], [B], [B]."""
         mean, log_std = self.first(batch.states[0])
         z0 = mean + log_std.exp() * noise.first
         kl = gaussian_kl(mean, log_std, torch.zeros_like(mean), torch.zeros_like(log_std)).sum(1)
@@ -215,7 +215,7 @@ class DlsmNetworks(nn.Module):
         return terms * batch.outcome_mask
 
     def end_input(self, z: Tensor, lengths: Tensor, alive: Tensor) -> Tensor:
-        """z_T of each session, with `pooled` also the mean of z_1 ... z_T; z is [T, B, Z]."""
+        """Select z_T of each session, with `pooled` also the mean of z_1 ... z_T; z is [T, B, Z]."""
         final = z.gather(0, (lengths - 1).view(1, -1, 1).expand(1, -1, z.shape[2])).squeeze(0)
         if self.config.end_features == "final":
             return final
@@ -223,7 +223,7 @@ class DlsmNetworks(nn.Module):
         return torch.cat([final, pooled], dim=1)
 
     def replay(self, batch: Batch, draws: int, generator: torch.Generator) -> Replay:
-        """The decoder's own runs from q(z_0 | s_0) under the actions of the batch, `draws` per session."""
+        """Run the decoder from q(z_0 | s_0) under the actions of the batch, `draws` per session."""
         steps, sessions = batch.size
         wide = [batch.actions.repeat(1, draws), batch.alive.repeat(1, draws)]
         noise = self.noise(steps, sessions * draws, generator)
@@ -255,7 +255,7 @@ class DlsmNetworks(nn.Module):
         return batch.left
 
     def _with_linear(self, batch: Batch, draws: int, mean: Tensor, log_std: Tensor, generator: torch.Generator) -> Tensor:
-        """Means of beta given the simulated past, [T, draws B, 1], from what the heads say of its linear prediction."""
+        """Compute the means of beta given the simulated past, [T, draws B, 1], from what the heads say of its linear prediction."""
         if self.linear is None or batch.resting is None:
             raise ValueError("free runs of a residual model need the batch of its own linear part")
         drawn = torch.randn(mean.shape[:2], generator=generator, dtype=mean.dtype)

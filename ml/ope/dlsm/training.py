@@ -106,7 +106,7 @@ class MemberTraining:
         return Member(self.networks, self.best, tuple(self.course))
 
     def advance(self) -> None:
-        """One gradient step over a batch of sessions."""
+        """Take one gradient step over a batch of sessions."""
         c = self.config
         chosen = self.learnt
         if len(chosen) > c.batch:

@@ -45,7 +45,7 @@ FEWEST_WEIGHT = 1e-3
 
 
 def dose(shape: str, a: Floats) -> Floats:
-    """f(a) of a dose shape for amplitude fractions a; 0 at 0 and 1 at 1."""
+    """Compute f(a) of a dose shape for amplitude fractions a; 0 at 0 and 1 at 1."""
     if shape == "line":
         return a
     if shape == "hill":
@@ -60,7 +60,7 @@ def dose(shape: str, a: Floats) -> Floats:
 
 @cache
 def prior_root(alpha: float) -> Floats:
-    """R [STRETCHES, STRETCHES + 1] with g = R u, u independent of one variance, where g has the stable-spline prior at `alpha`.
+    """Compute R [STRETCHES, STRETCHES + 1] with g = R u, u independent of one variance, where g has the stable-spline prior at `alpha`.
 
     Columns of the design are means of f over a stretch of lags, so that a coefficient is the sum of the impulse response over the
     stretch. R R^T is scaled so that the prior variance of the sustained answer, the sum of g, is 1. The last u is the immediate answer's
@@ -89,19 +89,19 @@ class LaggedMeans:
         self._now = MEMORY
 
     def sums(self, value: Floats) -> Floats:
-        """Sums of the signal up to every edge, [STRETCHES + 1, ...], with the newest value [...] at lag 0."""
+        """Sum the signal up to every edge, [STRETCHES + 1, ...], with the newest value [...] at lag 0."""
         self._now += 1
         self._sums[self._now] = self._sums[self._now - 1] + value
         return np.asarray(self._sums[self._now - np.array(EDGES)], dtype=np.float64)
 
     def step(self, value: Floats) -> Floats:
-        """Means [..., STRETCHES] with the newest value [...] at lag 0."""
+        """Compute means [..., STRETCHES] with the newest value [...] at lag 0."""
         sums = np.moveaxis(self.sums(value), 0, -1)
         return np.asarray((sums[..., :-1] - sums[..., 1:]) / np.diff(EDGES), dtype=np.float64)
 
 
 def lagged_means(signal: Floats, before: float | None = None) -> Floats:
-    """`LaggedMeans` of a whole signal [T] after the value `before` it (its first one where that is None), [T, STRETCHES]."""
+    """Compute `LaggedMeans` of a whole signal [T] after the value `before` it (its first one where that is None), [T, STRETCHES]."""
     first = signal[0] if before is None else before
     sums = np.concatenate([np.zeros(1), np.cumsum(np.concatenate([np.full(MEMORY, first), signal]))])
     now = MEMORY + 1 + np.arange(signal.size)
@@ -122,7 +122,8 @@ class ResponseTable:
 
     @classmethod
     def of(cls, session: SessionTrajectory, scale: Scale, otherwise: float | None = None) -> ResponseTable:
-        """Tables of a session after the dose before it, which is `otherwise` where no record says it (`ml.ope.doses.lead_dose`)."""
+        """Build the tables of a session after the dose before it, which is `otherwise` where no record says it
+        (`ml.ope.doses.lead_dose`)."""
         a, window, before = held_amplitude(session), session.lead_beta.size, lead_dose(session, otherwise)
         first = a[0] if before is None else before
         means = {shape: lagged_means(dose(shape, np.concatenate([np.full(window, first), a]))) for shape in SHAPES}
@@ -171,12 +172,12 @@ class ImpulseDynamics:
         return np.asarray(self.gains.sum(1), dtype=np.float64)
 
     def rest(self, table: ResponseTable) -> Floats:
-        """The part of beta that answers to the amplitude, [D, W + T]."""
+        """Compute the part of beta that answers to the amplitude, [D, W + T]."""
         every = np.stack([table.means[shape] for shape in SHAPES])[self.shapes]
         return np.einsum("dtk,dk->dt", every, self.gains)
 
     def innovations(self, tables: Sequence[ResponseTable]) -> list[Floats]:
-        """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
+        """Compute standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
         found = []
         for i, table in enumerate(tables):
             eta = table.beta - self.rest(table) - self.levels[:, i : i + 1]
@@ -184,12 +185,13 @@ class ImpulseDynamics:
         return found
 
     def usual_lead(self) -> Floats:
-        """Standardised beta of each session under the mean of the random amplitudes, [n]: where the window before it is not known."""
+        """Compute standardised beta of each session under the mean of the random amplitudes, [n]: where the window before it is not
+        known."""
         answer = [float(dose(SHAPES[s], np.array([0.65]))[0]) * g for s, g in zip(self.shapes, self.sustained, strict=True)]
         return np.asarray((self.levels + np.array(answer)[:, None]).mean(0), dtype=np.float64)
 
     def response(self, first: Floats, steps: int) -> Response:
-        """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
+        """Begin the answer to amplitudes that come step by step, the first of them [P, D, n]."""
         return Response(self, after_doses(first, self.before), steps)
 
 
@@ -223,7 +225,7 @@ class Response:
 def fit_impulse(
     buffer: ReplayBuffer, tables: Sequence[ResponseTable], draws: int, seed: int, otherwise: float | None = None
 ) -> ImpulseDynamics:
-    """`draws` sets of coefficients from the posterior over shapes, time scales and coefficients.
+    """Draw sets of coefficients (`draws`) from the posterior over shapes, time scales and coefficients.
 
     Args:
         otherwise: the dose before sessions of which no record says it, as the tables were made with.
@@ -268,12 +270,12 @@ def _weighed(
 
 
 def response_sums(tables: Sequence[ResponseTable], visit: Indices, phi: Floats, shape: str) -> SessionSums:
-    """Sums of every session over rows filtered by phi; columns: 1, means over stretches of lags."""
+    """Collect the sums of every session over rows filtered by phi; columns: 1, means over stretches of lags."""
     return level_sums([t.beta for t in tables], [t.means[shape] for t in tables], [t.usable for t in tables], visit, phi)
 
 
 def moved(sums: SessionSums, alpha: float) -> SessionSums:
-    """Sums for the columns (1, u), of which `prior_root` makes the impulse response."""
+    """Convert sums to the columns (1, u), of which `prior_root` makes the impulse response."""
     root = prior_root(alpha)
     change = np.zeros((1 + STRETCHES, 1 + root.shape[1]))
     change[0, 0], change[1:, 1:] = 1.0, root
@@ -285,14 +287,14 @@ RESPONSE_MODEL = MixedModel(STRETCHES + 2, {"response": range(1, 2 + STRETCHES)}
 
 
 def _split(coefficients: Floats, visit: Indices, alpha: float) -> tuple[Floats, Floats]:
-    """Gains [D, STRETCHES] and levels [D, n] from coefficients [D, p]."""
+    """Compute gains [D, STRETCHES] and levels [D, n] from coefficients [D, p]."""
     root = prior_root(alpha)
     answers, levels = split_coefficients(coefficients, visit, root.shape[1])
     return answers @ root.T, levels
 
 
 def _residuals(tables: Sequence[ResponseTable], chosen: Combination, visit: Indices) -> list[Floats]:
-    """eta [W + T] of every session at the posterior mean of a combination."""
+    """Compute eta [W + T] of every session at the posterior mean of a combination."""
     gains, levels = _split(chosen.fit.coefficients[None], visit, chosen.alpha)
     return [table.beta - table.means[chosen.shape] @ gains[0] - levels[0, i] for i, table in enumerate(tables)]
 
@@ -300,7 +302,7 @@ def _residuals(tables: Sequence[ResponseTable], chosen: Combination, visit: Indi
 def _drawn(
     combinations: Sequence[Combination], visit: Indices, phi: Floats, noise: Floats, before: Floats, draws: int, seed: int
 ) -> ImpulseDynamics:
-    """Draws shared out over the combinations by their evidence (largest remainders, so that a rare one is not a matter of luck)."""
+    """Share the draws out over the combinations by their evidence (largest remainders, so that a rare one is not a matter of luck)."""
     live = [c for c in combinations if c.weight >= FEWEST_WEIGHT]
     shares = np.array([c.weight for c in live]) / sum(c.weight for c in live) * draws
     counts = np.floor(shares).astype(int)

@@ -41,5 +41,5 @@ class ImpulseModel:
 
 
 def build(key: str, seed: int, size: Size) -> ImpulseModel:
-    """The factory of the registry."""
+    """Build the estimator, as the registry asks for it."""
     return ImpulseModel(LinearConfig(seed=seed, draws=20) if size == "held_out" else LinearConfig(seed=seed))

@@ -39,7 +39,7 @@ ANSWERS = 7
 
 
 def answers(a: Floats, memory: Floats) -> Floats:
-    """What beta answers to, [N, 7]: the dose (average over about 20 steps), three differences in timing from it, three curvatures.
+    """Compute what beta answers to, [N, 7]: the dose (average over about 20 steps), three differences in timing from it, three curvatures.
 
     Args:
         a: amplitude, [N]. memory: memories of amplitudes with a in them, [N, 3]; `ml.ope.doses.DECAYS`.
@@ -48,14 +48,14 @@ def answers(a: Floats, memory: Floats) -> Floats:
 
 
 def _answers(a: Floats, memory: Floats) -> list[Floats]:
-    """`answers` one by one, of any shape [...], for memories [3, ...]."""
+    """Compute `answers` one by one, of any shape [...], for memories [3, ...]."""
     fast, dose, slow = memory
     saturating = 4 * (dose / (dose + SATURATION) - dose / (1 + SATURATION))
     return [dose, a - dose, fast - dose, slow - dose, 4 * (dose**2 - dose), 4 * (a**2 - a), saturating]
 
 
 def noise_features(a: Floats, predicted: Floats) -> Floats:
-    """Regressors of the log scale of an innovation, [..., 3], for amplitudes and predicted beta of one shape."""
+    """Compute regressors of the log scale of an innovation, [..., 3], for amplitudes and predicted beta of one shape."""
     return np.stack([np.ones_like(a), a, np.clip(predicted, -NOISE_LIMIT, NOISE_LIMIT)], axis=-1)
 
 
@@ -70,7 +70,8 @@ class SessionTable:
 
     @classmethod
     def of(cls, session: SessionTrajectory, scale: Scale, otherwise: float | None = None) -> SessionTable:
-        """Tables of a session after the dose before it, which is `otherwise` where no record says it (`ml.ope.doses.lead_dose`)."""
+        """Build the tables of a session after the dose before it, which is `otherwise` where no record says it
+        (`ml.ope.doses.lead_dose`)."""
         a, before = held_amplitude(session), lead_dose(session, otherwise)
         own = answers(a, memories(a, before))
         first = a[:1] if before is None else np.array([before])
@@ -102,7 +103,7 @@ class Dynamics:
     ratios: Floats = field(default_factory=lambda: np.ones(4))
 
     def innovations(self, tables: Sequence[SessionTable]) -> list[Floats]:
-        """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
+        """Compute standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
         found = []
         for i, table in enumerate(tables):
             eta = table.beta - self.beta @ table.answers.T - self.levels[:, i : i + 1]
@@ -110,11 +111,12 @@ class Dynamics:
         return found
 
     def response(self, first: Floats, steps: int) -> LinearResponse:
-        """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
+        """Begin the answer to amplitudes that come step by step, the first of them [P, D, n]."""
         return LinearResponse(self.beta, after_doses(first, self.before))
 
     def usual_lead(self) -> Floats:
-        """Standardised beta of each session under the mean of the random amplitudes, [n]: where the window before it is not known."""
+        """Compute standardised beta of each session under the mean of the random amplitudes, [n]: where the window before it is not
+        known."""
         return np.asarray(self.levels[0] + self.beta[0, 0] * 0.65, dtype=np.float64)
 
 
@@ -146,7 +148,7 @@ class LinearResponse:
 def fit_dynamics(
     buffer: ReplayBuffer, tables: Sequence[SessionTable], draws: int, seed: int, otherwise: float | None = None
 ) -> tuple[Dynamics, Dynamics]:
-    """The model at its posterior mean (D = 1), and `draws` of its coefficients from their posterior (phi and noise as in the first).
+    """Fit the model: at its posterior mean (D = 1), and `draws` of its coefficients from their posterior (phi and noise as in the first).
 
     Args:
         otherwise: the dose before sessions of which no record says it, as the tables were made with.
@@ -172,7 +174,8 @@ def fit_dynamics(
 
 
 def innovations_of(eta: Floats, beta: Floats, amplitude: Floats, usable: NDArray[np.bool_], phi: Floats, noise_weights: Floats) -> Floats:
-    """Standardised innovations [D, T] of one session from what levels and answers leave of it, eta [D, W + T]; NaN where not usable."""
+    """Compute standardised innovations [D, T] of one session from what levels and answers leave of it, eta [D, W + T]; NaN where not
+    usable."""
     windows = np.lib.stride_tricks.sliding_window_view(eta, phi.size, axis=1)[:, :-1]
     innovation = eta[:, phi.size :] - windows @ phi[::-1]
     predicted = beta[phi.size :] - innovation
@@ -181,18 +184,18 @@ def innovations_of(eta: Floats, beta: Floats, amplitude: Floats, usable: NDArray
 
 
 def visit_numbers(buffer: ReplayBuffer) -> Indices:
-    """Number of each session's visit among those of the buffer, [n], from 0."""
+    """Assign a number to each session's visit among those of the buffer, [n], from 0."""
     return np.unique([s.visit for s in buffer.sessions], return_inverse=True)[1].astype(np.int64)
 
 
 def split_coefficients(coefficients: Floats, visit: Indices, width: int) -> tuple[Floats, Floats]:
-    """Answers [D, width] and levels [D, n] from coefficients [D, p] of columns (1, answers), visits and sessions."""
+    """Split answers [D, width] and levels [D, n] from coefficients [D, p] of columns (1, answers), visits and sessions."""
     visits, sessions = coefficients[:, 1 + width : -visit.size], coefficients[:, -visit.size :]
     return coefficients[:, 1 : 1 + width], coefficients[:, :1] + visits[:, visit] + sessions
 
 
 def largest_root(phi: Floats) -> float:
-    """Largest modulus of a root of the autoregression; 0 where there is none."""
+    """Compute the largest modulus of a root of the autoregression; 0 where there is none."""
     roots = np.roots(np.concatenate([[1.0], -phi]))
     return float(np.abs(roots).max()) if roots.size else 0.0
 
@@ -200,7 +203,7 @@ def largest_root(phi: Floats) -> float:
 def level_sums(
     betas: Sequence[Floats], answers: Sequence[Floats], usable: Sequence[NDArray[np.bool_]], visit: Indices, phi: Floats
 ) -> SessionSums:
-    """Sums over the usable rows of every session, filtered by phi: beta [W + T] on (1, answers [W + T, k])."""
+    """Collect sums over the usable rows of every session, filtered by phi: beta [W + T] on (1, answers [W + T, k])."""
     rest, joint = 1 - float(phi.sum()), []
     for beta, answer, steps in zip(betas, answers, usable, strict=True):
         rows = filtered(np.concatenate([answer, beta[:, None]], axis=1), phi)[steps]
@@ -214,23 +217,23 @@ LINEAR_MODEL = MixedModel(1 + ANSWERS, {"timing": (2, 3, 4), "shape": (5, 6, 7)}
 
 
 def linear_sums(tables: Sequence[SessionTable], visit: Indices, phi: Floats) -> SessionSums:
-    """Sums of every session for `LINEAR_MODEL`."""
+    """Collect the sums of every session for `LINEAR_MODEL`."""
     return level_sums([t.beta for t in tables], [t.answers for t in tables], [t.usable for t in tables], visit, phi)
 
 
 def _split(coefficients: Floats, visit: Indices) -> tuple[Floats, Floats]:
-    """Answers [D, 7] and levels [D, n] from coefficients [D, p]."""
+    """Compute answers [D, 7] and levels [D, n] from coefficients [D, p]."""
     return split_coefficients(coefficients, visit, ANSWERS)
 
 
 def filtered(values: Floats, phi: Floats) -> Floats:
-    """v_t - sum over l of phi_l v_{t-l}, [T, k], from values [W + T, k]; NaN where one of them is."""
+    """Compute v_t - sum over l of phi_l v_{t-l}, [T, k], from values [W + T, k]; NaN where one of them is."""
     windows = np.lib.stride_tricks.sliding_window_view(values, phi.size, axis=0)[:-1]
     return np.asarray(values[phi.size :] - windows @ phi[::-1], dtype=np.float64)
 
 
 def autoregression(residuals: Sequence[Floats], usable: Sequence[NDArray[np.bool_]], window: int) -> Floats:
-    """phi [W] by least squares on what levels and answers leave of each session, [W + T], its roots kept inside `LARGEST_ROOT`."""
+    """Fit phi [W] by least squares on what levels and answers leave of each session, [W + T], its roots kept inside `LARGEST_ROOT`."""
     gram, moment = 1.0 * np.eye(window), np.zeros(window)
     for eta, steps in zip(residuals, usable, strict=True):
         x = np.lib.stride_tricks.sliding_window_view(eta, window)[:-1][steps]
@@ -244,7 +247,7 @@ def autoregression(residuals: Sequence[Floats], usable: Sequence[NDArray[np.bool
 def log_noise_weights(
     residuals: Sequence[Floats], betas: Sequence[Floats], amplitudes: Sequence[Floats], usable: Sequence[NDArray[np.bool_]], phi: Floats
 ) -> Floats:
-    """Weights of the log scale of innovations, [3], from what levels and answers leave of each session, [W + T]."""
+    """Fit the weights of the log scale of innovations, [3], from what levels and answers leave of each session, [W + T]."""
     designs, logs = [], []
     for eta, beta, amplitude, steps in zip(residuals, betas, amplitudes, usable, strict=True):
         innovation = filtered(eta[:, None], phi)[steps, 0]

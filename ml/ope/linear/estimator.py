@@ -69,13 +69,13 @@ class Replayable(Protocol):
     @property
     def shares(self) -> dict[str, float]: ...
     def innovations(self, tables: Sequence[Any]) -> list[Floats]:
-        """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
+        """Compute standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
 
     def response(self, first: Floats, steps: int) -> Response:
-        """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
+        """Begin the answer to amplitudes that come step by step, the first of them [P, D, n]."""
 
     def usual_lead(self) -> Floats:
-        """Standardised beta of each session, [n], where the window before it is not known."""
+        """Compute standardised beta of each session, [n], where the window before it is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,7 +178,8 @@ class FittedLinear:
         return {n: self._estimate(i, p, main, spread, days, support, horizon, measured) for i, (n, p) in enumerate(policies.items())}
 
     def replay(self, policies: list[Policy], dynamics: Replayable, end: EndModel, horizon: int) -> Replayed:
-        """Every session under every policy with every set of coefficients, and with as many draws of the outcomes where `end` has any."""
+        """Run every session under every policy with every set of coefficients, and with as many draws of the outcomes where `end` has
+        any."""
         start, noise = self.beginning(dynamics, horizon)
         logged = of_buffer(self.buffer)
         was = Minutes(logged.features[None], logged.share[None], logged.late[None])
@@ -188,14 +189,14 @@ class FittedLinear:
         return Replayed(**{f.name: np.stack([getattr(one, f.name) for one in each]) for f in fields(Replayed)})
 
     def beginning(self, dynamics: Replayable, horizon: int) -> tuple[Floats, Floats]:
-        """Windows before the first step, standardised, [W, D, n], and standardised innovations of the steps, [H, D, n]."""
+        """Compute the windows before the first step, standardised, [W, D, n], and standardised innovations of the steps, [H, D, n]."""
         w, levels = self.buffer.settings.window, dynamics.levels
         lead = np.stack([t.beta[:w] for t in self.tables])
         lead = np.where(np.isfinite(lead), lead, dynamics.usual_lead()[:, None])
         return np.broadcast_to(lead.T[:, None], (w, *levels.shape)), self._innovations(dynamics, horizon)
 
     def steps(self, policy: Policy, dynamics: Replayable, start: Floats, noise: Floats) -> tuple[Floats, Floats]:
-        """Beta in the buffer's unit and amplitudes under a policy, [H, D, n] each, from a `beginning`."""
+        """Compute beta in the buffer's unit and amplitudes under a policy, [H, D, n] each, from a `beginning`."""
         (w, *shape), horizon, phi = start.shape, len(noise), dynamics.phi[::-1]
         low, high = self.scale.beta(np.array([self.scale.beta_low, self.scale.beta_high]))
         low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
@@ -215,7 +216,7 @@ class FittedLinear:
         return raw[w:], actions
 
     def _as_measured(self, policies: list[Policy], horizon: int) -> Floats | None:
-        """r_end [P, n] if sessions that were stopped counted as measured; None where none was."""
+        """Compute r_end [P, n] if sessions that were stopped counted as measured; None where none was."""
         if not any(s.stopped for s in self.buffer.sessions):
             return None
         buffer = replace(self.buffer, sessions=tuple(replace(s, stopped_as=None) for s in self.buffer.sessions))
@@ -223,7 +224,7 @@ class FittedLinear:
         return other.replay(policies, self.main, other.end, horizon).outcomes[:, :, :, 0].mean(1)
 
     def _innovations(self, dynamics: Replayable, horizon: int) -> Floats:
-        """Standardised innovations of every session over the horizon, [H, D, n].
+        """Draw standardised innovations of every session over the horizon, [H, D, n].
 
         Steps that a session lacks take a known one of the same session, or of any session where it has none.
         """
@@ -239,7 +240,7 @@ class FittedLinear:
         return noise
 
     def _replayed(self, betas: Floats, actions: Floats, end: EndModel, seen: Floats) -> Replayed:
-        """What counts of one policy's sessions, [D, n] and so on, from beta and amplitudes [H, D, n]."""
+        """Summarise one policy's sessions, [D, n] and so on, from beta and amplitudes [H, D, n]."""
         settings, late = self.buffer.settings, actions[-LATE_STEPS:]
         returns = np.tensordot(settings.gamma ** np.arange(len(betas)), step_reward(settings, betas, actions), 1)
         of = end.each if end.draws else end.predict
@@ -333,5 +334,5 @@ class FittedLinear:
 
 
 def build(key: str, seed: int, size: Size) -> LinearModel:
-    """The estimator at a size of `ml.ope.registry`."""
+    """Build the estimator at a size of `ml.ope.registry`."""
     return LinearModel(LinearConfig(seed=seed, draws=20) if size == "held_out" else LinearConfig(seed=seed), key)

@@ -1,4 +1,4 @@
-"""How well the linear model's free runs meet sessions that it has not learnt from: shown beside its estimates, no choice rests on it."""
+"""Skill of the linear model's free runs on sessions that it has not learnt from. It is shown next to the estimates and decides nothing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ BLOCK = 30
 def replay_skill(
     buffer: ReplayBuffer, tables: Sequence[SessionTable], folds: Sequence[Sequence[int]], before: float | None = None
 ) -> float | None:
-    """1 - error / error of the learnt sessions' mean beta, over block means of left-out sessions run freely under their own amplitudes.
+    """Compute 1 - error / error of the learnt sessions' mean beta, over block means of left-out sessions run freely under their own
+    amplitudes.
 
     A left-out session runs from its own s_0 at the level of its visit's other sessions. None where no session could be left out.
 
@@ -48,7 +49,7 @@ def replay_skill(
 
 
 def mean_path(model: Dynamics, table: SessionTable, level: float) -> Floats:
-    """Mean of standardised beta, [T], from a session's first window under its logged amplitudes at a level."""
+    """Compute the mean of standardised beta, [T], from a session's first window under its logged amplitudes at a level."""
     rest = table.answers @ model.beta[0] + level
     window = model.phi.size
     eta = np.concatenate([table.beta[:window] - rest[:window], np.zeros(table.usable.size)])

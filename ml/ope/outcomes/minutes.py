@@ -115,7 +115,7 @@ def with_shares(features: Floats, counts: Floats) -> Minutes:
 
 
 def of_buffer(buffer: ReplayBuffer) -> Minutes:
-    """All sessions of a buffer, [n, M, ...]; shorter ones have minutes of share 0 at their beginning."""
+    """Stack all sessions of a buffer, [n, M, ...]; shorter ones have minutes of share 0 at their beginning."""
     longest = max(s.steps for s in buffer.sessions)
     beta, amplitude = (np.full((len(buffer.sessions), longest), np.nan) for _ in range(2))
     for i, session in enumerate(buffer.sessions):

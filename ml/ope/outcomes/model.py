@@ -33,7 +33,7 @@ RANGES = {COLUMN[o.key]: o.limits for o, _ in PREDICTED}
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What is said of sessions that are left out; columns are `OUTCOMES`.
+    """Predictions of held-out sessions; columns are `OUTCOMES`.
 
     Attributes:
         predicted: [n, 4]; NaN where there is none.
@@ -78,7 +78,8 @@ class EndModel:
     day_share: Floats
 
     def predict(self, minutes: Minutes, own: Sessions | None = None) -> Floats:
-        """Posterior mean [..., K] of sessions of any leading shape on a new day; with `own` their last axis is those sessions."""
+        """Compute the posterior mean [..., K] of sessions of any leading shape on a new day; with `own` their last axis is those
+        sessions."""
         burden = burden_of(minutes, self.centre, self.spread)
         result = self._unseen(minutes.share.shape[:-1])
         leading: Floats | None = None
@@ -91,7 +92,7 @@ class EndModel:
         return self.joined(result)
 
     def each(self, minutes: Minutes, own: Sessions | None = None) -> Floats:
-        """The same by every draw: sessions [..., D, n] (the d-th by draw d) or [..., 1, n] (all by all); [..., D, n, K].
+        """Compute the same by every draw: sessions [..., D, n] (the d-th by draw d) or [..., 1, n] (all by all); [..., D, n, K].
 
         Raises:
             ValueError: the model has no draws, or the sessions are those of another number of them.
@@ -112,7 +113,7 @@ class EndModel:
         return self.joined(result)
 
     def carried(self, predicted: Floats, known: Floats, seen: Floats) -> Floats:
-        """Outcomes [..., n, K] of sessions under another policy, where what each session had of its own stays with it.
+        """Predict outcomes [..., n, K] of sessions under another policy, where what each session had of its own stays with it.
 
         A share y that was s on average becomes y p / s where p < s and y + (1 - y)(p - s) / (1 - s) where p > s: what is left on
         average is p, the range is kept, and p = s gives back y. (Of a yes or no this is the same uniform number held against s and p.)
@@ -132,17 +133,18 @@ class EndModel:
         return self.joined(result)
 
     def part(self, first: int, number: int) -> EndModel:
-        """The same model with some of its draws; with none of them for `number` 0."""
+        """Return the same model with some of its draws; with none of them for `number` 0."""
         chosen = {name: replace(r, drawn=r.drawn[first : first + number]) for name, r in self.regressions.items()}
         return replace(self, regressions=chosen, draws=number)
 
     def joined(self, outcomes: Floats) -> Floats:
-        """The outcomes with r_end made of them."""
+        """Append r_end, made of the outcomes, to them."""
         outcomes[..., 0] = outcomes[..., 1:] @ self.constants if self.seen[0] else self.unseen[0]
         return outcomes
 
     def predictability(self) -> dict[str, dict[str, float | None]]:
-        """Errors and skill of left-out sessions and visits, JSON-able, by outcome: those that are predicted, r_end where a QoC counts."""
+        """Summarise errors and skill of held-out sessions and visits, JSON-able, by outcome: those that are predicted, r_end where a QoC
+        counts."""
         return {
             name: {
                 "session_error": _rounded(self.by_session.residual[j]),
@@ -160,7 +162,7 @@ class EndModel:
         return {outcome: r.shape_evidence for outcome, r in self.regressions.items()}
 
     def ordered(self) -> list[tuple[Outcome, Regression]]:
-        """The regressions in the order in which they are predicted."""
+        """List the regressions in the order in which they are predicted."""
         return [(outcome, self.regressions[outcome]) for outcome in ORDER if outcome in self.regressions]
 
     def _unseen(self, shape: tuple[int, ...]) -> Floats:
@@ -238,7 +240,7 @@ def _filled(values: Floats) -> Floats:
 
 
 def _put(values: Floats, r: Regression) -> Floats:
-    """Values of all sessions, [n], with what a regression says of left-out visits, where it says something."""
+    """Return the values of all sessions, [n], with the predictions of held-out visits where there are any."""
     result, said = values.copy(), r.left_out["visit"]
     result[r.sessions] = np.where(np.isfinite(said), said, values[r.sessions])
     return result

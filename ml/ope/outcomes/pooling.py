@@ -39,7 +39,7 @@ ROUNDS, TOLERANCE = 500, 1e-10
 
 @dataclass(frozen=True)
 class Proof:
-    """What a prior from the others is worth to every participant in turn.
+    """Worth of a prior from the others, for every participant in turn.
 
     Attributes:
         gains: log predictive density of each participant's whole data under the prior learnt from the others, less that under the flat
@@ -65,13 +65,13 @@ class Proof:
 
     @property
     def holds(self) -> bool:
-        """Whether at least `FEWEST` participants gain, in the mean by more than one standard error above 0."""
+        """True where at least `FEWEST` participants gain, in the mean by more than one standard error above 0."""
         if self.participants < FEWEST:
             return False
         return bool(self.gains.mean() > self.gains.std(ddof=1) / np.sqrt(self.gains.size))
 
     def to_json(self) -> dict[str, Any]:
-        """`participants`, the `fewest` that are needed, `gain`, `standard_error` (nats), and whether the prior is `used`."""
+        """Return `participants`, the `fewest` that are needed, `gain`, `standard_error` (nats), and whether the prior is `used`."""
         numbers = {"gain": self.mean, "standard_error": self.standard_error}
         return {"participants": self.participants, "fewest": FEWEST} | numbers | {"used": self.holds}
 
@@ -90,7 +90,7 @@ class Pooled:
 
 
 def pool(own: Evidence, others: Sequence[Evidence]) -> Pooled:
-    """Priors from the others' evidences, and whether they are to be used.
+    """Compute priors from the others' evidences, and whether to use them.
 
     The participant is one of those who are left out: without it the proof would hold most easily where it alone is unlike the others.
 

@@ -93,7 +93,7 @@ KEPT: Final = 0.01
 
 @dataclass(frozen=True)
 class Sessions:
-    """What is known of n sessions besides their steps.
+    """Facts of n sessions besides their steps.
 
     Attributes:
         visit: index of it, [n]. covariates: by their name in `PRIORS`, [n] each, 0 for a session that is like the mean or not known.
@@ -137,7 +137,7 @@ class Regression:
     shape_evidence: Floats
 
     def mean(self, member: Member, minutes: Minutes, burden: Floats, tremor: Floats | None, own: Sessions | None) -> Floats:
-        """Expected outcome [...] of sessions, by one member; arguments as of `predictor`."""
+        """Predict the outcome [...] of sessions, by one member; arguments as of `predictor`."""
         eta, parts = self.predictor(member, minutes, burden, tremor, own)
         extra = 0.0 if own is not None else member.day_variance
         return mean_of(KINDS[self.outcome], eta, parts, member.dispersion, extra)
@@ -145,7 +145,7 @@ class Regression:
     def predictor(
         self, member: Member, minutes: Minutes, burden: Floats, tremor: Floats | None, own: Sessions | None
     ) -> tuple[Floats, Floats]:
-        """Predictor of the parts of sessions and the weights of these, [..., M'] each, by one member.
+        """Compute the predictor of the parts of sessions and the weights of these, [..., M'] each, by one member.
 
         Args:
             burden: [..., M]. tremor: predicted share of minutes, [...], where the rating follows it.
@@ -162,7 +162,7 @@ class Regression:
 def design(
     outcome: Outcome, shape: int, minutes: Minutes, burden: Floats, tremor: Floats | None, covariates: Mapping[str, Floats]
 ) -> tuple[dict[str, Floats], Floats]:
-    """Fixed columns [..., M'] by name and weights of the parts [..., M']; M' is 1 but for tremor, which is of minutes."""
+    """Compute fixed columns [..., M'] by name and weights of the parts [..., M']; M' is 1 but for tremor, which is of minutes."""
     dose = minutes.features[..., DOSE + shape]
     if outcome == "tremor":
         columns = {"one": np.ones_like(dose), "dose": dose, "burden": burden}
@@ -181,7 +181,8 @@ def design(
 
 
 def burden_of(minutes: Minutes, centre: Floats, spread: Floats) -> Floats:
-    """Burden of beta by minute, [..., M]: mean of beta and of the share above the threshold, each in standard deviations of sessions."""
+    """Compute the burden of beta by minute, [..., M]: mean of beta and of the share above the threshold, each in standard deviations of
+    sessions."""
     scaled = (minutes.features[..., [BETA, ABOVE]] - centre) / spread
     return np.asarray(scaled.mean(-1), dtype=np.float64)
 
@@ -200,7 +201,7 @@ def fit(
     tremor_left_out: Floats | None = None,
     shape_prior: Floats | None = None,
 ) -> Regression:
-    """Posterior of one outcome.
+    """Fit the posterior of one outcome.
 
     Args:
         y: of every session, [n], NaN where not measured; a share for tremor. tremor: measured shares that the rating follows, [n].
@@ -256,7 +257,7 @@ def fit(
 
 
 def _left_out(found: Solved, problem: Problem, weights: Floats, at: Floats, visit: NDArray[np.int64], day: Floats) -> dict[Left, Floats]:
-    """`Regression.left_out` of n sessions of the visits [n]; NaN where only one visit is there to be left out.
+    """Compute `Regression.left_out` of n sessions of the visits [n]; NaN where only one visit is there to be left out.
 
     Args:
         weights: of the regressions, given all, [K]. at: their design with the tremor as predicted of left-out visits. day: variances, [K].

@@ -1,4 +1,4 @@
-"""What every step of a session adds to its expected outcomes: the outcome model taken apart into steps.
+"""Share of every step in a session's expected outcomes: the outcome model taken apart into steps.
 
 The model is of sessions and minutes, and bends: a share of minutes is a logistic, a rating is cut at its ends, a dose saturates. At a
 session as it was, a step adds what its minute has, and beyond that what its own dose and beta differ by from the minute, times the slope
@@ -25,7 +25,8 @@ SLOPE_STEP = 1e-3
 
 
 def end_reward_by_step(model: EndModel, session: SessionTrajectory, settings: MdpSettings) -> Floats:
-    """r_end that each step stands for, [T]: their mean over the known steps is what the model expects of the session on a new day.
+    """Compute the r_end that each step accounts for, [T]: their mean over the known steps is what the model expects of the session on a new
+    day.
 
     The dose of the last minutes counts no more than that of others here: a policy knows no clock. NaN where amplitude or beta is unknown.
     """
@@ -62,7 +63,8 @@ def _shares(
     known: NDArray[np.bool_],
     lead: Floats | None,
 ) -> Floats:
-    """Shares of one outcome, [T], over the members of its posterior; `lead` [T] are those of the outcome that this one follows."""
+    """Compute the shares of one outcome, [T], over the members of its posterior; `lead` [T] are those of the outcome that this one
+    follows."""
     of_session, of_steps = (burden_of(m, model.centre, model.spread) for m in (whole, each))
     middle = None if lead is None else np.asarray(lead[known].mean())
     total = np.zeros(known.size)

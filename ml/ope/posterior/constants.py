@@ -1,4 +1,4 @@
-"""What the structures get wrong beside what they say they do: constants from part A of the virtual population, never from B or C.
+"""Errors of the structures beyond those that they state: constants from part A of the virtual population, never from B or C.
 
 Variance of the error of a component = what the draws say + unit^2 (base^2 + reach^2 leverage), leverage from `ml.ope.posterior.support`.
 Version 2 has the constants of least interval score of differences to cDBS over the 60 worlds of part A, both designs together, each
@@ -28,7 +28,7 @@ class ModelError:
     reach: float
 
     def sd(self, leverage: float) -> float:
-        """At a leverage in [0, 1]."""
+        """Compute the standard deviation at a leverage in [0, 1]."""
         return float((self.base**2 + self.reach**2 * leverage) ** 0.5)
 
 
@@ -47,7 +47,7 @@ COMMON_SHARE = 0.6
 
 
 def error_unit(component: str, expected: Floats, reach: float) -> Floats:
-    """Unit of what structures get wrong, [P].
+    """Compute the unit of what structures get wrong, [P].
 
     A share of time that is nearly 0 or 1 can hardly be wrong by ten points: an error of it is one of its logit, and moves the share
     p by p (1 - p) of that.

@@ -73,7 +73,7 @@ def joint_draws(
     model_errors: Mapping[str, ModelError] = MODEL_ERRORS,
     common_share: float = COMMON_SHARE,
 ) -> Draws:
-    """Draws of coefficients and structures, of the days that were not seen, and of what the structures get wrong.
+    """Draw coefficients and structures, the days that were not seen, and of what the structures get wrong.
 
     Args:
         replays: P policies, cDBS last. ends: model of r_end. alike: correlation of what structures get wrong, [P, P]. leverage: [P].
@@ -110,7 +110,7 @@ def joint_draws(
 
 
 def _end_rewards(drawn: Mapping[str, Floats], constants: Floats | None) -> Floats:
-    """r_end of every draw, [P, KEPT], from its QoCs; 0 without constants."""
+    """Compute r_end of every draw, [P, KEPT], from its QoCs; 0 without constants."""
     none = np.zeros_like(drawn["steps"])
     if constants is None:
         return none
@@ -118,13 +118,13 @@ def _end_rewards(drawn: Mapping[str, Floats], constants: Floats | None) -> Float
 
 
 def systematic(weights: Floats, number: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Indices [number] in random order, each about weight times number often (systematic resampling)."""
+    """Draw indices [number] in random order, each about weight times number often (systematic resampling)."""
     at = (np.arange(number) + rng.random()) / number
     picked = np.minimum(np.searchsorted(np.cumsum(weights / weights.sum()), at), weights.size - 1)
     return rng.permutation(picked)
 
 
 def _between_visits(gaps: Floats, visits: NDArray[np.int64]) -> float:
-    """Root mean squared standard deviation between visits of differences [P, n], over policies; 0 with one visit."""
+    """Compute the root mean squared standard deviation between visits of differences [P, n], over policies; 0 with one visit."""
     means = np.stack([gaps[:, visits == v].mean(1) for v in np.unique(visits)])
     return float(np.sqrt(np.mean(means.var(0, ddof=1)))) if len(means) > 1 else 0.0

@@ -86,11 +86,12 @@ class Posterior:
     others: tuple[Evidence, ...] | None = None
 
     def with_tests(self, tests: Sequence[TestedDifference], not_counted: Flag | None = None) -> Posterior:
-        """The same estimator knowing tested sessions as well; `evaluate` raises ValueError where a tested policy is not evaluated."""
+        """Return the same estimator that knows tested sessions as well; `evaluate` raises ValueError where a tested policy is not
+        evaluated."""
         return replace(self, tests=tuple(tests), not_counted=not_counted)
 
     def with_others(self, others: Sequence[Evidence]) -> Posterior:
-        """The same estimator with the dose shapes of outcomes pooled with other participants' where the proof holds."""
+        """Return the same estimator with the dose shapes of outcomes pooled with other participants' where the proof holds."""
         return replace(self, others=tuple(others))
 
     def fit(self, buffer: ReplayBuffer, report: Report = silent, checkpoint_dir: Path | None = None) -> FittedPosterior:
@@ -119,7 +120,7 @@ class Posterior:
 
 
 def shared_out(weights: Mapping[str, float], draws: int) -> dict[str, int]:
-    """How many draws each structure has; none below `LEAST_WEIGHT`, and at least `LEAST_DRAWS` above it."""
+    """Share draws out over the structures: none below `LEAST_WEIGHT`, and at least `LEAST_DRAWS` above it."""
     return {key: max(LEAST_DRAWS, round(w * draws)) for key, w in weights.items() if w >= LEAST_WEIGHT}
 
 
@@ -142,7 +143,7 @@ class FittedPosterior:
     pooled: Pooled | None = None
 
     def with_pooled(self, pooled: Pooled) -> FittedPosterior:
-        """The same structures with outcomes whose dose shapes have the priors of other participants."""
+        """Return the same structures with outcomes whose dose shapes have the priors of other participants."""
         ends = self._outcomes(self.buffer, pooled) if pooled.priors else self.ends
         return replace(self, ends=ends, pooled=pooled)
 
@@ -151,7 +152,7 @@ class FittedPosterior:
         return fit_end_model(buffer, draws=draws, seed=self.config.seed, severity=self.levels, wider=1.0, shape_priors=priors)
 
     def evaluate(self, policies: Mapping[str, Policy], horizon_steps: int | None = None, report: Report = silent) -> dict[str, Estimate]:
-        """Posterior of every policy.
+        """Compute the posterior of every policy.
 
         Raises:
             ValueError: a horizon below one step, or a tested policy that is not among them.
@@ -187,14 +188,15 @@ class FittedPosterior:
         return {o: proof.to_json() | gains.get(o, {}) for o, proof in self.pooled.proofs.items()}
 
     def joint(self, policies: Mapping[str, Policy], horizon: int, report: Report = silent) -> tuple[Replays, list[Support], Draws]:
-        """Replays, support and joint draws of all policies, cDBS last: what their estimates are made of."""
+        """Compute replays, support and joint draws of all policies, cDBS last, from which their estimates are made."""
         replays = self._replays(list(policies.values()), horizon, report)
         support = SessionSupport(self.buffer)
         supports = [support.of(s) for s in replays.summaries]
         return replays, supports, self._draws(replays, policies, supports, horizon)
 
     def _moved_as_measured(self, policies: list[Policy], replays: Replays, horizon: int) -> Floats | None:
-        """What r_end of each policy, [P], would gain if stopped sessions counted as measured; None where none was, or no r_end is."""
+        """Compute what r_end of each policy, [P], would gain if stopped sessions counted as measured; None where none was, or no r_end
+        is."""
         if not self.ends.seen[0] or not any(s.stopped for s in self.buffer.sessions):
             return None
         buffer = replace(self.buffer, sessions=tuple(replace(s, stopped_as=None) for s in self.buffer.sessions))
@@ -210,12 +212,12 @@ class FittedPosterior:
 
     @property
     def _parts(self) -> dict[str, float]:
-        """What one unit of each QoC adds to the return."""
+        """Weight of one unit of each QoC in the return."""
         parts = {o.field: o.end.per_unit(self.buffer.settings) for o, _ in PREDICTED if o.end is not None}
         return {name: weight for name, weight in parts.items() if weight}
 
     def _replays(self, policies: list[Policy], horizon: int, report: Report) -> Replays:
-        """Every structure's replays side by side; the draws of r_end are dealt out over the structures."""
+        """Combine every structure's replays side by side; the draws of r_end are dealt out over the structures."""
         found: list[Replayed] = []
         weights: list[Floats] = []
         first = 0
@@ -244,7 +246,7 @@ class FittedPosterior:
         )
 
     def _summaries(self, found: Sequence[Replayed], weights: Floats) -> Floats:
-        """`support.SUMMARIES` of every policy, [P, 4], over sessions and draws."""
+        """Compute `support.SUMMARIES` of every policy, [P, 4], over sessions and draws."""
         each = []
         for r in found:
             each.append(np.stack([v.mean(-1) for v in (r.amplitude, r.late, r.above, r.switching)], axis=-1))  # [P, D, 4]
@@ -303,7 +305,8 @@ class FittedPosterior:
 
 
 def _apart(own: Floats, without_model_errors: Floats) -> dict[str, float]:
-    """Standard errors of a return by their cause: `statistical`, too few sessions; `model_error`, what structures get wrong that far away.
+    """Split the standard errors of a return by their cause: `statistical`, too few sessions; `model_error`, what structures get wrong that
+    far away.
 
     Before any test their squares add up to that of the whole but for chance; a test ties the two together, and the whole is less.
     """
@@ -312,7 +315,7 @@ def _apart(own: Floats, without_model_errors: Floats) -> dict[str, float]:
 
 
 def _behaviour(found: Sequence[Replayed], i: int) -> dict[str, float]:
-    """What policy i does in its replayed sessions, over all draws of all structures."""
+    """Summarise what policy i does in its replayed sessions, over all draws of all structures."""
     rows = sum(r.amplitude[i].size for r in found)
 
     def mean(name: str) -> float:
@@ -322,5 +325,5 @@ def _behaviour(found: Sequence[Replayed], i: int) -> dict[str, float]:
 
 
 def build(key: str, seed: int, size: Size) -> Posterior:
-    """The factory of the registry: 32 draws for a first look, 48 for a study."""
+    """Build the estimator, as the registry asks for it: 32 draws for a first look, 48 for a study."""
     return Posterior(PosteriorConfig(seed=seed, draws=48 if size == "full" else 32), key)

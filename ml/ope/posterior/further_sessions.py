@@ -1,4 +1,4 @@
-"""How many further sessions near a dose would tell what cannot be told yet, by simulation.
+"""Number of further sessions near a dose that would settle an open verdict, by simulation.
 
 Preposterior analysis (Raiffa and Schlaifer 1961, ch. 4): a truth is drawn from the posterior, the mean of n sessions under it is drawn
 with the noise of sessions, the posterior is moved by that mean as tested sessions move it (linear prediction over joint draws), and the
@@ -61,7 +61,7 @@ def further_sessions(
     levels: Levels,
     place: Place,
 ) -> Further | None:
-    """The fewest sessions that would tell of a policy; None where none would that a plan can hold, or its dose is not known.
+    """Find the fewest sessions that would settle a policy's verdict; None where no plan can have them, or the dose is not known.
 
     Args:
         own, cdbs: posteriors of the policy and of cDBS. held: amplitude and posterior of constants. noise: of a session, by outcome.
@@ -106,7 +106,8 @@ class Hold:
 
 
 def worth_holding(waiting: Mapping[str, tuple[Further, float | None]], slots: int) -> tuple[Hold, ...]:
-    """What to hold in so many slots: the fewest sessions first, then the likeliest policy. Of sessions on two visits this one takes half.
+    """Choose what to keep constant in so many slots: the fewest sessions first, then the likeliest policy. Of sessions on two visits this
+    one takes half.
 
     Args:
         waiting: of policies that cannot be told yet, what would tell, and their probability of keeping within the margins.
@@ -126,13 +127,13 @@ def worth_holding(waiting: Mapping[str, tuple[Further, float | None]], slots: in
 
 
 def worth_exploring(place: Place, slots: int) -> tuple[Hold, ...]:
-    """What to hold where the data cannot order policies: the lowest amplitude that a whole session may hold, beside cDBS."""
+    """Choose the sessions where the data cannot order policies: at the lowest amplitude that a whole session may keep, next to cDBS."""
     level = place.bound.early_lowest + NEAR_SPREAD
     return (Hold(level, min(slots, MOST_HELD), None),) if slots >= 1 and level <= 1.0 - 2 * NEAR_SPREAD else ()
 
 
 def session_noise(buffer: ReplayBuffer) -> dict[str, float]:
-    """Standard deviation of each outcome from session to session under one controller (and policy) at one visit.
+    """Estimate the standard deviation of each outcome from session to session under one controller (and policy) at one visit.
 
     Random sessions of one visit may differ in dose by design, so they count only where the others have too few. An outcome is absent
     where fewer than three degrees of freedom speak about it. Units: Hz, points, percentage points.
@@ -152,7 +153,7 @@ def session_noise(buffer: ReplayBuffer) -> dict[str, float]:
 
 
 def return_noise(buffer: ReplayBuffer, horizon_steps: int) -> float:
-    """Standard deviation of a session's return from session to session under one controller at one visit, reward units.
+    """Estimate the standard deviation of a session's return from session to session under one controller at one visit, reward units.
 
     Random sessions count only where the others have too few, as in `session_noise`; 0 where fewer than three degrees of freedom speak about
     it all the same. A missing r_end leaves the session out where others have one; where no session has one, a return is its steps' part.
@@ -169,7 +170,7 @@ def return_noise(buffer: ReplayBuffer, horizon_steps: int) -> float:
 
 
 def _within_groups(groups: Sequence[Sequence[float | None]]) -> float:
-    """Pooled standard deviation within groups; 0 where there are too few values, or all of a group are the same."""
+    """Compute the pooled standard deviation within groups; 0 where there are too few values, or all of a group are the same."""
     squares, freedom = 0.0, 0
     for values in groups:
         known = np.array([v for v in values if v is not None], dtype=np.float64)
@@ -201,7 +202,7 @@ class Reachable:
 
 
 def reachable(dose: float, place: Place) -> Reachable | None:
-    """The level nearest to a policy's mean dose whose sessions lie near the policy (`support.NEAR`); None where there is none.
+    """Find the level nearest to a policy's mean dose whose sessions are near the policy (`support.NEAR`); None where there is none.
 
     A session is not held much lower than the policy itself would go, so as to make up for minutes at which it may not be low.
 
@@ -221,7 +222,7 @@ def reachable(dose: float, place: Place) -> Reachable | None:
 
 @dataclass(frozen=True)
 class Needed:
-    """What would tell: so many sessions, on at least so many visits."""
+    """Sessions that would settle a verdict: so many, on at least so many visits."""
 
     sessions: int
     visits: int
@@ -238,7 +239,7 @@ def sessions_to_tell(
     supported: bool = True,
     seed: int = 0,
 ) -> Needed | None:
-    """The fewest further sessions near the policy's dose with which it would be told as a test or as unsafe.
+    """Find the fewest further sessions near the policy's dose that would show it as a test or as unsafe.
 
     Args:
         gaps: by how much each outcome keeps within its margin, draw by draw (`verdict.slacks`), [draws].
@@ -276,7 +277,7 @@ def sessions_to_tell(
 
 
 def _shown(dose: float, cdbs: Estimate, held: Sequence[tuple[float, Estimate]]) -> dict[str, Floats] | None:
-    """What a session of a mean dose would show of each outcome less cDBS, by draw: between the constants next to it.
+    """Predict what a session of a mean dose would show of each outcome less cDBS, by draw: between the constants next to it.
 
     None where there are no two constants: then the policy's own outcomes stand for them.
     """
@@ -297,7 +298,7 @@ def _shown(dose: float, cdbs: Estimate, held: Sequence[tuple[float, Estimate]]) 
 def _told(
     asked: Floats, outcomes: int, seen: Floats, variance: Floats, truths: NDArray[np.int64], futures: Floats, own: Floats, levels: Levels
 ) -> float:
-    """Share of futures in which the verdict is told.
+    """Compute the share of futures in which the verdict is settled.
 
     Args:
         asked: gaps, and energy saved where it is known, [outcomes or outcomes + 1, draws]. outcomes: how many gaps.

@@ -50,7 +50,7 @@ class PosteriorGain:
 
 @dataclass(frozen=True)
 class Tests:
-    """What tested sessions showed.
+    """Results of tested sessions.
 
     Attributes:
         differences: to the same visit's cDBS, over the buffer's median session length. policies: that were tested, by the names in these.
@@ -77,7 +77,7 @@ def gains_over_cdbs(
     margins: Margins | None = None,
     tests: Tests | None = None,
 ) -> dict[str, PosteriorGain]:
-    """Gain of every policy, by name; a policy that acts as cDBS has one of about 0.
+    """Compute the gain of every policy, by name; a policy that acts as cDBS has one of about 0.
 
     Args:
         buffer: the sessions. policies: whose gains are asked for. seed: of all draws. report: progress.
@@ -110,6 +110,6 @@ def _saves(one: Estimate, cdbs: Estimate) -> float | None:
 
 
 def _within(one: Estimate, cdbs: Estimate, margins: Margins) -> float | None:
-    """Share of the draws in which every known QoC lies within its margin."""
+    """Compute the share of the draws in which every known QoC is within its margin."""
     gaps = slacks(one, cdbs, margins)
     return float(np.mean(np.min(np.stack(list(gaps.values())), axis=0) >= 0)) if gaps else None

@@ -32,7 +32,7 @@ _OWN = 0.1
 
 @dataclass(frozen=True)
 class TestedDifference:
-    """What sessions of one policy showed at one visit, less what that visit's cDBS sessions showed.
+    """Difference between sessions of one policy at one visit and that visit's cDBS sessions.
 
     Attributes:
         policy_name: name under which the policy is evaluated. visit: its number. n_sessions: of the policy at that visit.
@@ -71,7 +71,7 @@ class TestedDifference:
 
 
 def similarity(policies: Sequence[Policy], states: Floats) -> Floats:
-    """Correlation of what structures get wrong for two policies, [P, P], from their amplitudes on logged states [N, W]."""
+    """Compute the correlation of what structures get wrong for two policies, [P, P], from their amplitudes on logged states [N, W]."""
     keep = np.unique(np.linspace(0, len(states) - 1, MOST_STATES).astype(np.int64))
     actions = np.stack([np.clip(p.act(states[keep].copy()), 0.0, 1.0) for p in policies])
     squared = np.mean((actions[:, None] - actions[None]) ** 2, axis=-1)
@@ -79,7 +79,7 @@ def similarity(policies: Sequence[Policy], states: Floats) -> Floats:
 
 
 def correlated(correlation: Floats, sd: Floats, draws: int, rng: np.random.Generator) -> Floats:
-    """Zero-mean normal draws [P, draws] with standard deviations [P] and a correlation [P, P]."""
+    """Draw zero-mean normal numbers [P, draws] with standard deviations [P] and a correlation [P, P]."""
     lower = np.linalg.cholesky(correlation + JITTER * np.eye(len(correlation)))
     found = sd[:, None] * (lower @ rng.standard_normal((len(correlation), draws)))
     return np.asarray(found - found.mean(1, keepdims=True), dtype=np.float64)
@@ -95,7 +95,7 @@ def updated(
     parts_of_return: Mapping[str, float] | None = None,
     alike: Floats | None = None,
 ) -> dict[str, Floats]:
-    """Draws [P, K] by quantity after tested sessions.
+    """Return draws [P, K] by quantity after tested sessions.
 
     Args:
         draws: by quantity. names: of the policies, in the order of the rows. reference: row of cDBS.
@@ -141,7 +141,7 @@ def errors_of_tests(
     parts_of_return: Mapping[str, float],
     alike: Callable[[str, str], float] = lambda a, b: float(a == b),
 ) -> Floats:
-    """Covariance [n, n] of the errors of observed differences, each of one test and one quantity.
+    """Compute the covariance [n, n] of the errors of observed differences, each of one test and one quantity.
 
     Three things move a difference: its own sessions; the visit's cDBS sessions, which all tests of the visit share; and how the policy's
     true difference varies between visits, in which policies that act alike go together. A return holds the session's QoCs, so that its
@@ -168,13 +168,13 @@ def errors_of_tests(
 
 
 def _session_sd(test: TestedDifference) -> dict[str, float]:
-    """Standard deviation of one session by quantity, as a test's standard errors tell it."""
+    """Derive the standard deviation of one session by quantity from a test's standard errors."""
     share = 1.0 / test.n_sessions + (1.0 / test.n_reference if test.n_reference else 0.0)
     return {name: error / np.sqrt(share) for name, error in test.standard_errors.items()}
 
 
 def _loadings(quantity: str, sd: Mapping[str, float], parts_of_return: Mapping[str, float]) -> dict[str, float]:
-    """What moves a quantity, by independent part: a QoC by itself, a return by its QoCs and by what else is in it."""
+    """Split what moves a quantity into independent parts: a QoC by itself, a return by its QoCs and by what else is in it."""
     if quantity != "return":
         return {quantity: sd.get(quantity, 0.0)}
     of_qocs = {name: weight * sd[name] for name, weight in parts_of_return.items() if name in sd}

@@ -1,4 +1,4 @@
-"""How well each structure predicts sessions that it has not learnt from, and the weights that follow from it.
+"""Skill of each structure on sessions that it has not learnt from, and the weights that follow from it.
 
 Each session in turn is left out of a structure's coefficients (its autoregression and hyperparameters stay) and runs freely from its own
 window under its own logged amplitudes, at a level that its visit suggests and with innovations of other sessions. What counts is what the
@@ -78,7 +78,7 @@ def held_out(buffer: ReplayBuffer, scale: Scale, fits: Sequence[Fit], seed: int)
 
 
 def weights_of(densities: Mapping[str, Floats], seed: int) -> dict[str, float]:
-    """Pseudo-BMA weights with the Bayesian bootstrap over sessions; equal ones where fewer than two sessions could be left out."""
+    """Compute pseudo-BMA weights with the Bayesian bootstrap over sessions; equal ones where fewer than two sessions could be left out."""
     keys = list(densities)
     table = np.stack([densities[k] for k in keys])
     table = table[:, np.isfinite(table).all(0)]
@@ -91,7 +91,7 @@ def weights_of(densities: Mapping[str, Floats], seed: int) -> dict[str, float]:
 
 
 def free_runs(fit: Fit, buffer: ReplayBuffer, held: Sequence[int], scale: Scale, seed: int) -> list[Floats]:
-    """Rewards of every held session in free runs under its own amplitudes, [RUNS, T] each."""
+    """Compute the rewards of every held-out session in free runs under its own amplitudes, [RUNS, T] each."""
     rng = np.random.default_rng([seed, 0xF4EE])
     weights = np.array([f.weight for f in fit.forms])
     counts = rng.multinomial(RUNS, weights / weights.sum())
@@ -103,7 +103,7 @@ def free_runs(fit: Fit, buffer: ReplayBuffer, held: Sequence[int], scale: Scale,
 def _form_runs(
     fit: Fit, form: LinearForm, buffer: ReplayBuffer, held: Sequence[int], runs: int, scale: Scale, rng: np.random.Generator
 ) -> Floats:
-    """Rewards of the held sessions in one form, [runs, m, T]."""
+    """Compute the rewards of the held-out sessions in one form, [runs, m, T]."""
     window, sessions = form.phi.size, [buffer.sessions[i] for i in held]
     steps = max(s.steps for s in sessions)
     rest, amplitude = np.zeros((window + steps, runs, len(held))), np.ones((steps, len(held)))
@@ -120,7 +120,8 @@ def _form_runs(
 
 
 def _autoregressed(form: LinearForm, rest: Floats, amplitude: Floats, lead: Floats, noise: Floats, scale: Scale) -> Floats:
-    """Standardised beta [T, runs, m] around its rest [W + T, runs, m] from windows [m, W], with standardised innovations [T, runs, m]."""
+    """Run standardised beta [T, runs, m] around its rest [W + T, runs, m] from windows [m, W], with standardised innovations [T, runs,
+    m]."""
     window = form.phi.size
     low, high = scale.beta(np.array([scale.beta_low, scale.beta_high]))
     reach = 0.25 * (high - low)
@@ -134,7 +135,7 @@ def _autoregressed(form: LinearForm, rest: Floats, amplitude: Floats, lead: Floa
 
 
 def _innovations(fit: Fit, held: Sequence[int], runs: int, steps: int, rng: np.random.Generator) -> Floats:
-    """Standardised innovations [T, runs, m]: for each a run of those of another session, in their order."""
+    """Draw standardised innovations [T, runs, m]: for each a run of those of another session, in their order."""
     found = take(fit.drawn, np.arange(1)).innovations(fit.tables)
     known = {i: f[0][np.isfinite(f[0])] for i, f in enumerate(found)}
     donors = [i for i, f in known.items() if f.size >= LEAST_KNOWN]
@@ -147,13 +148,13 @@ def _innovations(fit: Fit, held: Sequence[int], runs: int, steps: int, rng: np.r
 
 
 def _known_rewards(buffer: ReplayBuffer, i: int) -> Floats:
-    """r_k of a session's usable steps, [T]; NaN elsewhere."""
+    """Compute r_k of a session's usable steps, [T]; NaN elsewhere."""
     session = buffer.sessions[i]
     return np.where(session.usable(), session.rewards(buffer.settings), np.nan)
 
 
 def _blocks(rewards: Floats) -> Floats:
-    """Sums over blocks [B] of rewards [T], as if every step were known; NaN where fewer than `LEAST_KNOWN` are."""
+    """Sum rewards over blocks [B], from rewards [T], as if every step were known; NaN where fewer than `LEAST_KNOWN` are."""
     found = []
     for start in range(0, rewards.size - BLOCK + 1, BLOCK):
         block = rewards[start : start + BLOCK]
@@ -167,7 +168,7 @@ def _block_sums(runs: Floats, blocks: int) -> Floats:
 
 
 def log_density(seen: Floats, runs: Floats) -> float:
-    """Of observed sums [B] in a normal with the mean and the shrunk covariance of runs [R, B]."""
+    """Compute the log density of observed sums [B] in a normal with the mean and the shrunk covariance of runs [R, B]."""
     mean, covariance = runs.mean(0), np.atleast_2d(np.cov(runs, rowvar=False))
     shrunk = (1 - SHRINK) * covariance
     shrunk[np.diag_indices(len(shrunk))] = np.diag(covariance) + OWN_VARIANCE

@@ -59,7 +59,8 @@ TURNS = 2
 
 
 def dose_functions(a: Floats) -> Floats:
-    """Dose functions [..., SHAPES]: the dose itself, and what steep rises at `BENDS` are beyond it, 0 at no stimulation and at cDBS.
+    """Compute dose functions [..., SHAPES]: the dose itself, and what steep rises at `BENDS` are beyond it, 0 at no stimulation and at
+    cDBS.
 
     Together they make lines, answers that saturate early or late, and ones that turn round.
     """
@@ -83,7 +84,7 @@ class Filters:
         self._passed[:], self._sided[:], self._now = np.moveaxis(dose_functions(first), -1, 0), first, first
 
     def step(self, a: Floats) -> Floats:
-        """`columns`, [COLUMNS, ...], once the amplitudes a [...] are in force; the next step overwrites them."""
+        """Update `columns`, [COLUMNS, ...], once the amplitudes a [...] are in force; the next step overwrites them."""
         doses = np.moveaxis(dose_functions(a), -1, 0)
         for passed, keep in zip(self._passed, KEEP, strict=True):
             passed *= keep
@@ -100,7 +101,7 @@ class Filters:
 
 
 def columns_of(a: Floats, first: float) -> Floats:
-    """`Filters` of a whole session, step by step, [T, COLUMNS], for amplitudes [T] after `first` had been on for long."""
+    """Compute `Filters` of a whole session, step by step, [T, COLUMNS], for amplitudes [T] after `first` had been on for long."""
     p, start = dose_functions(a), dose_functions(np.array(first))
     passed = np.empty((a.size, len(TIMES), SHAPES))
     for m, keep in enumerate(KEEP):
@@ -129,7 +130,8 @@ class ModeTable:
 
     @classmethod
     def of(cls, session: SessionTrajectory, scale: Scale, otherwise: float | None) -> ModeTable:
-        """Tables of a session after the dose before it, which is `otherwise` where no record says it; its first amplitude for None."""
+        """Build the tables of a session after the dose before it, which is `otherwise` where no record says it; its first amplitude for
+        None."""
         a, window, before = held_amplitude(session), session.lead_beta.size, lead_dose(session, otherwise)
         first = float(a[0]) if before is None else before
         columns = columns_of(np.concatenate([np.full(window, first), a]), first)
@@ -155,7 +157,7 @@ class ModeDynamics:
     before: Floats
 
     def innovations(self, tables: Sequence[ModeTable]) -> list[Floats]:
-        """Standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
+        """Compute standardised innovations of the steps of each session, [D, T]; NaN where a step is not usable."""
         found = []
         for i, table in enumerate(tables):
             eta = table.beta - self.gains @ table.columns.T - self.levels[:, i : i + 1]
@@ -163,13 +165,13 @@ class ModeDynamics:
         return found
 
     def usual_lead(self) -> Floats:
-        """Standardised beta of each session, [n], where the window before it is not known."""
+        """Compute standardised beta of each session, [n], where the window before it is not known."""
         doses = after_doses(np.ones(self.before.size), self.before)
         lasting = np.stack([columns_of(np.array([dose]), float(dose))[0] for dose in doses], axis=1)
         return np.asarray((self.levels + self.gains @ lasting).mean(0), dtype=np.float64)
 
     def response(self, first: Floats, steps: int) -> ModeResponse:
-        """The answer to amplitudes that come step by step, the first of them [P, D, n]."""
+        """Begin the answer to amplitudes that come step by step, the first of them [P, D, n]."""
         return ModeResponse(self.gains, after_doses(first, self.before))
 
 
@@ -199,12 +201,12 @@ class FittedModes:
     before: Floats
 
     def drawn(self, draws: int, rng: np.random.Generator) -> ModeDynamics:
-        """Draws of the coefficients."""
+        """Draw the coefficients."""
         return self._of(self.fit.draws(draws, rng))
 
     @property
     def mean(self) -> ModeDynamics:
-        """The model at its posterior mean (D = 1)."""
+        """Model at its posterior mean (D = 1)."""
         return self._of(self.fit.coefficients[None])
 
     def _of(self, coefficients: Floats) -> ModeDynamics:
@@ -214,7 +216,7 @@ class FittedModes:
 
 
 def fit_modes(buffer: ReplayBuffer, tables: Sequence[ModeTable], otherwise: float | None) -> FittedModes:
-    """The posterior of the model; `otherwise` as the tables were made with.
+    """Fit the posterior of the model; `otherwise` as the tables were made with.
 
     Raises:
         ValueError: fewer than two sessions with usable steps.
@@ -247,12 +249,12 @@ MODE_MODEL = MixedModel(
 
 
 def mode_sums(tables: Sequence[ModeTable], visit: Indices, phi: Floats) -> SessionSums:
-    """Sums of every session for `MODE_MODEL`."""
+    """Collect the sums of every session for `MODE_MODEL`."""
     return level_sums([t.beta for t in tables], [t.columns for t in tables], [t.usable for t in tables], visit, phi)
 
 
 def _split(coefficients: Floats, visit: Indices) -> tuple[Floats, Floats]:
-    """Gains [D, COLUMNS] and levels [D, n] from coefficients [D, p]."""
+    """Compute gains [D, COLUMNS] and levels [D, n] from coefficients [D, p]."""
     return split_coefficients(coefficients, visit, COLUMNS)
 
 

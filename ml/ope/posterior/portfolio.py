@@ -1,4 +1,4 @@
-"""Which candidates to test at one visit: those whose tests together are expected to leave the best policy in hand.
+"""Choice of candidates to test at one visit: those whose tests together are expected to leave the best policy in hand.
 
 A visit tests several policies, and what counts afterwards is the best of those that have been tested. A set S is worth
 
@@ -55,7 +55,7 @@ class Suggestion:
 def portfolio(
     differences: Mapping[str, Floats], slots: int, careful: Collection[str] = (), tested: Collection[str] = (), noise: float = 0.0
 ) -> tuple[Suggestion, ...]:
-    """The policies that teach most together, in the order in which they were chosen.
+    """Choose the policies that teach most together, in the order in which they were chosen.
 
     Args:
         differences: returns less that of cDBS by policy, aligned posterior draws, [draws] each; only what may be proposed.
@@ -95,7 +95,7 @@ def portfolio(
 
 
 def _next(beliefs: _Beliefs, left: list[int], chosen: list[int], had: list[int]) -> tuple[int | None, float]:
-    """Which of those left to take next, and what its session adds; None where none is worth a patient's minutes."""
+    """Choose the next of the remaining policies, and compute what its session adds; None where none is worth a patient's minutes."""
     now = beliefs.worth(chosen, had)
     adds = np.array([beliefs.worth([*chosen, i], had) for i in left]) - now
     if adds.max() > max(LEAST_GAIN * now, _NOTHING):
@@ -113,7 +113,7 @@ def _next(beliefs: _Beliefs, left: list[int], chosen: list[int], had: list[int])
 
 @dataclass(frozen=True)
 class _Beliefs:
-    """What is believed of all policies, and what sessions would show.
+    """Beliefs about all policies, and what sessions would show.
 
     Attributes:
         draws: [n, draws]. mean: [n]. covariance: [n, n]. noise: of a session's difference. shown: the draws as sessions with noise would
@@ -135,7 +135,7 @@ class _Beliefs:
         return _Beliefs(draws, draws.mean(axis=1), covariance, noise, draws + noise * by_chance)
 
     def worth(self, chosen: list[int], had: list[int]) -> float:
-        """Expected mean of the best of those tested before and those chosen, after the sessions of those chosen; at least 0."""
+        """Compute the expected mean of the best of those tested before and those chosen, after the sessions of those chosen; at least 0."""
         kept = sorted({*chosen, *had})
         if not kept:
             return 0.0
@@ -158,7 +158,7 @@ def _aligned(differences: Mapping[str, Floats], names: list[str]) -> Floats:
 
 
 def _informs(draws: Floats, i: int) -> float:
-    """Share of the variance of the others that goes with policy i; 0 where there are no others, or nothing varies."""
+    """Compute the share of the variance of the others that goes with policy i; 0 where there are no others, or nothing varies."""
     centred = draws - draws.mean(axis=1, keepdims=True)
     others = np.delete(centred, i, axis=0)
     total, own = float((others**2).sum()), float((centred[i] ** 2).sum())

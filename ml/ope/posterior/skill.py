@@ -1,4 +1,4 @@
-"""Whether the data can order policies at all, which is asked before any order is shown."""
+"""Check of whether the data can order policies at all, before any order is shown."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ class Skill:
     held_out_correlation: float | None
 
     def to_json(self) -> dict[str, Any]:
-        """All fields, JSON-able."""
+        """Return all fields, JSON-able."""
         return {"told": self.told, "reasons": list(self.reasons), "held_out_correlation": self.held_out_correlation}
 
 
 def ordering_skill(buffer: ReplayBuffer, predictions: HeldOut, equal: Floats, ends: EndModel, levels: Floats) -> Skill:
-    """Predictions of left-out sessions against calling all doses equal, and against contrasts between controllers.
+    """Compare predictions of held-out sessions with calling all doses equal, and with contrasts between controllers.
 
     The reward of the amplitude's price is known and orders nothing by itself. The level of a visit, or of the window before a session,
     orders no doses either: what predictions are held against knows both. Beta may answer to nothing while outcomes do: where an outcome
@@ -85,19 +85,20 @@ def ordering_skill(buffer: ReplayBuffer, predictions: HeldOut, equal: Floats, en
 
 
 def _better(was: Floats, said: Floats, equal: Floats) -> bool:
-    """Whether squared errors fall, session by session, by more than chance would let them."""
+    """Decide whether squared errors fall, session by session, by more than chance would let them."""
     gain = (was - equal) ** 2 - (was - said) ** 2
     return bool(gain.mean() > MARGIN * gain.std(ddof=1) / np.sqrt(gain.size))
 
 
 def _outcomes_told(buffer: ReplayBuffer, ends: EndModel) -> bool:
-    """Whether an outcome of left-out sessions is predicted better than by the other sessions, however much those of its visit count."""
+    """Decide whether an outcome of held-out sessions is predicted better than by the other sessions, however much those of its visit
+    count."""
     table, visits = outcome_table(buffer), np.array([s.visit for s in buffer.sessions])
     return any(_outcome_told(table[:, j], ends.by_session.predicted[:, j], visits) for j in COLUMN.values() if ends.seen[j])
 
 
 def _outcome_told(found: Floats, predicted: Floats, visits: NDArray[np.int64]) -> bool:
-    """The same of one outcome [n], NaN where not measured, and its left-out predictions [n] for sessions of the visits [n]."""
+    """Decide the same for one outcome [n], NaN where not measured, and its held-out predictions [n] for sessions of the visits [n]."""
     known = np.isfinite(found) & np.isfinite(predicted)
     if known.sum() < FEWEST:
         return False
@@ -111,14 +112,14 @@ def _outcome_told(found: Floats, predicted: Floats, visits: NDArray[np.int64]) -
 
 
 def _mean_of_others(values: Floats, among: Floats) -> Floats:
-    """Mean of the other values among which each stands, [n], by a matrix of 0 and 1, [n, n]; NaN where it stands alone."""
+    """Average the other values of each value's group, [n], by a matrix of 0 and 1, [n, n]; NaN where it is alone."""
     others = among - np.eye(values.size)
     count = others.sum(1)
     return np.asarray(np.where(count > 0, others @ values / np.maximum(count, 1), np.nan), dtype=np.float64)
 
 
 def _follow_dose(buffer: ReplayBuffer, levels: Floats) -> bool:
-    """Whether levels of random sessions go with their mean dose within visits: then the answer to a dose is not what structures say.
+    """Decide whether levels of random sessions go with their mean dose within visits: then the answer to a dose is not what structures say.
 
     What a controller gives in answer to beta follows beta; random doses follow nothing.
     """
@@ -136,7 +137,7 @@ def _follow_dose(buffer: ReplayBuffer, levels: Floats) -> bool:
 
 
 def _contradicted(buffer: ReplayBuffer, predicted: Floats, seen: Floats) -> bool:
-    """Whether a clear contrast between two controllers is predicted with the other sign."""
+    """Decide whether a clear contrast between two controllers is predicted with the other sign."""
     arms = []
     for indices in controllers(buffer).values():
         own = np.array([i for i in indices if np.isfinite(predicted[i]) and np.isfinite(seen[i])])

@@ -53,7 +53,7 @@ class Fit:
     forms: tuple[LinearForm, ...]
 
     def thinned(self, draws: int) -> Replayable:
-        """The first draws alone, at most those that there are."""
+        """Return the first draws alone, at most those that there are."""
         return take(self.drawn, np.arange(min(draws, len(self.drawn.levels))))
 
 
@@ -65,7 +65,7 @@ MOST_FORMS = 8
 
 
 def take(dynamics: Replayable, keep: NDArray[np.int64]) -> Replayable:
-    """Some of the draws of a model.
+    """Return some of the draws of a model.
 
     Raises:
         TypeError: a model of a kind that is not known here.
@@ -80,7 +80,7 @@ def take(dynamics: Replayable, keep: NDArray[np.int64]) -> Replayable:
 
 
 def fit_linear(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, before: float | None) -> Fit:
-    """The linear model: levels, an answer to the dose over about 20 steps with differences in timing, an autoregression."""
+    """Fit the linear model: levels, an answer to the dose over about 20 steps with differences in timing, an autoregression."""
     tables = [SessionTable.of(s, scale, before) for s in buffer.sessions]
     mean, drawn = fit_dynamics(buffer, tables, draws, seed, before)
     sums = linear_sums(tables, visit_numbers(buffer), mean.phi)
@@ -89,7 +89,7 @@ def fit_linear(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, before
 
 
 def no_answer(fit: Fit, buffer: ReplayBuffer) -> Fit:
-    """A fitted linear model without any answer to the amplitude, which calls all doses equal: what skill is held against."""
+    """Fit a linear model without any answer to the amplitude, which calls all doses equal: skill is compared with it."""
     tables = [replace(t, answers=np.zeros_like(t.answers)) for t in fit.tables]
     mean, drawn = fit_dynamics(buffer, tables, 1, 0, None)
     zeros = tuple(np.zeros((t.beta.size, ANSWERS)) for t in tables)
@@ -99,7 +99,7 @@ def no_answer(fit: Fit, buffer: ReplayBuffer) -> Fit:
 
 
 def fit_response(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, before: float | None) -> Fit:
-    """The impulse response with a stable-spline prior behind one of four dose shapes."""
+    """Fit the impulse response with a stable-spline prior behind one of four dose shapes."""
     tables = [ResponseTable.of(s, scale, before) for s in buffer.sessions]
     drawn = fit_impulse(buffer, tables, draws, seed, before)
     forms, visit = [], visit_numbers(buffer)
@@ -115,7 +115,7 @@ def fit_response(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, befo
 
 
 def fit_low_passes(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, before: float | None) -> Fit:
-    """Low-passes of several speeds behind dose functions."""
+    """Fit low-passes of several speeds behind dose functions."""
     tables = [ModeTable.of(s, scale, before) for s in buffer.sessions]
     found = fit_modes(buffer, tables, before)
     sums = mode_sums(tables, found.visit, found.phi)

@@ -1,4 +1,4 @@
-"""Which policies the logged sessions can speak about, by what sessions are as a whole: mean and late dose, burden of beta, switching.
+"""Support of policies by the logged sessions, by what sessions are as a whole: mean and late dose, burden of beta, switching.
 
 A step's amplitude may have been tried a thousand times and yet no session have held it. A policy is supported where at least two sessions
 on two visits lie near what it would do. How far it lies from all of them is its leverage: the share of the variance of a smooth function
@@ -40,7 +40,7 @@ OFF = 0.05
 
 @dataclass(frozen=True)
 class Support:
-    """What is logged near one policy.
+    """Logged sessions near one policy.
 
     Attributes:
         near_sessions, near_visits: sessions near it, and their visits. leverage: in [0, 1].
@@ -56,12 +56,12 @@ class Support:
 
     @property
     def supported(self) -> bool:
-        """Whether two sessions on two visits lie near."""
+        """True where two sessions on two visits are near."""
         return self.near_sessions >= FEWEST_SESSIONS and self.near_visits >= FEWEST_VISITS
 
     @property
     def flags(self) -> tuple[Flag, ...]:
-        """Why the sessions cannot speak about the policy; empty where they can."""
+        """Reasons why the sessions do not support the policy; empty where they do."""
         if self.supported:
             return ()
         if self.near_sessions < FEWEST_SESSIONS:
@@ -71,7 +71,7 @@ class Support:
         return (Flag.of("few_near_visits", float(self.near_visits), float(FEWEST_VISITS), "visits", refuses=True, dose=self.dose),)
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers, by name."""
+        """Return all numbers, by name."""
         return asdict(self)
 
 
@@ -93,7 +93,7 @@ class SessionSupport:
         self.lowest = self._lowest()
 
     def of(self, summary: Floats) -> Support:
-        """Support of a policy whose sessions have the summaries [4] on average."""
+        """Compute the support of a policy whose sessions have the summaries [4] on average."""
         near = np.all(np.abs(self.points - summary) <= NEAR, axis=1)
         k = _kernel(summary[None], self.points)[0]
         leverage = float(np.clip(1 - k @ self._inverse @ k, 0.0, 1.0))

@@ -40,7 +40,7 @@ _WITHIN_ONE = float(ndtr(1.0))
 
 @dataclass(frozen=True)
 class TestSession:
-    """What one session showed.
+    """Result of one session.
 
     Attributes:
         policy: name under which its policy is evaluated; None for cDBS. visit: its number.
@@ -64,7 +64,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Differences:
-    """What tested sessions show, and how many of them show nothing.
+    """Differences that tested sessions show, and how many sessions show none.
 
     Attributes:
         tests: one per policy and visit with sessions of both the policy and cDBS, in order of visit and name.
@@ -78,7 +78,7 @@ class Differences:
 
 
 def differences_to_cdbs(sessions: Sequence[TestSession], prior: Mapping[str, Spread] | None = None) -> Differences:
-    """Every policy's difference to cDBS at every visit.
+    """Compute every policy's difference to cDBS at every visit.
 
     Args:
         sessions: of policies and of cDBS. prior: of the noise by quantity, as `spread_of_random` has it; none where None.
@@ -109,7 +109,7 @@ def differences_to_cdbs(sessions: Sequence[TestSession], prior: Mapping[str, Spr
 
 
 def spread_of_random(buffer: ReplayBuffer, horizon_steps: int) -> dict[str, Spread]:
-    """How far random sessions lie from their visit's mean and a straight line over their energy, by quantity.
+    """Measure how far random sessions are from their visit's mean and a straight line over their energy, by quantity.
 
     What does not follow such a line counts as noise. A quantity is absent where no degree of freedom is left; energy always is, because it
     is the dose. Sessions that were stopped are left out.
@@ -143,7 +143,7 @@ def _known(name: str, sessions: Sequence[TestSession]) -> Floats:
 
 
 def _noise(name: str, groups: Mapping[tuple[str | None, int], Sequence[TestSession]], prior: Spread | None) -> float | None:
-    """Standard deviation of a session of one policy at one visit, as the docstring of the module has it; None where nothing tells it."""
+    """Estimate the standard deviation of a session of one policy at one visit, as the module's docstring says; None where it is unknown."""
     of_policy: dict[str | None, list[TestSession]] = defaultdict(list)
     for (policy, _), rows in groups.items():
         of_policy[policy] += rows
@@ -169,5 +169,5 @@ def _noise(name: str, groups: Mapping[tuple[str | None, int], Sequence[TestSessi
 
 
 def _squares(groups: Sequence[Floats]) -> tuple[float, int]:
-    """Sum of squares around the groups' means, and its degrees of freedom."""
+    """Compute the sum of squares around the groups' means, and its degrees of freedom."""
     return sum(float(((g - g.mean()) ** 2).sum()) for g in groups if g.size), sum(max(g.size - 1, 0) for g in groups)

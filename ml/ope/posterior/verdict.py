@@ -1,4 +1,4 @@
-"""What to say of a candidate: worth a test, a test with care, the same as cDBS, unsafe, or not to be told. Pure, from posterior draws.
+"""Verdict on a candidate: worth a test, a test with care, the same as cDBS, unsafe, or open. It is a pure function of posterior draws.
 
 Every probability is a share of draws that are aligned between the policy and cDBS, so that what the posterior gets wrong for both alike
 cancels. The order of precedence is safety first: unsafe, cannot tell, same as cDBS, test with care, test. Where the data cannot order
@@ -43,7 +43,7 @@ SETTLED_BY_SESSIONS = frozenset({"undecided", "few_near_sessions", "few_near_vis
 
 @dataclass(frozen=True)
 class Levels:
-    """How sure a verdict must be; the defaults are those of the study's settings.
+    """Certainty that a verdict needs; the defaults are those of the study's settings.
 
     Attributes:
         test_within: least probability that all outcomes lie within their margins for a test.
@@ -67,7 +67,7 @@ class Levels:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What to say of one candidate.
+    """Verdict on one candidate.
 
     Attributes:
         code: the verdict.
@@ -90,14 +90,14 @@ class Verdict:
 
     @property
     def proposed(self) -> bool:
-        """Whether it may be proposed for a visit."""
+        """True where it may be proposed for a visit."""
         return self.code in ("test", "test_with_care")
 
 
 def verdict(
     own: Estimate, cdbs: Estimate | None, margins: Margins, levels: Levels, *, harms: Sequence[Flag] = (), unchecked: str | None = None
 ) -> Verdict:
-    """The verdict on a candidate.
+    """Decide the verdict on a candidate.
 
     Args:
         own: its posterior, with the details that `ml.ope.posterior` gives (draws, behaviour, support, skill).
@@ -142,7 +142,7 @@ def verdict(
 
 
 def slacks(own: Estimate, cdbs: Estimate, margins: Margins) -> dict[str, Floats]:
-    """By how much each known outcome keeps within its margin of cDBS, draw by draw, [draws]; below 0 it is beyond.
+    """Compute by how much each known outcome keeps within its margin of cDBS, draw by draw, [draws]; below 0 it is beyond.
 
     Raises:
         ValueError: draws of the policy and of cDBS that are not aligned.
@@ -160,7 +160,7 @@ def slacks(own: Estimate, cdbs: Estimate, margins: Margins) -> dict[str, Floats]
 
 
 def chance_within(own: Estimate, cdbs: Estimate, margins: Margins) -> float | None:
-    """Probability that every known outcome keeps within its margin of cDBS, all together; None where none is known.
+    """Compute the probability that every known outcome keeps within its margin of cDBS, all together; None where none is known.
 
     Raises:
         ValueError: draws of the policy and of cDBS that are not aligned.
@@ -169,13 +169,13 @@ def chance_within(own: Estimate, cdbs: Estimate, margins: Margins) -> float | No
 
 
 def outcome_draws(estimate: Estimate, name: str) -> Floats | None:
-    """Draws of one predicted quantity, [draws]; None where there are too few to tell a probability, or one is not finite."""
+    """Return the draws of one predicted quantity, [draws]; None where there are too few for a probability, or one is not finite."""
     drawn = np.asarray((estimate.details.get("outcome_draws") or {}).get(name) or [], dtype=np.float64)
     return drawn if drawn.size >= FEWEST_DRAWS and bool(np.isfinite(drawn).all()) else None
 
 
 def interval(draws: Floats) -> tuple[float, float]:
-    """The 5 % and 95 % quantiles of draws, [draws], at least one; linear between neighbours, as NumPy has them.
+    """Compute the 5 % and 95 % quantiles of draws, [draws], at least one; linear between neighbours, as NumPy has them.
 
     A page asks for hundreds of them, and for a few hundred draws NumPy's own function takes some ten times as long.
     """
@@ -210,7 +210,7 @@ def _promising(within: float | None, saves: float | None, levels: Levels) -> boo
 
 
 def _chances(within: float | None, saves: float | None, levels: Levels) -> tuple[Flag, ...]:
-    """The two probabilities that every verdict states, where they are known."""
+    """Return the two probabilities that every verdict states, where they are known."""
     found = []
     if within is not None:
         found.append(Flag("within_margins", within, levels.test_within, "probability"))
@@ -235,7 +235,7 @@ def _hazards(own: Estimate, gaps: Mapping[str, Floats], levels: Levels) -> list[
 def _cannot_tell(
     own: Estimate, cdbs: Estimate | None, gaps: Mapping[str, Floats], saves: float | None, unchecked: str | None
 ) -> Flag | None:
-    """What stands against saying anything, whatever the policy does; None where nothing does."""
+    """Find the reason against any verdict, whatever the policy does; None where there is none."""
     if unchecked is not None:
         return Flag.of("coverage_unchecked", text=unchecked)
     if cdbs is None:
@@ -252,6 +252,6 @@ def _support(estimate: Estimate) -> Mapping[str, Any]:
 
 
 def _unsupported(own: Estimate) -> Flag:
-    """The first finding that refuses the policy, or that too few sessions came near what it does."""
+    """Find the first reason that refuses the policy, or that too few sessions came near what it does."""
     refusing = next((flag for flag in own.flags if flag.refuses), None)
     return refusing or Flag("few_near_sessions", _support(own).get("near_sessions"), 2.0, "sessions")

@@ -55,7 +55,7 @@ class BehaviourMap:
     apart: dict[str, dict[str, float]]
 
     def distance(self, one: str, other: str) -> float | None:
-        """How far two policies are apart, fraction of cDBS, as `apart` has it; None where one of them is not in the map."""
+        """Measure how far two policies are apart, fraction of cDBS, as `apart` has it; None where one of them is not in the map."""
         found = self.apart.get(one, {}).get(other)
         return found if found is not None else self.apart.get(other, {}).get(one)
 

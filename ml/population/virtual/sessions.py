@@ -143,7 +143,8 @@ def session_constants(patient: Patient, days: Days, own: Floats) -> Floats:
 
 
 def quality(patient: Patient, noise: Floats, amplitude: Floats, brady: Floats, tremor: Floats, overload: Floats) -> tuple[Floats, ...]:
-    """Grasp frequency (Hz), rating (1-10) and tremor (%) of sessions from their symptoms, [n, T] each; `noise` [n, 2] standard normals."""
+    """Compute grasp frequency (Hz), rating (1-10) and tremor (%) of sessions from their symptoms, [n, T] each; `noise` [n, 2] standard
+    normals."""
     late = brady[:, -GRASP_STEPS:].mean(axis=1)
     grasp = patient.grasp_high - (patient.grasp_high - patient.grasp_low) * late + patient.grasp_noise * noise[:, 0]
     minutes = np.arange(0, tremor.shape[1], STEPS_PER_MINUTE)

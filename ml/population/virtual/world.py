@@ -279,7 +279,7 @@ def end_rewards(settings: MdpSettings, grasp_hz: Floats, rating: Floats, tremor_
 
 
 def within_margins(policy: Truth, cdbs: Truth) -> bool:
-    """Whether no predicted outcome is truly worse than under cDBS by more than its margin."""
+    """Decide whether no predicted outcome is truly worse than under cDBS by more than its margin."""
     return all(o.slack(getattr(policy, o.field).value, getattr(cdbs, o.field).value, MARGINS.of(o)) >= 0 for o, _ in PREDICTED)
 
 
