@@ -5,6 +5,9 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 WORKERS ?= 2
 
+# What is compiled once is kept, whatever the environment says: tests begin two processes for each that they are run by.
+export PYTHONDONTWRITEBYTECODE :=
+
 .DEFAULT_GOAL := help
 .PHONY: help install demo smoke test test-slow check measure audit format lock bench soak clean
 
