@@ -9,7 +9,8 @@ from tests.architecture import measure
 
 def test_no_measure_rises() -> None:
     values = {name: value for name, value in measure.current()["measures"].items() if not name.startswith(measure.TRACED)}
-    measure.hold(values, details={name: found for name, (_, found) in measure.measurements().items()})
+    details = {name: found for name, (_, found) in measure.measurements().items()}
+    assert measure.unlike_record(values, details=details) == []
 
 
 def test_every_measure_is_recorded() -> None:
@@ -18,11 +19,12 @@ def test_every_measure_is_recorded() -> None:
 
 def test_a_rise_is_refused_and_a_fall_must_be_recorded() -> None:
     now = measure.ratchet()["measures"]["tables by string"]
-    measure.hold({"tables by string": now})
-    with pytest.raises(AssertionError, match="may only fall"):
-        measure.hold({"tables by string": now + 1})
-    with pytest.raises(AssertionError, match="Record it"):
-        measure.hold({"tables by string": now - 1})
+    assert measure.unlike_record({"tables by string": now}) == []
+    rose = measure.unlike_record({"tables by string": now + 1}, details={"tables by string": ["here"]})
+    assert rose == [f"measures may only fall: tables by string: {now} -> {now + 1}\ntables by string: here"]
+    (fell,) = measure.unlike_record({"tables by string": now - 1})
+    assert fell.startswith(f"measures fell: tables by string: {now} -> {now - 1}. Record it: ")
+    assert measure.unlike_record({"tables by string": now - 1}, exact=False) == []
 
 
 def test_lines_are_recorded_in_steps() -> None:
