@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Annotated
 
@@ -23,6 +24,9 @@ from app.tables.accounts import Scope
 COOKIE = "betaloop_session"
 METRICS = "/metrics"
 
+CALLER_AGE_S = 1.0
+"""Age of a caller found before the body was read, beyond which it is looked up again, seconds: a slow body outlives a revoked token."""
+
 _bearer = HTTPBearer(auto_error=False, description="API token from `betaloop token create`.")
 
 
@@ -32,10 +36,10 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
     Raises:
         Unauthorized: neither a live token nor a live browser session.
     """
-    caller = None
-    if bearer is not None:
+    caller = _found_before(request)
+    if caller is None and bearer is not None:
         caller = service.caller_of_token(db, bearer.credentials)
-    elif cookie := request.cookies.get(COOKIE):
+    elif caller is None and (cookie := request.cookies.get(COOKIE)):
         caller = service.caller_of_cookie(db, cookie)
     if caller is None:
         request.state.last_caller = service.last_user_of_cookie(db, request.cookies.get(COOKIE, ""))
@@ -55,6 +59,12 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
     request.state.caller = caller  # before a form is refused: the page that says so is of who has signed in, and drops what another typed
     _refuse_entries_of_others(request, caller)
     return caller
+
+
+def _found_before(request: Request) -> Caller | None:
+    """Return the caller that was found before the body was read; None where that was more than a second ago."""
+    found_at, caller = getattr(request.state, "found", (0.0, None))
+    return caller if time.monotonic() - found_at < CALLER_AGE_S else None
 
 
 def _refuse_entries_of_others(request: Request, caller: Caller) -> None:
@@ -92,7 +102,9 @@ async def judge(request: Request) -> str:
 
 def _judged(request: Request, bearer: HTTPAuthorizationCredentials | None) -> str:
     with new_session() as db:
-        return f"user {get_caller(request, db, bearer).user_id}"
+        caller = get_caller(request, db, bearer)
+    request.state.found = (time.monotonic(), caller)
+    return f"user {caller.user_id}"
 
 
 def caller_now(request: Request) -> Callable[[Session], Caller | None]:

@@ -137,6 +137,15 @@ def get_engine() -> Engine:
         return _engines[url]
 
 
+def lock_engine() -> Engine:
+    """Return the engine for locks that outlast a transaction. Each statement commits by itself, and one connection is kept when idle."""
+    url = database_url()
+    with _lock:
+        if (key := f"locks of {url}") not in _engines:
+            _engines[key] = create_engine(url, isolation_level="AUTOCOMMIT", pool_pre_ping=True, pool_size=1, max_overflow=-1)
+        return _engines[key]
+
+
 def new_session() -> Session:
     """Open a session outside a request (commands, workers); the caller commits and closes."""
     return Session(get_engine(), expire_on_commit=False)
@@ -251,8 +260,8 @@ def _announce(db: Session, connection: Connection) -> None:
 
 
 @event.listens_for(Session, "after_begin")
-def _after_begin(db: Session, _transaction: Any, connection: Connection) -> None:
-    if db.info.get("actor"):
+def _after_begin(db: Session, transaction: SessionTransaction, connection: Connection) -> None:
+    if db.info.get("actor") and not transaction.nested:  # the settings of the transaction hold in it too
         _announce(db, connection)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Any, NamedTuple
@@ -203,12 +204,27 @@ def next_ordinal(db: Session, visit_id: int) -> int:
     return (db.scalar(select(func.max(StudySession.ordinal)).where(StudySession.visit_id == visit_id)) or 0) + 1
 
 
+@contextmanager
+def traces_read_once(db: Session) -> Iterator[None]:
+    """Read the traces of each recording once within the block, which may change traces but neither adds nor removes any."""
+    db.info[_TRACES] = {}
+    try:
+        yield
+    finally:
+        del db.info[_TRACES]
+
+
+_TRACES = "traces by recording"
+
+
 def traces_of_recording(db: Session, recording_id: int) -> Sequence[Trace]:
     """The traces of a recording in its newest decode version."""
-    newest = select(func.max(Trace.decode_version)).where(Trace.recording_id == recording_id).scalar_subquery()
-    return db.scalars(
-        select(Trace).where(Trace.recording_id == recording_id, Trace.decode_version == newest).order_by(Trace.stream, Trace.channel)
-    ).all()
+    known: dict[int, Sequence[Trace]] = db.info.get(_TRACES, {})
+    if recording_id not in known:
+        newest = select(func.max(Trace.decode_version)).where(Trace.recording_id == recording_id).scalar_subquery()
+        query = select(Trace).where(Trace.recording_id == recording_id, Trace.decode_version == newest)
+        known[recording_id] = db.scalars(query.order_by(Trace.stream, Trace.channel)).all()
+    return known[recording_id]
 
 
 def traces_of_recordings(db: Session, recording_ids: Collection[int]) -> dict[int, list[Trace]]:

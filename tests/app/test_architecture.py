@@ -201,7 +201,7 @@ def test_the_session_commits_and_nothing_else_but_what_must_in_the_middle() -> N
         # an upload commits when its bytes are safe and again when they are decoded, so that a crash in between loses nothing
         "app/ingest/uploads/receiving.py",
         "app/ingest/uploads/service.py",
-        "app/ingest/uploads/in_progress.py",  # ends the statement of its lock, on a connection of its own
+        "app/ingest/uploads/in_progress.py",  # a count is taken back after its transaction was
         "app/ingest/quarantine/service.py",  # bytes are erased only after the decision is safe
         "app/accounts/sign_on.py",  # a refusal stands in the trail whatever becomes of the request
         # a failed sign-in counts whatever becomes of the request; so does when a session or token was last used

@@ -8,6 +8,7 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import event
 
+from app.accounts import deps
 from app.platform.database import get_engine
 from app.platform.kept import forget
 from tests.app.evaluations import judge as judge
@@ -99,3 +100,24 @@ def test_a_participants_page_asks_for_no_recording_once_it_has_been_seen(
     statements.clear()
     assert client.get("/participants/P1").text == seen
     assert not any("FROM recording" in s or "JOIN recording" in s for s in statements if "xmin" not in s)
+
+
+def test_a_request_with_a_body_looks_its_caller_up_once_unless_the_body_is_slow(
+    client: TestClient, participant_code: str, statements: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def looked_up(number: int) -> int:
+        statements.clear()
+        assert client.post("/api/v1/participants/P1/visits", json={"number": number}).status_code == 201
+        return sum("FROM api_token" in s for s in statements)
+
+    assert looked_up(7) == 1
+    monkeypatch.setattr(deps, "CALLER_AGE_S", 0.0)
+    assert looked_up(8) == 2
+
+
+def test_an_upload_reads_its_traces_once(upload: Callable[..., int], statements: list[str]) -> None:
+    upload("random", steps=20, qoc={})
+    statements.clear()
+    upload("random", steps=20, qoc={})
+    assert sum("FROM trace" in s for s in statements) == 1
+    assert len(statements) <= 55

@@ -60,8 +60,8 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
         # what differs from a session that counts is for a person to look at
         stated = replace(stated, confirm=False)
     day = local_day(placement.control, placement.started_at) if placement.started_at else None
-    visits = study.visits(db, participant.id, 1000, 0)[0]
     slot = logged.slot_of_recording(db, placement.control)
+    visits = study.visits(db, participant.id, 1000, 0)[0] if stated.visit is None or slot is not None else []
     if logged.rehearsed(placement.control) or differs_from_slot(slot, stated):
         # a log of a bench, or of another session than the sender says, is for a person to look at
         stated = replace(stated, confirm=False)

@@ -38,7 +38,13 @@ class UploadRoute(APIRoute):
 
 
 def _check(request: Request, bearer: HTTPAuthorizationCredentials | None) -> None:
-    """Raise Unauthorized for an unknown caller, Forbidden for one whose roles do not include uploads."""
-    with new_session() as db:
-        get_caller(request, db, bearer).require(can.UPLOAD)
+    """Raise Unauthorized for an unknown caller, Forbidden for one whose roles do not include uploads.
+
+    The caller is known where the size of the body was looked at just before.
+    """
+    caller = getattr(request.state, "caller", None)
+    if caller is None:
+        with new_session() as db:
+            caller = get_caller(request, db, bearer)
+    caller.require(can.UPLOAD)
     limited.prepare()

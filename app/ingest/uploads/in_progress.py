@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import structlog
-from sqlalchemy import NullPool, create_engine, text
+from sqlalchemy import text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from app.ingest import repository
-from app.platform.database import database_url
+from app.platform.database import lock_engine
 from app.platform.errors import passing
 
 log = structlog.get_logger()
@@ -59,19 +59,17 @@ def told(upload_id: int) -> Progress | None:
 @contextmanager
 def in_progress(upload_id: int) -> Iterator[None]:
     """Lock an upload that is being received, on a connection of its own, for the upload itself commits in between."""
-    engine = create_engine(database_url(), poolclass=NullPool)
-    with engine.connect() as connection:
+    with lock_engine().connect() as connection:
         connection.execute(text("select pg_advisory_lock(:space, :upload)"), {"space": LOCKS, "upload": upload_id})
-        connection.commit()
         try:
             yield
         finally:
             _progress.pop(upload_id, None)
-            # The server frees it too once it notices that the connection is gone, which on a busy machine is a moment later. Where the
-            # database is away the lock is gone with the connection, and the error that ended the upload is reported, not this.
-            with suppress(DBAPIError):
+            try:
                 connection.execute(text("select pg_advisory_unlock(:space, :upload)"), {"space": LOCKS, "upload": upload_id})
-                connection.commit()
+            except DBAPIError:
+                # the lock goes with the connection, and the error that ended the upload is reported, not this
+                connection.invalidate()
 
 
 @contextmanager

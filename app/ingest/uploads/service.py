@@ -109,13 +109,14 @@ def state_session(
         raise Invalid(
             f"The stated start {started_at} is out of range: {error}.", "Give the start of the session.", field="started_at"
         ) from error
-    known = ", ".join(str(v.number) for v in study.visits(db, participant.id, 500, 0)[0])
     visit = study.visit_by_number(db, participant.id, visit_number) if visit_number is not None else None
-    if visit is None and visit_number is not None:
-        listed = f"visits: {known or 'none yet'}"
-        raise Invalid(f"Participant {participant.code} has no visit {visit_number} ({listed}).", "Add the visit first.", field="visit")
-    if not known:
-        raise Invalid(f"Participant {participant.code} has no visit yet.", "Add the visit first.", field="visit")
+    if visit is None:
+        known = ", ".join(str(v.number) for v in study.visits(db, participant.id, 500, 0)[0])
+        if visit_number is not None:
+            listed = f"visits: {known or 'none yet'}"
+            raise Invalid(f"Participant {participant.code} has no visit {visit_number} ({listed}).", "Add the visit first.", field="visit")
+        if not known:
+            raise Invalid(f"Participant {participant.code} has no visit yet.", "Add the visit first.", field="visit")
     if controller is not None and visit is not None and confirm:
         require_unlocked(visit)
     if controller is not None and visit is None and confirm:
@@ -271,7 +272,7 @@ def make_sessions(db: Session, outcome: UploadOutcome, stated: StatedSession) ->
     created: list[making.NewSession] = []
     trouble = ""
     try:
-        with db.begin_nested():
+        with db.begin_nested(), study.traces_read_once(db):
             created = making.make_sessions(db, outcome.participant, outcome.upload, list(fresh.values()), stated)
     except Exception as fault:
         if passing(fault) is not None:
