@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import shutil
 import subprocess
 import sys
@@ -22,7 +23,9 @@ from sqlalchemy import event, make_url, text
 from app.platform.database import database_url, get_engine, new_session
 from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
+from tests import between_workers
 from tests.app.every_route import World
+from tests.between_workers import one_at_a_time
 from tests.conftest import Template, close_connections, copy_database, copy_of, drop_database, own_database
 from tests.s3_server import CREDENTIALS, Server
 
@@ -46,10 +49,16 @@ def table(amplitude: NDArray[np.float64], rng: np.random.Generator, lead: int = 
 
 @pytest.fixture(scope="session")
 def full_study(server: EmbeddedPostgres, application: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Template, World]:
-    """A study in use with a row for every route, made once."""
+    """A study in use with a row for every route, made once by one of the workers of a run."""
     data = tmp_path_factory.mktemp("full") / "data"
-    with pytest.MonkeyPatch.context() as patch, own_database(server, data, patch, "betaloop", keep="filled"):
-        world = World(application)
+    several = "PYTEST_XDIST_WORKER" in os.environ
+    folder = tmp_path_factory.getbasetemp().parent / "filled" if several else tmp_path_factory.mktemp("filled")
+    with one_at_a_time(folder), pytest.MonkeyPatch.context() as patch, own_database(server, data, patch, "betaloop", keep="filled"):
+        database = str(make_url(database_url()).database)
+        known = between_workers.take(server, database, data, folder)
+        world = World(application, known)
+        if known is None and several:
+            between_workers.give(server, database, data, world.state(), folder)
     return ("filled", data), world
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+from base64 import b64decode, b64encode
 from datetime import UTC, datetime
 from typing import Any
 
@@ -63,10 +65,23 @@ def token_of(role: str, study: str | None = None, name: str | None = None) -> st
 class World:
     """A study in which every route has a row to work on: one in use, and what is waiting to be decided on."""
 
-    def __init__(self, app: Any) -> None:
+    def __init__(self, app: Any, state: str | None = None) -> None:
+        """Fill the empty database in use, or take up the one of whose world `state` was given."""
         self.app = app
-        self.made = 0
-        self.admin = self.calling(token_of("admin"))
+        if state is None:
+            self.made = 0
+            self.token = token_of("admin")
+            self.admin = self.calling(self.token)
+            self._fill()
+        else:
+            self.made, self.token, self.ids, self.forms = pickle.loads(b64decode(state))
+            self.admin = self.calling(self.token)
+
+    def state(self) -> str:
+        """What another process needs to know of the rows."""
+        return b64encode(pickle.dumps((self.made, self.token, self.ids, self.forms))).decode()
+
+    def _fill(self) -> None:
         FilledStudy(self.admin)
         ranking = self.read("/participants/P2/ranking")
         open_visit = next(v["id"] for v in self.read("/participants/P2/visits")["items"] if v["number"] == 4)
