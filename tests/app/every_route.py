@@ -78,7 +78,7 @@ class World:
             self.admin = self.calling(self.token)
 
     def state(self) -> str:
-        """What another process needs to know of the rows."""
+        """Write what another process needs to know of the rows."""
         return b64encode(pickle.dumps((self.made, self.token, self.ids, self.forms))).decode()
 
     def _fill(self) -> None:

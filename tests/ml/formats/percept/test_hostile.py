@@ -14,16 +14,6 @@ from ml.formats import UndecodableFile, decode, redact, sniff
 RIGHT = "ONE_THREE_RIGHT"
 
 
-@pytest.fixture
-def write(tmp_path):
-    def make(content, name="report.json"):
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else json.dumps(content).encode())
-        return path
-
-    return make
-
-
 def trace(recording, stream):
     return next(t for t in recording.traces if t.stream == stream)
 

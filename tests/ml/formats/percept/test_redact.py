@@ -14,16 +14,6 @@ SECRETS = ("Ada", "Lovelace", "MRN4711", "NPX799999H", "LEAD4711", "Ockham", "20
 
 
 @pytest.fixture
-def write(tmp_path):
-    def make(content, name="report.json"):
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else json.dumps(content).encode())
-        return path
-
-    return make
-
-
-@pytest.fixture
 def secret(percept):
     """A report with a name in every place that holds text."""
     report = percept.one_run(lost=(4,))

@@ -17,16 +17,6 @@ from ml.signals import band_pass
 RIGHT, LEFT = "ONE_THREE_RIGHT", "ZERO_TWO_LEFT"
 
 
-@pytest.fixture
-def write(tmp_path):
-    def make(content, name="report.json"):
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else json.dumps(content).encode())
-        return path
-
-    return make
-
-
 def trace(recording, stream):
     return next(t for t in recording.traces if t.stream == stream)
 

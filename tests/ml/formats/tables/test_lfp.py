@@ -12,16 +12,6 @@ from ml.formats import DecodeOptions, UndecodableFile, decode, sniff
 RATE = 250
 
 
-@pytest.fixture
-def write(tmp_path):
-    def make(content, name="table.csv"):
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return make
-
-
 def lfp_csv(header="t_s,lfp [uV]", seconds=20.0, rate=RATE, first=0, scale=1.0, decimals=4, gone=(), extra=""):
     k = np.arange(first, int(seconds * rate))
     t = (k + 1) / rate

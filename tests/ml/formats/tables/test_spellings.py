@@ -15,16 +15,6 @@ PLAIN = "t_s,beta [uV],amplitude_ma\n2,10.5,2.5\n4,11.5,2.0\n6,,2.0\n8,12.5,1.5\
 BODY = PLAIN[PLAIN.index("\n") + 1 :]
 
 
-@pytest.fixture
-def write(tmp_path):
-    def make(content, name="table.csv"):
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return make
-
-
 def traces(path):
     assert sniff(path) == "csv"
     (recording,) = decode(path).recordings

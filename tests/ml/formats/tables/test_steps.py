@@ -15,16 +15,6 @@ from ml.formats.tables.numbers import unit_name
 HEADER = "t_s,beta,amplitude_fraction\n"
 
 
-@pytest.fixture
-def write(tmp_path):
-    def make(content, name="table.csv"):
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return make
-
-
 def trace(decoded, stream):
     return next(t for t in decoded.recordings[0].traces if t.stream == stream)
 
