@@ -51,7 +51,7 @@ def worker(fresh_database: str) -> Any:
     process = run("import mean_beta_kind; mean_beta_kind.work()")
     yield process
     process.terminate()
-    process.wait(20)
+    process.wait(300)
 
 
 @pytest.mark.slow

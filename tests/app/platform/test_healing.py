@@ -158,4 +158,4 @@ def test_a_worker_whose_database_was_killed_goes_on(data: Path) -> None:
                 break  # it gave a sign of life after the kill
     finally:
         worker.send_signal(signal.SIGTERM)
-        worker.wait(30)
+        worker.wait(300)

@@ -69,7 +69,7 @@ def wait_for(data: Path, sentence: str, process: subprocess.Popen[bytes]) -> Non
 
 
 def assert_nothing_left(data: Path) -> None:
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while (left := left_in(data)) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not left
@@ -83,7 +83,7 @@ def test_a_stopped_service_leaves_nothing_behind(data: Path, command: str, runni
     wait_for(data, running, process)
     assert (data / "postgres" / "postmaster.pid").exists()
     process.send_signal(number)
-    process.wait(60)
+    process.wait(300)
     assert_nothing_left(data)
 
 
@@ -106,5 +106,5 @@ def test_a_stop_during_the_start_leaves_nothing_behind(data: Path) -> None:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.terminate()
-    process.wait(60)
+    process.wait(300)
     assert_nothing_left(data)

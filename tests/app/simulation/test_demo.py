@@ -100,7 +100,7 @@ def demo() -> Iterator[Demo]:
         wait(data, process, lambda: len(done(data)) >= 30)
         (loader,) = [p for p in psutil.Process(process.pid).children() if "app.simulation.demo.loader" in p.cmdline()]
         loader.send_signal(signal.SIGKILL)
-        assert process.wait(60) != 0
+        assert process.wait(300) != 0
         assert "goes on where it was" in said.read_text()
         before = done(data)
         said.write_text("")

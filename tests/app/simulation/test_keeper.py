@@ -48,7 +48,7 @@ def demo(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[psutil.Pope
     process = psutil.Popen(
         [sys.executable, "-c", PROGRAM, str(tmp_path), *loader], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while MODULE not in process.cmdline():
         assert time.monotonic() < deadline
         assert process.poll() is None
@@ -72,7 +72,7 @@ def test_a_signal_stops_the_services_and_then_itself(demo: psutil.Popen, tmp_pat
     services = demo.children()
     assert len(services) == 2
     demo.send_signal(number)  # also one that comes before the keeper can handle it
-    said, complained = demo.communicate(timeout=60)
+    said, complained = demo.communicate(timeout=300)
     assert (demo.returncode, said.replace(READY, "").strip(), complained) == (0, "Stopping …", "")
     assert not [one for one in services if one.is_running()]
     assert set((tmp_path / "ended").read_text().split()) == {"web", "worker"}
@@ -81,7 +81,7 @@ def test_a_signal_stops_the_services_and_then_itself(demo: psutil.Popen, tmp_pat
 def test_a_service_that_ends_by_itself_ends_the_demo_with_a_sentence(demo: psutil.Popen, tmp_path: Path) -> None:
     web, worker = demo.children()
     web.kill()
-    said, complained = demo.communicate(timeout=60)
+    said, complained = demo.communicate(timeout=300)
     assert (demo.returncode, said.replace(READY, "").strip()) == (1, "")
     assert complained == f"betaloop: The web service or the worker ended by itself. See the files in {tmp_path / 'log'}.\n"
     assert not worker.is_running()
@@ -94,12 +94,12 @@ def test_it_says_when_the_study_is_loaded_and_goes_on(demo: psutil.Popen) -> Non
     assert "".join(demo.stdout.readline() for _ in range(2)).rstrip("\n") == READY
     assert demo.poll() is None
     demo.send_signal(signal.SIGINT)
-    assert demo.wait(60) == 0
+    assert demo.wait(300) == 0
 
 
 @pytest.mark.parametrize("demo", [["import sys; sys.exit(1)"]], indirect=True)
 def test_a_study_that_cannot_be_loaded_ends_the_demo_with_a_sentence(demo: psutil.Popen, tmp_path: Path) -> None:
-    _, complained = demo.communicate(timeout=60)
+    _, complained = demo.communicate(timeout=300)
     assert demo.returncode == 1
     assert complained.startswith("betaloop: The demo's study could not be loaded; started again, the demo goes on where it was.")
     assert set((tmp_path / "ended").read_text().split()) == {"web", "worker"}
@@ -110,5 +110,5 @@ def test_a_signal_stops_the_loader_too(demo: psutil.Popen) -> None:
     children = demo.children()
     assert len(children) == 3
     demo.send_signal(signal.SIGINT)
-    assert demo.wait(60) == 0
+    assert demo.wait(300) == 0
     assert not [one for one in children if one.is_running()]

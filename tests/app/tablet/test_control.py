@@ -228,7 +228,7 @@ def test_the_command_says_in_words_and_as_json_and_its_exit_code(bundle: Path) -
     runner = CliRunner()
     only = runner.invoke(command_line, ["control", "--bundle", str(bundle), "--key", PUBLIC])
     assert only.exit_code == 0
-    assert "signature, 23 files and test vectors are right" in only.output
+    assert "signature, 25 files and test vectors are right" in only.output
     assert "NOT APPROVED" in only.output
     call = ["control", "--bundle", str(bundle), "--key", PUBLIC, "--source", "cohort:P2:1", "--steps", "20", "--speed", "fast"]
     words = runner.invoke(command_line, call)

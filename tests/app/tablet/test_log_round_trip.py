@@ -106,7 +106,7 @@ def test_the_log_of_a_bundles_own_runner_gives_back_what_the_device_had(tmp_path
             runner.stdin.flush()
             amplitude = float(runner.stdout.readline().split()[0])
         runner.stdin.close()
-        assert runner.wait(20) == 0
+        assert runner.wait(300) == 0
     same_as_the_device(decode(tmp_path / "bundle" / "log.csv"), device)
     again = subprocess.run(call, cwd=tmp_path / "bundle", input="1\n", capture_output=True, text=True, check=False)
     assert (again.returncode, "log.csv is there already" in again.stderr) == (1, True)
@@ -122,7 +122,7 @@ def test_a_runner_whose_reader_went_away_says_so_and_blames_no_log(tmp_path: Pat
         assert runner.stdout is not None
         runner.stdout.close()
         runner.stdout = None
-        _, said = runner.communicate("1\n1\n1\n", timeout=20)
+        _, said = runner.communicate("1\n1\n1\n", timeout=300)
     assert runner.returncode == 1
     assert said.splitlines()[-1] == "nobody reads the amplitudes any more"
 

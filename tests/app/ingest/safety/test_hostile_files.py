@@ -35,7 +35,7 @@ def service(participant_code: str, make_token: Callable[[str], str]) -> Iterator
             yield client, process
     finally:
         process.terminate()
-        process.wait(30)
+        process.wait(300)
 
 
 def _wait_for(client: httpx.Client) -> None:

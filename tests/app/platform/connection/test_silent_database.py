@@ -65,7 +65,7 @@ def seconds_to_stop(process: subprocess.Popen[bytes]) -> float:
     """Ask a process to stop, and time it."""
     asked = time.monotonic()
     process.send_signal(signal.SIGTERM)
-    process.wait(60)
+    process.wait(300)
     return time.monotonic() - asked
 
 

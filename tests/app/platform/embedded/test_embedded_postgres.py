@@ -59,10 +59,10 @@ def test_the_server_outlives_one_of_two_users_and_not_the_last(tmp_path: Path) -
     ]
     pids = {int(u.stdout.readline()) for u in users if u.stdout}
     assert len(pids) == 1
-    users[0].communicate("\n", timeout=30)
+    users[0].communicate("\n", timeout=300)
     assert Path(f"/proc/{pids.copy().pop()}").exists()
-    users[1].communicate("\n", timeout=30)
-    deadline = time.monotonic() + 10
+    users[1].communicate("\n", timeout=300)
+    deadline = time.monotonic() + 60
     while Path(f"/proc/{min(pids)}").exists() and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not Path(f"/proc/{min(pids)}").exists()

@@ -86,7 +86,7 @@ def who(children: ForkedProcesses, folder: Path) -> int:
 
 
 def wait_until_gone(pid: int) -> None:
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 90
     while psutil.pid_exists(pid):  # a zombie exists too
         assert time.monotonic() < deadline
         time.sleep(0.02)

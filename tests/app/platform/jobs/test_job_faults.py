@@ -69,7 +69,7 @@ def test_an_orderly_stop_kills_the_children_and_another_worker_takes_over_at_onc
     children = jobs.children(stopped)
     assert len(children) == 2
     stopped.send_signal(signal.SIGTERM)
-    assert stopped.wait(60) == 0
+    assert stopped.wait(300) == 0
     assert all(_gone(c) for c in children)
     job = jobs.ended(job_id, 50)
     assert (job.status, jobs.counted(job_id)) == ("succeeded", [0, 1])
@@ -126,7 +126,7 @@ def test_a_job_that_nobody_runs_any_more_is_cancelled_at_once(jobs):
     job_id = jobs.submit(parts=1, numbers=1000, pause_s=0.1)
     jobs.wait(lambda: jobs.numbers(job_id, 0))
     worker.send_signal(signal.SIGTERM)
-    worker.wait(60)
+    worker.wait(300)
     with transaction("test") as db:
         assert service.cancel(db, repository.get(db, job_id), "test").status == "cancelled"
     counted = len(jobs.numbers(job_id, 0))
@@ -178,7 +178,7 @@ def test_a_job_that_kills_every_worker_is_given_up(jobs):
     job_id = jobs.submit("fail", how="kills worker")
     for _ in range(engine.MAX_RECOVERIES + 1):
         worker = jobs.start_worker()
-        assert worker.wait(30) == -signal.SIGKILL
+        assert worker.wait(300) == -signal.SIGKILL
     survivor = jobs.start_worker()
     job = jobs.ended(job_id)
     assert job.status == "failed"

@@ -34,4 +34,4 @@ def test_a_connection_outlives_a_pause(data: Path) -> None:
             assert connection.sock is socket, "http.client opens a new one where the old was ended"
     finally:
         service.send_signal(signal.SIGTERM)
-        service.wait(30)
+        service.wait(300)

@@ -103,7 +103,7 @@ def port(service_app: Any) -> Iterator[int]:
     server = uvicorn.Server(uvicorn.Config(service_app, host="127.0.0.1", port=0, log_level="error", lifespan="off"))
     thread = threading.Thread(target=server.run)
     thread.start()
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 300
     while not server.started:
         assert time.monotonic() < deadline, "the service did not start"
         time.sleep(0.01)
