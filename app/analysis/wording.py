@@ -120,9 +120,14 @@ def basis(tested: Tested) -> str:
     return "confirmation" + (f"; {counted(left, 'earlier session')} that may have picked it left out" if left else "")
 
 
-def verdict(result: VerdictResult) -> str:
-    """The verdict in one sentence that a clinician can quote."""
-    name = CONTROLLER_NAMES[result.controller]
+def is_open(result: VerdictResult) -> bool:
+    """Return whether a verdict settles nothing."""
+    return result.assessment is None or isinstance(result.assessment.verdict, Inconclusive)
+
+
+def verdict(result: VerdictResult, name: str = "") -> str:
+    """Return the verdict in one sentence that a clinician can quote; `name` is the policy's, where it is not on a whole controller."""
+    name = name or CONTROLLER_NAMES[result.controller]
     if result.assessment is None:
         if result.no_verdict is NoVerdict.NO_VISIT_AFTER_LOCK and result.locked.until is not None:
             return f"No verdict on {name}: no visit began while these margins were locked."

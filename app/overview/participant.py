@@ -17,6 +17,7 @@ from app.accounts.permissions import Caller
 from app.analysis.evidence.service import Evidence, evidence
 from app.analysis.metrics import service as analysis
 from app.analysis.metrics.charts import view
+from app.analysis.standing import standing_sentences
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.staleness import stale_reasons
 from app.evaluation.what_next import what_next
@@ -53,6 +54,7 @@ def participant_page(request: Request, participant: CurrentParticipant, db: Db, 
         state=state.states(db, [participant], datetime.now(UTC).date())[participant.id],
         phases=state.PHASES,
         answer=_answer(db, participant, caller),
+        standings=standing_sentences(db, participant, caller),
         what=wording.what,
         characteristics=characteristics_words(fields_of(participant.current_characteristics)),
         actors=wording.ACTORS,

@@ -74,7 +74,10 @@ def test_the_first_screen_says_what_to_test_what_it_costs_and_what_not_to_touch(
 
 def test_where_nothing_is_worth_a_visit_the_first_screen_says_what_to_do_instead(window: Callable, undecided: None) -> None:  # type: ignore[type-arg]
     words = answered(window(1280, SCREEN))
-    assert "No policy is worth a visit yet. At the next visit: random and cDBS sessions, from which better policies can" in words
+    assert (
+        "By prediction, no policy is worth a visit yet. At the next visit: random and cDBS sessions, from which better policies can"
+        in words
+    )
     assert "Why: The best of those that may be run is rl-04, energy" in words
     assert "Nor can it be told of 3 more." in words
     assert "a test asks for 80 % likely no worse" in words

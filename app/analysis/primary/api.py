@@ -13,6 +13,7 @@ from app.analysis.primary.schemas import PrimaryOut
 from app.analysis.primary.serializers import primary_out
 from app.platform.database import Db
 from app.platform.web.schemas import problems
+from app.platform.web.templates import Part, make_part
 from app.study.deps import CurrentParticipant
 
 router = APIRouter(tags=["analysis"], responses=problems(401, 403, 404, 422))
@@ -31,4 +32,5 @@ def read_primary(
 ) -> PrimaryOut | Response:
     """Each controller and policy against the same visit's cDBS, with the visit as the unit of evidence, and the verdicts on the margins."""
     found = service.primary(db, participant, caller)
-    return primary_csv(found) if format == "csv" else primary_out(found)
+    standings = make_part(Part.STANDINGS, db, participant, caller)
+    return primary_csv(found, standings) if format == "csv" else primary_out(found, standings)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from fastapi import Response
 
 from app.analysis.primary.serializers import CSV_COLUMNS, csv_rows
@@ -9,7 +11,10 @@ from app.analysis.primary.service import Primary
 from app.analysis.tables import csv_of
 from app.platform.web.csv_files import download
 
+_POLICY = CSV_COLUMNS.index("policy_id")
 
-def primary_csv(found: Primary) -> Response:
-    """One row per controller or policy and metric."""
-    return download(csv_of(CSV_COLUMNS, csv_rows(found)), f"{found.evidence.participant}-primary.csv")
+
+def primary_csv(found: Primary, standings: Mapping[int, str]) -> Response:
+    """Write one row per controller or policy and metric; `standings` has a sentence by policy."""
+    rows = [(*row, standings.get(row[_POLICY])) for row in csv_rows(found)]  # type: ignore[call-overload]
+    return download(csv_of((*CSV_COLUMNS, "standing"), rows), f"{found.evidence.participant}-primary.csv")

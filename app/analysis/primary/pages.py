@@ -18,7 +18,7 @@ from app.analysis.primary.serializers import unit_of
 from app.platform.database import Db
 from app.platform.errors import NotFound
 from app.platform.web.charts import written
-from app.platform.web.templates import render
+from app.platform.web.templates import Part, make_part, render
 from app.study.deps import CurrentParticipant
 
 router = APIRouter()
@@ -33,6 +33,7 @@ def primary_page(request: Request, participant: CurrentParticipant, db: Db, call
         "analysis/primary.html",
         participant=participant,
         found=found,
+        standings=make_part(Part.STANDINGS, db, participant, caller),
         wording=wording,
         units=_units(found),
     )
@@ -42,7 +43,7 @@ def primary_page(request: Request, participant: CurrentParticipant, db: Db, call
 @router.get("/participants/{code}/analyses.csv")
 def primary_table(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
     """The primary comparisons as a table."""
-    return primary_csv(service.primary(db, participant, caller))
+    return primary_csv(service.primary(db, participant, caller), make_part(Part.STANDINGS, db, participant, caller))
 
 
 @router.get("/participants/{code}/analyses/visits/{key}")

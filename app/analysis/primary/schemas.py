@@ -114,6 +114,13 @@ class VerdictOut(Model):
     late_stop_session_ids: list[int] = Field(description="Stopped too, but known only after the lock of the visit: counted as measured.")
 
 
+class StandingOut(Model):
+    """Standing of a policy, in the words of every page."""
+
+    policy_id: int
+    sentence: str
+
+
 class PrimaryOut(Model):
     """Controllers and policies against the same visit's cDBS."""
 
@@ -126,3 +133,4 @@ class PrimaryOut(Model):
         description="Under locks that a newer one followed, oldest first: of the visits that began between the two."
     )
     results: list[TestedOut]
+    standings: list[StandingOut] = Field(description="Of each policy: its harms, its own sessions, its prediction.")

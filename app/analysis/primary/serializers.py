@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 
 from app.analysis import wording
@@ -13,6 +14,7 @@ from app.analysis.primary.schemas import (
     PrimaryComparisonOut,
     PrimaryOut,
     SensitivityOut,
+    StandingOut,
     TestedOut,
     VerdictOut,
     VisitRowOut,
@@ -34,8 +36,8 @@ CSV_COLUMNS = (
 VERDICT_NAMES = {NonInferiorAndSaving: "non_inferior_and_saving", Inferior: "inferior", Inconclusive: "inconclusive"}
 
 
-def primary_out(found: Primary) -> PrimaryOut:
-    """Everything of one participant."""
+def primary_out(found: Primary, standings: Mapping[int, str]) -> PrimaryOut:
+    """Convert the results of one participant; `standings` has a sentence by policy."""
     return PrimaryOut(
         participant=found.evidence.participant,
         level=LEVEL,
@@ -44,6 +46,7 @@ def primary_out(found: Primary) -> PrimaryOut:
         verdicts=[verdict_out(v) for v in found.verdicts],
         earlier_verdicts=[verdict_out(v) for v in found.earlier],
         results=[_tested(r, found) for r in found.results],
+        standings=[StandingOut(policy_id=i, sentence=text) for i, text in standings.items()],
     )
 
 

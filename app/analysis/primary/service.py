@@ -16,7 +16,7 @@ from app.analysis.evidence.measurements import choose, comparable_beta, of_contr
 from app.analysis.evidence.service import Evidence
 from app.analysis.primary import repository
 from app.analysis.primary.results import PLANNED, ControllerResult, results
-from app.analysis.primary.verdict import LockedMargins, VerdictResult, earlier_verdicts, verdicts
+from app.analysis.primary.verdict import LockedMargins, VerdictResult, earlier_verdicts, policy_verdicts, verdicts
 from app.platform.errors import NotFound
 from app.platform.kept import kept
 from app.study.margins.service import margins_of
@@ -83,6 +83,17 @@ def _of(held: Evidence, locks: Sequence[LockedMargins], names: Mapping[int, str]
 def verdicts_of(db: Session, participant: Participant, caller: Caller) -> tuple[VerdictResult, ...]:
     """The verdicts of `primary` alone, for pages that show no comparison: those of forty policies take many times as long."""
     return _verdicts(evidence.of_all(db, [participant], caller)[0], locked_margins(participant)[-1])
+
+
+def policy_verdicts_of(facts: Evidence, participant: Participant) -> dict[int, VerdictResult]:
+    """Return by policy the verdict on its own sessions, by the margins in force."""
+    locked = locked_margins(participant)[-1]
+
+    def compute() -> dict[int, VerdictResult]:
+        sessions = with_comparable_beta(facts.sessions, comparable_beta(facts.sessions, facts.beta_unit, facts.beta_source))
+        return policy_verdicts(sessions, locked, facts.failed)
+
+    return kept(("policy verdicts", facts.key, locked), compute)
 
 
 def _verdicts(held: Evidence, locked: LockedMargins) -> tuple[VerdictResult, ...]:

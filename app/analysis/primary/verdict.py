@@ -99,6 +99,27 @@ def verdicts(sessions: Sequence[Facts], controllers: Sequence[Controller], locke
     return found
 
 
+def policy_verdicts(sessions: Sequence[Facts], margins: LockedMargins, failure: Qoc) -> dict[int, VerdictResult]:
+    """Return by policy the verdict on its own sessions, by the margins in force, without planning.
+
+    None confirms: earlier sessions decided which policies ran on. Arguments as of `verdicts`, whose `locked` and `failed` these are.
+    """
+    ran = sorted({(s.arm.policy_id, s.controller) for s in sessions if s.arm.policy_id is not None})
+    return {
+        i: _judge(
+            sessions,
+            [s for s in sessions if s.controller is Controller.CDBS or s.arm.policy_id == i],
+            controller,
+            margins,
+            failure,
+            confirmatory=False,
+            plan=False,
+        )
+        for i, controller in ran
+        if i is not None
+    }
+
+
 def earlier_verdicts(
     sessions: Sequence[Facts], controllers: Sequence[Controller], locks: Sequence[LockedMargins], failed: Qoc
 ) -> list[VerdictResult]:

@@ -23,7 +23,7 @@ from app.learning.sweeps.comparison import below_bound
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, NotFound
 from app.platform.web.forms import FormValues, field_notes, parse
-from app.platform.web.templates import render
+from app.platform.web.templates import Part, make_part, render
 from app.study import repository as study_repository
 from app.study.deps import CurrentParticipant, ResultsViewed
 from app.study.service import may, require
@@ -88,6 +88,7 @@ def _page(
         curves=curve_charts(policy.metrics.get("curve", {}), f"policy {policy.name}"),
         config={k: v for k, v in policy.config.items() if not k.endswith("_every")},
         row=row,
+        standing=make_part(Part.STANDINGS, db, participant, caller).get(policy.id, ""),
         picture=judged.picture(participant.current_settings.bound, policy.id) if judged and row else None,
         other=other_than(policy, learning.candidates(db, participant.id), answered),
         same=_same(policy, answered) if answered else [],

@@ -25,7 +25,7 @@ from app.platform.errors import NotFound
 from app.platform.jobs import registry
 from app.platform.jobs import repository as jobs
 from app.platform.web.forms import parse
-from app.platform.web.templates import render, render_part
+from app.platform.web.templates import Part, make_part, render, render_part
 from app.study.deps import CurrentParticipant, ResultsViewed
 from app.study.service import may
 from app.tables.jobs import JobStatus
@@ -67,6 +67,7 @@ def ranking_page(
         "evaluation/ranking.html",
         participant=participant,
         ranking=found,
+        standings=make_part(Part.STANDINGS, db, participant, caller) if found else {},
         answer=judged.answer if judged else None,
         body=_body(judged, found, shown, may_plan, may_run, unfolded=bool(method)) if judged and found else "",
         missing=missing,

@@ -26,7 +26,7 @@ from app.planning.plans.schemas import (
     PlanWarningOut,
     Removal,
 )
-from app.planning.plans.view import PlanLine, PlanView, shown
+from app.planning.plans.view import PlanLine, PlanView, shown, standings_of
 from app.planning.plans.view import read_plan as plan_of
 from app.planning.protocol.session_order import Order
 from app.platform.audit import record
@@ -76,7 +76,7 @@ def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
     name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
     from app.planning.sheet import pdf  # what writes PDF takes long to load: a service that was killed is back sooner without it
 
-    content = pdf.render(view, _bundles(db, view), caller.label, now())
+    content = pdf.render(view, _bundles(db, view), caller.label, now(), standings_of(db, view, caller))
     return Response(content, media_type="application/pdf", headers={"Content-Disposition": f'inline; filename="{name}"'})
 
 

@@ -20,7 +20,7 @@ from app.planning import draft_form, wording
 from app.planning.plans import key, repository, service
 from app.planning.plans.schemas import Id, Move
 from app.planning.plans.sign_off import MEANING
-from app.planning.plans.view import PlanView, read_plan, shown
+from app.planning.plans.view import PlanView, read_plan, shown, standings_of
 from app.planning.plans.visits import remove_visit, today, visit_for_draft
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, NotFound
@@ -214,6 +214,7 @@ def _page(
         movable=_movable(view),
         order_words=wording.order_words,
         session_name=wording.session_name,
+        standings=standings_of(db, view, caller) if view else [],
         warnings=[text for _, text in wording.plain_warnings(view.warnings)] if view else [],
         method_notes=wording.method_notes(view.warnings) if view else [],
         remarks=field_notes(error, dict.fromkeys(values, "")) if values is not None else {},

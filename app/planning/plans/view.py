@@ -28,6 +28,7 @@ from app.planning.protocol.medication import due_before
 from app.planning.wording import ANSWER_EVENT, happened
 from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
 from app.platform.signatures.service import SignatureState
+from app.platform.web.templates import Part, make_part
 from app.study import service as study
 from app.study.adverse_events.service import Events
 from app.study.characteristics.service import fields_of
@@ -159,6 +160,12 @@ def shown(view: PlanView) -> PlanView:
         for line in view.lines
     ]
     return replace(view, lines=lines, warnings=without_policies(view.warnings))
+
+
+def standings_of(db: Session, view: PlanView, caller: Caller) -> list[str]:
+    """Return a sentence on the standing of each policy that a plan shows; a sealed one shows none."""
+    planned = {line.policy.id for line in shown(view).lines if line.policy}
+    return [text for i, text in make_part(Part.STANDINGS, db, view.visit.participant, caller).items() if i in planned] if planned else []
 
 
 def _masked(item: PlanItem, limits: CommonLimits | None) -> PlanItem:

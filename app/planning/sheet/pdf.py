@@ -6,7 +6,7 @@ is not approved says so across every page.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 
 from fpdf import FPDF
@@ -91,12 +91,13 @@ def _approval(view: PlanView) -> str:
     return f"{by}, signature {view.signature.sha256[:12]}" if view.signature else by
 
 
-def render(view: PlanView, bundles: Mapping[int, str], printed_by: str, printed_at: datetime) -> bytes:
+def render(view: PlanView, bundles: Mapping[int, str], printed_by: str, printed_at: datetime, standings: Sequence[str] = ()) -> bytes:
     """The sheet of a plan as PDF bytes.
 
     Args:
         view: the plan. bundles: SHA-256 of the newest bundle that was taken for a session, by the number of its plan item.
         printed_by: who printed it. printed_at: when; stands on the page and in the document's metadata.
+        standings: sentences on the policies.
     """
     view = shown(view)
     pdf = _Sheet(view, printed_by, printed_at)
@@ -105,6 +106,8 @@ def render(view: PlanView, bundles: Mapping[int, str], printed_by: str, printed_
     _circumstances(pdf, view)
     if view.plan.note:
         _paragraph(pdf, "Note", view.plan.note)
+    for text in standings:
+        _paragraph(pdf, "Standing", text)
     draw_cards(pdf, view, bundles)
     _designs(pdf, view)
     _reading(pdf, view)

@@ -116,6 +116,7 @@ class Part(StrEnum):
     """Part of a page that a later phase makes, from the session, the record of the page, and the caller."""
 
     SLOTS_OF_VISIT = "planned sessions against recorded ones, on the page of a visit"
+    STANDINGS = "a sentence on every policy, by its number, on pages that show policies"
     OUTLOOK = "sentences on what further visits would settle, on the page of a draft"
 
 

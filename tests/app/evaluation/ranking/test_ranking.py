@@ -305,7 +305,7 @@ def test_an_evaluation_without_a_posterior_proposes_nothing_and_says_so(
         "retired: worn out",
     )
     page = client.get("/participants/P1/ranking").text
-    assert "No policy is worth a visit yet" in page
+    assert "By prediction, no policy is worth a visit yet" in page
     assert "evaluate again" in page
 
 

@@ -101,7 +101,10 @@ def test_without_ordering_skill_there_are_no_ranks_and_nothing_is_proposed(clien
     assert {(p["rank"], p["probability_best"], p["decision"]) for p in body["policies"]} == {(None, None, "cannot_tell")}
     assert [p["name"] for p in body["policies"]] == ["p0", "p1", "p2"], "by name, not by value"
     words = first_screen(client)
-    assert "No policy is worth a visit yet. At the next visit: random and cDBS sessions, by which policies may be told apart." in words
+    assert (
+        "By prediction, no policy is worth a visit yet. At the next visit: random and cDBS sessions, by which policies may be told apart."
+        in words
+    )
     assert "Why: The recordings so far cannot tell policies apart." in words
     assert "Not advised: p2 : nearly off 42 % of the time" in words
     assert re.search(r"p2 \w+ not advised nearly off 42 %", words), "the table says the same as the sentence above it"
@@ -193,7 +196,8 @@ def test_a_ranking_with_nothing_to_test_says_so_why_and_what_to_do(client: TestC
     judge({a: judged(50.0, **WORSE), b: judged(60.0, behaviour={"closeness_to_cdbs": 0.01}), c: judged(9.0, **off)})
     words = first_screen(client)
     assert (
-        "No policy is worth a visit yet. At the next visit: random and cDBS sessions, from which better policies can be learned. Why: "
+        "By prediction, no policy is worth a visit yet. At the next visit: random and cDBS sessions, "
+        "from which better policies can be learned. Why: "
         "1 acts like cDBS, so that a session would show nothing new; the rest is not advised. Further policies are needed: train some ."
         in words
     )

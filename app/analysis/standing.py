@@ -1,0 +1,96 @@
+"""Standing of each policy in one sentence: harms first, then its own sessions, then the prediction. Every page takes it from here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import Caller
+from app.analysis import wording
+from app.analysis.evidence.service import evidence
+from app.analysis.primary.service import policy_names, policy_verdicts_of, verdicts_of
+from app.analysis.primary.verdict import VerdictResult
+from app.evaluation import repository as evaluations
+from app.evaluation import verdict_wording
+from app.evaluation.ranking.decisions import Decided, findings_of
+from app.evaluation.ranking.judged import judged
+from app.study.adverse_events.repository import events_of_participant
+from app.study.adverse_events.service import blocking_events
+from app.tables.participants import Participant
+from ml.ope import Flag
+from ml.statistics.noninferiority import PLANNED_SESSIONS
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Evidence on one policy.
+
+    Attributes:
+        harms: serious adverse events and stops that no clinician has cleared. sessions: its own sessions that count.
+        measured: verdict on these sessions; None without any. predicted: verdict of the newest ranking; None where it has none.
+    """
+
+    name: str
+    harms: tuple[Flag, ...]
+    sessions: int
+    measured: VerdictResult | None
+    predicted: Decided | None
+
+    @property
+    def sentence(self) -> str:
+        """Say the standing in words."""
+        return f"{self.name}. " + " ".join(part for part in (self._harms(), self._measurement(), self._prediction()) if part)
+
+    def _harms(self) -> str:
+        return f"Held back: {verdict_wording.plainly(self.harms)}." if self.harms else ""
+
+    def _measurement(self) -> str:
+        if self.measured is None:
+            return "Not tested."
+        return f"Measured, exploratory: {wording.verdict(self.measured, self.name)}"
+
+    def _prediction(self) -> str:
+        if self.predicted is None:
+            return "Not ranked."
+        why = verdict_wording.plainly(self.predicted.hazards or self.predicted.reasons)
+        code = verdict_wording.STANDING_NAMES[self.predicted.standing]
+        settled = self.measured is not None and self.measured.assessment is not None and not wording.is_open(self.measured)
+        return f"Predicted: {code}{f' ({why})' if why else ''}.{' The measurement counts before the prediction.' if settled else ''}"
+
+
+def standings(db: Session, participant: Participant, caller: Caller) -> dict[int, Standing]:
+    """Return the standing of every policy that was ranked, ran, or did harm, as the caller may know it; none to a blinded assessor."""
+    if caller.is_blinded:
+        return {}
+    held = evidence(db, participant, caller)
+    measured = policy_verdicts_of(held, participant)
+    newest = evaluations.newest_evaluation(db, participant.id)
+    ranked = judged(db, participant, newest).assessment.candidates if newest is not None else []
+    predicted = {a.policy.id: a.decided for a in ranked}
+    harms = {i: findings_of(events) for i, events in blocking_events(events_of_participant(db, participant.id), caller).items()}
+    names = policy_names(db, participant)
+    counts = [s.arm.policy_id for s in held.sessions]
+    return {
+        i: Standing(names[i], harms.get(i, ()), counts.count(i), measured.get(i), predicted.get(i))
+        for i in sorted(measured.keys() | predicted.keys() | harms.keys())
+        if i in names
+    }
+
+
+def standing_sentences(db: Session, participant: Participant, caller: Caller) -> dict[int, str]:
+    """Return the sentences by policy: of those with sessions or harms first, then of the others."""
+    found = standings(db, participant, caller)
+    order = sorted(found, key=lambda i: (not found[i].harms and not found[i].sessions, i))
+    return {i: found[i].sentence for i in order}
+
+
+def outlook(db: Session, participant: Participant, caller: Caller) -> list[str]:
+    """Return a sentence on every learned controller that was tested: what further visits would settle.
+
+    It follows the confirmatory verdict where margins are locked.
+    """
+    found: dict[str, str] = {}
+    for result in verdicts_of(db, participant, caller):
+        found.setdefault(result.controller.value, wording.outlook(result, PLANNED_SESSIONS))
+    return list(found.values())
