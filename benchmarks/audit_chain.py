@@ -1,4 +1,4 @@
-"""What the hash chain of the audit trail costs a write, and how long it takes to verify it and to hold rows against it.
+"""Cost of the audit trail's hash chain per write, and time to verify it and to compare rows with it.
 
     python benchmarks/audit_chain.py [--quick]
 
@@ -22,7 +22,7 @@ from support.results import run_benchmark
 
 
 def per_write_ms(db, rows: int, together: bool) -> float:  # type: ignore[no-untyped-def]
-    """Time of a row of the trail, ms."""
+    """Measure the time of a row of the trail, ms."""
     begun = time.perf_counter()
     for i in range(rows):
         db.execute(

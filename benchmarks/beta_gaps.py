@@ -43,7 +43,7 @@ APART_S = 10.0
 
 
 def recording() -> Path | None:
-    """The montage recording with packet loss of the test recordings; None, said on standard output, where it is not there."""
+    """Find the montage recording with packet loss of the test recordings; None, with a line on standard output, where it is absent."""
     folder = Path(os.environ.get("BETALOOP_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
     found = folder / "rcs" / "montage_packet_loss.zip"
     if found.exists():
@@ -56,7 +56,8 @@ LIMITS = (0.5, 0.6, 0.69, OPTIONS.min_valid_fraction, 0.8)
 
 
 def gap_patterns(path: Path) -> list[tuple[float, NDArray[np.bool_]]]:
-    """(rate in Hz, which samples are there [n]) of each sensing configuration and contact pair, from the packets' own times."""
+    """Find (rate in Hz, mask of the samples that are there [n]) of each sensing configuration and contact pair, from the packets' own
+    times."""
     with zipfile.ZipFile(path) as archive:
         named = {PurePosixPath(name).stem: json.loads(archive.read(name)) for name in archive.namelist() if name.endswith(".json")}
     packets: list[Any] = [packet for element in named["RawDataTD"] for packet in element["TimeDomainData"]]
@@ -79,7 +80,7 @@ def gap_patterns(path: Path) -> list[tuple[float, NDArray[np.bool_]]]:
 
 
 def synthetic(n: int, rate: float, rng: np.random.Generator) -> Floats:
-    """A local field potential: bursts of beta at 17 to 26 Hz in a background of 1/f amplitude and white noise, [n]."""
+    """Make a local field potential: bursts of beta at 17 to 26 Hz in a background of 1/f amplitude and white noise, [n]."""
     hz = np.fft.rfftfreq(n, 1.0 / rate)
 
     def coloured(amplitude: Floats) -> Floats:

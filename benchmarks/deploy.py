@@ -79,7 +79,7 @@ int main(void) {
 
 
 def timed(work: Callable[[int], Any], passes: int) -> tuple[Any, Any]:
-    """Wall and CPU time of each pass, microseconds, both [passes]."""
+    """Measure wall and CPU time of each pass, microseconds, both [passes]."""
     for i in range(WARM_UP):
         work(i)
     wall, cpu = np.empty(passes), np.empty(passes)
@@ -92,7 +92,7 @@ def timed(work: Callable[[int], Any], passes: int) -> tuple[Any, Any]:
 
 
 def timed_c(folder: Path, header: str, full: bool, blocks: int) -> tuple[Any, Any]:
-    """The C header's decisions, means over blocks, microseconds."""
+    """Measure the C header's decisions, means over blocks, microseconds."""
     (folder / "timer.c").write_text(TIMER)
     options = [f'-DHEADER="{header}"', f"-DBLOCKS={blocks}", f"-DREPEATS={20 if full else BLOCK}"]
     subprocess.run(["cc", "-std=c99", "-O3", *options, "timer.c", "-o", "timer"], cwd=folder, check=True)
@@ -102,7 +102,7 @@ def timed_c(folder: Path, header: str, full: bool, blocks: int) -> tuple[Any, An
 
 
 def measure(name: str, hidden: tuple[int, ...], passes: int) -> dict[str, tuple[Any, Any]]:
-    """Every runtime of one policy."""
+    """Measure every runtime of one policy."""
     policy = MlpPolicy(WINDOW, hidden, mean=MEAN, std=STD, seed=1)
     manifest = BundleManifest(
         participant="bench", policy_id=1, policy_name=name, window=WINDOW, beta_unit="uV", beta_source="time_domain", min_ma=0.0,
@@ -137,7 +137,8 @@ def measure(name: str, hidden: tuple[int, ...], passes: int) -> dict[str, tuple[
 
 
 def energies(codes: Iterable[str], updates: int) -> list[dict[str, Any]]:
-    """Mean squared and mean amplitude over cDBS of each participant's controllers, [sessions of SESSION_STEPS], and battery life."""
+    """Compute mean squared and mean amplitude over cDBS of each participant's controllers, [sessions of SESSION_STEPS], and battery
+    life."""
     out = []
     for code in codes:
         buffer = random_controller_buffer(code, visits=3, sessions_per_visit=6, steps=SESSION_STEPS, seed=2026)
@@ -163,7 +164,8 @@ def energies(codes: Iterable[str], updates: int) -> list[dict[str, Any]]:
 
 
 def closed_loop(code: str, policy: MlpPolicy, buffer: ReplayBuffer) -> list[Any]:
-    """Amplitude over cDBS per step of each session, as the bundle's controller decides within its limits, [SESSION_STEPS] each."""
+    """Compute the amplitude over cDBS per step of each session, as the bundle's controller decides within its limits, [SESSION_STEPS]
+    each."""
     window = buffer.settings.window
     manifest = BundleManifest(
         participant=code, policy_id=1, policy_name="bench", window=window, beta_unit="uV", beta_source="time_domain", min_ma=0.0,
@@ -189,7 +191,7 @@ def closed_loop(code: str, policy: MlpPolicy, buffer: ReplayBuffer) -> list[Any]
 
 
 def figures(values: Any) -> dict[str, float]:
-    """Mean, standard deviation, median and 99th percentile."""
+    """Compute mean, standard deviation, median and 99th percentile."""
     return {"mean": values.mean(), "std": values.std(), "median": np.median(values), "p99": np.quantile(values, 0.99)}
 
 

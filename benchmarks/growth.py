@@ -1,4 +1,4 @@
-"""How cost grows with the study: CPU seconds and memory of the three replaying methods as one participant's sessions become more.
+"""Growth of cost with the study: CPU seconds and memory of the three replaying methods as one participant has more sessions.
 
     python benchmarks/growth.py                            37, 111, 333 and 999 sessions; about four minutes
     python benchmarks/growth.py --quick                    37 and 111 sessions
@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def record(sessions: int) -> ReplayBuffer:
-    """So many sessions: those of four visits of P1, again and again at later visits."""
+    """Make so many sessions: those of four visits of P1, again and again at later visits."""
     from ml.population import random_controller_buffer
 
     first = random_controller_buffer("P1", 4, 9, 300, seed=1)
@@ -48,7 +48,7 @@ def record(sessions: int) -> ReplayBuffer:
 
 
 def candidates(xi: float) -> dict[str, Policy]:
-    """Twelve policies: constant amplitudes, and proportional ones about the threshold."""
+    """Make twelve policies: constant amplitudes, and proportional ones about the threshold."""
     from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 
     constant = {f"constant {a}": ConstantPolicy(a) for a in (0.4, 0.6, 0.8, 1.0)}
@@ -60,7 +60,7 @@ def candidates(xi: float) -> dict[str, Policy]:
 
 
 def measure(method: str, sessions: int) -> dict[str, float]:
-    """CPU seconds of fit and evaluation, and the largest memory of this process, GiB."""
+    """Measure CPU seconds of fit and evaluation, and the largest memory of this process, GiB."""
     from ml.ope.registry import estimators
 
     estimator = estimators(1)[method]
@@ -102,17 +102,17 @@ def grown(sizes: tuple[int, ...]) -> Table:
 
 
 def cpu(row: dict[str, dict[str, float]]) -> float:
-    """CPU seconds of all methods."""
+    """Sum the CPU seconds of all methods."""
     return sum(found["cpu_s"] for found in row.values())
 
 
 def memory(row: dict[str, dict[str, float]]) -> float:
-    """Largest memory of a method, GiB."""
+    """Find the largest memory of a method, GiB."""
     return max(found["memory_gib"] for found in row.values())
 
 
 def exponent(table: Table) -> float:
-    """Power of the number of sessions by which CPU time grows over the last two sizes."""
+    """Compute the power of the number of sessions by which CPU time grows over the last two sizes."""
     small, large = sorted(table)[-2:]
     return math.log(cpu(table[large]) / cpu(table[small])) / math.log(large / small)
 

@@ -51,7 +51,7 @@ KEY = b"a key for benchmarks"
 
 
 def time_domain_file(path: Path, megabytes: float) -> None:
-    """A RawDataTD.json of so many megabytes: two channels at 500 Hz, clocks running on, every 50th packet lost."""
+    """Write a RawDataTD.json of so many megabytes: two channels at 500 Hz, clocks running on, every 50th packet lost."""
     numbers = random.Random(0)
     bodies = [
         json.dumps(
@@ -106,14 +106,14 @@ def read_samples(path: Path) -> list[Any]:
 
 
 def cpu_s(work: Callable[[], Any]) -> float:
-    """CPU seconds of one call."""
+    """Measure the CPU seconds of one call."""
     start = time.process_time()
     work()
     return time.process_time() - start
 
 
 def whole_decode_peak_mb(folder: Path) -> float:
-    """Highest resident memory in MB of a process that decodes the folder and does nothing else."""
+    """Measure the highest resident memory in MB of a process that decodes the folder and does nothing else."""
     code = (
         "import sys; from pathlib import Path\n"
         "from ml.formats import DecodeOptions, decode\n"
@@ -151,7 +151,7 @@ def decode_figures(options: argparse.Namespace, folder: Path) -> dict[str, float
 
 
 def table_figures(options: argparse.Namespace, folder: Path) -> dict[str, float]:
-    """CPU of taking in a table of raw LFP: cleaning it, and decoding what is stored."""
+    """Measure the CPU of taking in a table of raw LFP: cleaning it, and decoding what is stored."""
     path, clean = folder / "lfp.csv", folder / "clean.csv"
     rows = options.lfp_rows
     values = np.random.default_rng(0).normal(0, 20, rows).round(4).tolist()
@@ -167,7 +167,7 @@ def table_figures(options: argparse.Namespace, folder: Path) -> dict[str, float]
 
 
 def memory_figures(options: argparse.Namespace, folder: Path) -> dict[str, float]:
-    """Peak memory of a whole decode."""
+    """Measure the peak memory of a whole decode."""
     time_domain_file(folder / "RawDataTD.json", options.whole_megabytes)
     peak = whole_decode_peak_mb(folder)
     print(f"peak memory of decoding a time domain of {options.whole_megabytes:g} MB: {peak:.0f} MB")
@@ -194,7 +194,7 @@ def client_of(installed: Installation) -> httpx.Client:
 
 
 def _process_cpu_s(pid: int) -> float:
-    """CPU seconds that a process has used, with the process that forks its readers and the readers that have ended."""
+    """Sum the CPU seconds that a process has used, with the process that forks its readers and the readers that have ended."""
     at = psutil.Process(pid)
     times = [p.cpu_times() for p in (at, *at.children(recursive=True))]
     return sum(t.user + t.system for t in times) + sum(t.children_user + t.children_system for t in times[1:])
@@ -207,7 +207,7 @@ def _enrol(client: httpx.Client, code: str) -> None:
 
 
 def upload_s(client: httpx.Client, code: str, name: str, content: bytes) -> float:
-    """Wall seconds from the begin of an upload for a fresh participant until its session's trace can be read."""
+    """Measure the wall seconds from the begin of an upload for a fresh participant until its session's trace can be read."""
     _enrol(client, code)
     fields = {"participant": code, "visit": "1", "controller": "other"}
     start = time.perf_counter()
@@ -221,7 +221,7 @@ def upload_s(client: httpx.Client, code: str, name: str, content: bytes) -> floa
 
 
 def _start_training(installed: Installation, client: httpx.Client) -> str:
-    """A training job that outlasts the uploads; returns its id once it computes."""
+    """Start a training job that outlasts the uploads; return its id once it computes."""
     _enrol(client, "T0")
     for i in range(6):
         content = session_table_csv(run_session("P2", "random", visit=1, hour=1.0, seed=i, steps=300, lead_steps=10))
@@ -241,7 +241,7 @@ def _start_training(installed: Installation, client: httpx.Client) -> str:
 
 
 def latency_figures(options: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
-    """Figures and ratios of uploads; prints them."""
+    """Measure figures and ratios of uploads; print them."""
     name, content = device_recording()
     with installation() as installed, client_of(installed) as client:
         web = installed.processes["web 1"].pid

@@ -50,7 +50,7 @@ TRAIN = {"kind": "train", "preset": "full", "algorithms": ["ddpg"], "count": 24,
 
 @dataclass
 class Found:
-    """What callers met.
+    """Answers that callers met.
 
     Attributes:
         seconds: times of answers by what was asked for. wrong: answers that were not right, and how often.
@@ -76,7 +76,7 @@ class Found:
 
 
 async def person(number: int, base: str, study: Study, found: Found, until: float) -> None:
-    """One who signs in, looks at pages and enters QoCs."""
+    """Simulate a person who signs in, looks at pages and enters QoCs."""
     rng = np.random.default_rng(number)
     headers = {"Accept": "text/html", "Sec-Fetch-Site": "same-origin"}
     async with httpx.AsyncClient(base_url=base, headers=headers, timeout=60) as caller:
@@ -100,7 +100,7 @@ async def person(number: int, base: str, study: Study, found: Found, until: floa
 
 
 async def uploader(number: int, base: str, token: str, found: Found, until: float) -> None:
-    """One who sends sessions."""
+    """Simulate a sender of sessions."""
     rng = np.random.default_rng(10_000 + number)
     async with httpx.AsyncClient(base_url=base, headers={"Authorization": f"Bearer {token}"}, timeout=60) as caller:
         await asyncio.sleep(rng.uniform(0, BETWEEN_UPLOADS_S))
@@ -114,12 +114,12 @@ async def uploader(number: int, base: str, token: str, found: Found, until: floa
 
 
 def address(number: int) -> str:
-    """Of a person."""
+    """Name the address of a person."""
     return f"person{number}@clinic.example"
 
 
 async def everybody(installed: Installation, token: str, study: Study, people: int, uploaders: int, seconds: float) -> Found:
-    """All callers at once; what they met."""
+    """Run all callers at once; return what they met."""
     found, until = Found(), time.monotonic() + seconds
     callers = [person(i, installed.bases[0], study, found, until) for i in range(people)]
     callers += [uploader(i, installed.bases[0], token, found, until) for i in range(uploaders)]
@@ -128,7 +128,7 @@ async def everybody(installed: Installation, token: str, study: Study, people: i
 
 
 def load(people: int, uploaders: int, minutes: float) -> dict[str, float]:
-    """One run; prints the table, returns the figures of the last line.
+    """Run once; print the table, and return the figures of the last line.
 
     Raises:
         RuntimeError: a request failed, something acknowledged is lost or doubled, or answers took too long.
@@ -160,7 +160,7 @@ def load(people: int, uploaders: int, minutes: float) -> dict[str, float]:
 
 
 def too_slow(figures: dict[str, float]) -> list[str]:
-    """A sentence where answers took longer than they may at the load of the machine."""
+    """List a sentence where answers took longer than the load of the machine allows."""
     if figures["p95_share"] < 1:
         return []
     return [f"95 of 100 answers came within {figures['p95_s']} s at a load of {figures['load']}: the aim is {P95_S:.0f} s"]

@@ -61,11 +61,11 @@ class Demo:
     base: str
 
     def said(self) -> str:
-        """What it printed so far."""
+        """Return what it printed so far."""
         return (self.folder / "said.txt").read_text(errors="replace")
 
     def loaded(self) -> bool:
-        """Whether its study is uploaded and a ranking has been asked for."""
+        """Decide whether its study is uploaded and a ranking has been asked for."""
         with contextlib.suppress(FileNotFoundError):
             return bool(json.loads((self.folder / "demo.json").read_text())["jobs"])
         return False
@@ -142,7 +142,7 @@ def finish_jobs(one: Demo, cancel: bool) -> None:
 
 
 def processes(one: Demo) -> Iterator[tuple[str, psutil.Process]]:
-    """Every process of the demo, with a name for people; PostgreSQL's all have one."""
+    """Yield every process of the demo, with a name for people; PostgreSQL's share one."""
     yield "demo", one.process
     for service in one.process.children():
         name = "web" if "serve" in service.cmdline() else "worker"
@@ -155,7 +155,7 @@ def processes(one: Demo) -> Iterator[tuple[str, psutil.Process]]:
 
 
 def measure(one: Demo) -> list[Used]:
-    """Memory of every process, the largest first."""
+    """Measure the memory of every process, the largest first."""
     own: list[Used] = []
     server: list[Used] = []
     for name, process in processes(one):

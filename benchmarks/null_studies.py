@@ -58,7 +58,7 @@ SKEWED = tuple(name for name, world in WORLDS.items() if world.slope)
 
 
 def naive(data: Measurements) -> tuple[bool | None, bool | None]:
-    """The paper's test of all sessions: rejected, and whether its interval covers no difference."""
+    """Run the paper's test of all sessions: rejected, and whether its interval covers no difference."""
     result = as_in_the_paper(data, LEVEL)
     if isinstance(result, Unavailable):
         return None, None
@@ -66,17 +66,17 @@ def naive(data: Measurements) -> tuple[bool | None, bool | None]:
 
 
 def error(number: int, level: float = ALPHA) -> float:
-    """Monte Carlo standard error of a share that is `level`."""
+    """Compute the Monte Carlo standard error of a share that is `level`."""
     return float(np.sqrt(level * (1 - level) / number))
 
 
 def rejects(found: Average | Unavailable) -> bool:
-    """A study that gives no evidence rejects nothing."""
+    """Decide whether a study rejects; one without evidence rejects nothing."""
     return isinstance(found, Average) and found.p_value < ALPHA
 
 
 def drawn(name: str, studies: int, either: bool, seed: int) -> Iterator[tuple[int, str, Measurements]]:
-    """Number, metric and data of the studies of one scenario; `either` as in `latent`."""
+    """Yield number, metric and data of the studies of one scenario; `either` as in `latent`."""
     world, rng = WORLDS[name], np.random.default_rng(sum(map(ord, name)) + 1_000_000 * seed)
     for study in range(studies):
         design = layout(world, rng)
@@ -87,7 +87,7 @@ def drawn(name: str, studies: int, either: bool, seed: int) -> Iterator[tuple[in
 
 
 def null_studies(name: str, studies: int, seed: int) -> Tally:
-    """One scenario with no average effect. The slower analyses are made in every twentieth study, the paper's test in every fourth."""
+    """Run one scenario with no average effect. The slower analyses are made in every twentieth study, the paper's test in every fourth."""
     tally = Tally()
     for study, metric, data in drawn(name, studies, True, seed):
         one_null(name, metric, data, tally, study)
@@ -95,7 +95,7 @@ def null_studies(name: str, studies: int, seed: int) -> Tally:
 
 
 def skewed_studies(name: str, studies: int, seed: int) -> Tally:
-    """One scenario whose effect has no average in the latent value: rating and tremor held against none, and against their own average."""
+    """Run one scenario whose effect has no average in the latent value: rating and tremor against none, and against their own average."""
     tally, own = Tally(), {metric: metric_average(WORLDS[name], metric) for metric in BOUNDED}
     for _, metric, data in drawn(name, studies, False, seed):
         if metric in own:
@@ -107,7 +107,7 @@ def skewed_studies(name: str, studies: int, seed: int) -> Tally:
 
 
 def levels(name: str, studies: int, seed: int) -> Tally:
-    """The primary test of `null_studies` alone, of the same studies."""
+    """Run the primary test of `null_studies` alone, of the same studies."""
     tally = Tally()
     for _, metric, data in drawn(name, studies, True, seed):
         add_primary(name, metric, data, tally)
@@ -122,7 +122,7 @@ def add_primary(name: str, metric: str, data: Measurements, tally: Tally) -> Non
 
 
 def one_null(name: str, metric: str, data: Measurements, tally: Tally, study: int) -> None:
-    """All tests of one metric of one study."""
+    """Run all tests of one metric of one study."""
     add_primary(name, metric, data, tally)
     if study % 4 == 0:
         plain, plain_cover = naive(data)
@@ -147,7 +147,7 @@ def one_null(name: str, metric: str, data: Measurements, tally: Tally, study: in
 
 
 def mixed(metric: str, data: Measurements) -> Average | None:
-    """The effect of the mixed model that the metric calls for."""
+    """Estimate the effect of the mixed model that the metric calls for."""
     if metric == "rating":
         found = ordinal_comparison(data)
     elif metric == "tremor":
@@ -181,7 +181,7 @@ Part = Callable[[Any, int, int], Tally]
 
 
 def cell(work: Part, argument: str | int, studies: int, seed: int, folder: Path | None) -> Tally:
-    """One part of the benchmark; read where the folder has it from an earlier run of as many studies."""
+    """Run one part of the benchmark; read where the folder has it from an earlier run of as many studies."""
     path = folder / f"{work.__name__}-{re.sub('[^a-z0-9]+', '-', str(argument).lower())}-{studies}-{seed}.json" if folder else None
     if path and path.exists():
         return Tally.read(path)
@@ -192,7 +192,8 @@ def cell(work: Part, argument: str | int, studies: int, seed: int, folder: Path 
 
 
 def show_null(tally: Tally, studies: int) -> dict[str, float]:
-    """The table of null studies and its worst cells; a cell is a scenario and metrics of one law (the continuous ones, rating, tremor)."""
+    """Print the table of null studies and its worst cells; a cell is a scenario and metrics of one law (the continuous ones, rating,
+    tremor)."""
     emit(f"null studies, {studies} of each scenario; share rejected at {ALPHA:g} (worst cell), intervals of {LEVEL:g} (range of cells)\n")
     labels = ("primary", "van elteren", "naive")
     intervals = ("primary", "delta", "saving", "slope", "mixed", "shift", "naive")
@@ -226,7 +227,7 @@ def show_null(tally: Tally, studies: int) -> dict[str, float]:
 
 
 def show_skewed(tally: Tally) -> None:
-    """Studies whose null is one of the latent value alone."""
+    """Print studies whose null is one of the latent value alone."""
     emit("the effect differs between days, without an average in the latent value: average in the metric | share rejected |")
     emit(" share of intervals that miss the average in the metric\n")
     for name in SKEWED:
@@ -238,7 +239,7 @@ def show_skewed(tally: Tally) -> None:
 
 
 def show_power(tally: Tally) -> None:
-    """What is found of an effect."""
+    """Print the power for an effect."""
     emit("\npower for an effect of one standard deviation of a session, 4 sessions of either arm a visit:")
     emit(" primary, van Elteren, the paper's\n")
     for key in dict.fromkeys(k[0] for k in tally.counts if len(k) == 2):

@@ -55,7 +55,7 @@ class Task:
 
 
 def measure(task: Task) -> list[dict[str, Any]]:
-    """All cells of one task that are not known yet."""
+    """Measure all cells of one task that are not known yet."""
     torch.set_num_threads(1)
     cells: list[dict[str, Any]] = []
     truth = task.known.get(f"{task.name}/truth")
@@ -86,7 +86,8 @@ def _method_cell(case: Case, design: str, method: str, estimator: Estimator, buf
 
 
 def _measures(case: Case, table: Mapping[str, Estimate]) -> dict[str, Any]:
-    """What is measured of a method's estimates: those of the candidates, and its answers to sustained dose and to following beta."""
+    """Extract what is measured of a method's estimates: those of the candidates, and its answers to sustained dose and to following
+    beta."""
     dose = gain_over(table[case.low], table[CDBS])
     follow = gain_over(table[case.follows], table[MATCHED])
     return {
@@ -100,7 +101,7 @@ def _measures(case: Case, table: Mapping[str, Estimate]) -> dict[str, Any]:
 
 
 def tasks(chosen: argparse.Namespace, cells: Cells) -> list[Task]:
-    """What is to be run, in order."""
+    """List the tasks in order."""
     without = chosen.without.split(",")
     methods = tuple(m for m in CHEAP if m not in without)
     dear = tuple(m for m in DEAR if m not in without)

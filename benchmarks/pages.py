@@ -1,4 +1,4 @@
-"""How long the server works for every page of a large study while a training runs, how many bytes travel, how many queries are asked.
+"""Time that the server works for every page of a large study while a training runs, with bytes and queries.
 
     python benchmarks/pages.py --quick                     2 participants x 3 visits x 4 sessions x 8 policies, 5 requests of each page
     python benchmarks/pages.py                             20 participants x 12 visits x 8 sessions x 40 policies, 40 requests of each page
@@ -139,7 +139,7 @@ class Measured:
 
 
 def prepare(folder: Path, extent: Extent) -> None:
-    """The study in a data folder; what an interruption left is gone on with, participant by participant."""
+    """Make the study in a data folder, participant by participant; an interrupted one is continued."""
     os.environ["BETALOOP_DATA_DIR"] = str(folder)
     os.environ["BETALOOP_DEVELOPMENT"] = "true"  # the style guide is a page of developers
     get_settings.cache_clear()
@@ -161,7 +161,7 @@ def prepare(folder: Path, extent: Extent) -> None:
 
 
 def _enter(folder: Path, extent: Extent) -> None:
-    """What is entered through the interface, for each participant once; `entered.json` holds what it is found by."""
+    """Enter what the interface takes, for each participant once; `entered.json` has its identifiers."""
     done = folder / "entered.json"
     entered: dict[str, dict[str, Any]] = json.loads(done.read_text()) if done.exists() else {}
     codes = [f"P{number:02d}" for number in range(1, extent.participants + 1)]
@@ -180,7 +180,7 @@ def _enter(folder: Path, extent: Extent) -> None:
 
 
 def addresses(folder: Path, extent: Extent) -> list[dict[str, Any]]:
-    """What stands in the paths, for each participant: its newest visit with sessions, one of its sessions, policies, jobs, uploads."""
+    """Find the identifiers in paths, for each participant: its newest visit with sessions, one of its sessions, policies, jobs, uploads."""
     found = []
     entered = json.loads((folder / "entered.json").read_text())
     with transaction("bench") as db:
@@ -198,7 +198,7 @@ def addresses(folder: Path, extent: Extent) -> list[dict[str, Any]]:
 
 @contextmanager
 def training() -> Iterator[None]:
-    """A worker that trains on the first participant for longer than any measurement."""
+    """Run a worker that trains on the first participant for longer than any measurement."""
     with transaction("bench") as db:
         participant = participant_by_code(db, "P01", SYSTEM)
         params = {"preset": "full", "count": 24, "updates": 1_000_000, "algorithms": ["ddpg"]}
@@ -232,7 +232,7 @@ def _wait_for_progress(job_id: str) -> None:
 
 @contextmanager
 def service() -> Iterator[tuple[str, Counter]]:
-    """The web service in a thread of this process, whose queries are counted."""
+    """Run the web service in a thread of this process, whose queries are counted."""
     counter = Counter()
 
     def count(*_: object) -> None:
@@ -256,7 +256,7 @@ def _browser(base: str) -> httpx.Client:
 
 
 def measure(base: str, counter: Counter, places: list[dict[str, Any]], names: list[str], requests: int) -> dict[str, Measured]:
-    """Every page `requests` times, participant after participant."""
+    """Request every page `requests` times, participant after participant."""
     found = {name: Measured() for name in names}
     with _browser(base) as client, _browser(base) as nobody:
         if client.post("/sign-in", data={"email": EMAIL, "password": PASSWORD}).status_code != 303:
@@ -284,7 +284,7 @@ def measure(base: str, counter: Counter, places: list[dict[str, Any]], names: li
 
 
 def first_looks(client: httpx.Client, places: list[dict[str, Any]]) -> list[float]:
-    """Milliseconds until the samples of sessions are drawn for the first time, which decodes their files in a child."""
+    """Measure milliseconds until the samples of sessions are drawn for the first time, which decodes their files in a child."""
     shutil.rmtree(get_settings().data_dir / "cache" / "signals", ignore_errors=True)
     found = []
     for place in places:
@@ -295,7 +295,7 @@ def first_looks(client: httpx.Client, places: list[dict[str, Any]]) -> list[floa
 
 
 def report(found: dict[str, Measured]) -> dict[str, float | bool]:
-    """The table, and the figures of the worst pages; of the first drawing of samples its own, and whether they meet the aim of a page."""
+    """Print the table; return the figures of the worst pages, and those of the first drawing of samples with whether they meet the aim."""
     first = found.pop("signal, first", None)
     print(f"{'page':<18}{'median ms':>10}{'p95 ms':>9}{'cpu ms':>9}{'kB':>8}{'queries':>9}")
     rows = []

@@ -50,7 +50,7 @@ POLICY = ProportionalPolicy(0.6, 1.6, 0.3, 5)
 
 
 def sessions_per_cpu_minute(kind: int, sessions: int = 1000, *, readable: bool = False) -> float:
-    """Simulated sessions of 300 steps per CPU minute, their noise and outcomes included."""
+    """Measure simulated sessions of 300 steps per CPU minute, their noise and outcomes included."""
     patient = draw_patient(kind, np.random.default_rng(kind))
     start = time.process_time()
     simulate(patient, 1.0, POLICY, days=new_days(1, 0, sessions), key=1, steps=STEPS, readable=readable)
@@ -58,7 +58,7 @@ def sessions_per_cpu_minute(kind: int, sessions: int = 1000, *, readable: bool =
 
 
 def speed() -> dict[str, float]:
-    """Sessions per CPU minute by mechanism, and of the readable equations for comparison."""
+    """Measure sessions per CPU minute by mechanism, and of the readable equations for comparison."""
     simulate(draw_patient(0, np.random.default_rng(0)), 1.0, POLICY, days=new_days(1, 0, 2), key=1, steps=2)  # compile
     found = {MECHANISMS[k]: sessions_per_cpu_minute(k) for k in range(len(MECHANISMS))}
     print(f"{'mechanism':<14}{'sessions per CPU minute':>26}")
@@ -82,7 +82,7 @@ def cohort_speed() -> float:
 
 
 def describe(part: str, indices: list[int], sessions: int) -> dict[str, float]:
-    """What a part holds: responders, the range of true returns, who gains by following beta."""
+    """Describe a part: responders, the range of true returns, who gains by following beta."""
     rows = []
     for index in indices:
         w = world(part, index)  # type: ignore[arg-type]
@@ -121,13 +121,13 @@ def describe(part: str, indices: list[int], sessions: int) -> dict[str, float]:
 
 
 def minutes_of(w: World, design: Any, visits: int) -> float:
-    """Minutes of the visits, pauses between sessions included."""
+    """Compute the minutes of the visits, pauses between sessions included."""
     rows = visit_plan(w.settings, design, 0, visits)
     return sum(r.amplitudes.size * w.settings.period_s / 60 + 60 * PAUSE_H for r in rows)
 
 
 def designs(part: str, indices: list[int], sessions: int, figure: Path) -> dict[str, float]:
-    """Accuracy of the linear model by design and visits; the figure has a group of bars for each number of visits."""
+    """Measure the accuracy of the linear model by design and visits; the figure has a group of bars for each number of visits."""
     found: dict[str, dict[str, dict[str, list[float]]]] = {}
     for index in indices:
         w = world(part, index)  # type: ignore[arg-type]

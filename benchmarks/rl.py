@@ -77,7 +77,7 @@ class EagerDdpg:
 
 
 def own_stepper(data: dict[str, Any], batch: int, members: int = 1) -> Callable[[], None]:
-    """One update of ours for each of `members` policies, with the drawing of their batches."""
+    """Make the function for one update of each of `members` policies, with the drawing of their batches."""
     packed = PackedTransitions(data["s"], data["a"][:, 0], data["r"][:, 0], data["s2"])
     starts = [{"policy": MlpPolicy(WINDOW, seed=k), "critic": Critic(WINDOW, seed=k)} for k in range(members)]
     configs = [DdpgConfig(tau=TAU, batch=batch, seed=k) for k in range(members)]
@@ -95,7 +95,7 @@ def own_stepper(data: dict[str, Any], batch: int, members: int = 1) -> Callable[
 
 
 def cpu_ms(step: Callable[[], None], steps: int) -> float:
-    """CPU milliseconds per call."""
+    """Measure CPU milliseconds per call."""
     start = time.process_time()
     for _ in range(steps):
         step()
@@ -103,7 +103,7 @@ def cpu_ms(step: Callable[[], None], steps: int) -> float:
 
 
 def in_turn(steppers: dict[str, Callable[[], None]], steps: int, repeats: int) -> dict[str, float]:
-    """Median CPU milliseconds per update of each stepper; they take turns, so that a busy machine is busy for all."""
+    """Measure the median CPU milliseconds per update of each stepper; they take turns, so that a busy machine is busy for all."""
     for step in steppers.values():
         cpu_ms(step, max(steps // 4, 5))
     times: dict[str, list[float]] = {name: [] for name in steppers}
@@ -114,7 +114,7 @@ def in_turn(steppers: dict[str, Callable[[], None]], steps: int, repeats: int) -
 
 
 def decision_us(act: Callable[[Any], Any], repeats: int = 1000) -> dict[str, float]:
-    """Median and 99th percentile of the CPU time of one decision, microseconds."""
+    """Measure the median and 99th percentile of the CPU time of one decision, microseconds."""
     state = np.random.default_rng(0).normal(size=(1, WINDOW))
     times = []
     for i in range(repeats + 200):
@@ -126,7 +126,8 @@ def decision_us(act: Callable[[Any], Any], repeats: int = 1000) -> dict[str, flo
 
 
 def random_sessions(count: int = 9, steps: int = 300) -> ReplayBuffer:
-    """Sessions of a random controller on a participant whose beta falls with the amplitude; their content does not change the speed."""
+    """Make sessions of a random controller on a participant whose beta falls with the amplitude; their content does not change the
+    speed."""
     rng = np.random.default_rng(0)
     sessions = []
     for i in range(count):
@@ -147,7 +148,7 @@ def train_and_distil(seeds: tuple[int, ...]) -> float:
 
 
 def six_policies() -> dict[str, float]:
-    """Six policies x 10 000 updates and their distillation in two processes of three."""
+    """Train six policies x 10 000 updates and their distillation in two processes of three."""
     start = time.perf_counter()
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         cpu = pool.map(train_and_distil, [(0, 1, 2), (3, 4, 5)], chunksize=1)

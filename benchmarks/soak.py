@@ -71,7 +71,7 @@ class Soak:
     late: list[str] = field(default_factory=list)
 
     def say(self, text: str) -> None:
-        """A line with the seconds since the begin."""
+        """Print a line with the seconds since the begin."""
         print(f"{time.monotonic() - self.begun:7.1f} s  {text}", flush=True)
 
     def round(self, number: int, of: int, kind: str) -> None:
@@ -138,7 +138,7 @@ class Soak:
         return f"child of step {step} killed,", time.monotonic() - killed
 
     def _computes(self, folder: str, other_than: int) -> bool:
-        """Whether a step has a process, but one that was killed."""
+        """Decide whether a step has a process other than a killed one."""
         for child in (c for worker in self.installed.workers for c in self.installed.children(worker)):
             with contextlib.suppress(psutil.Error):
                 if child.pid != other_than and _folder(child) == folder:
@@ -159,7 +159,7 @@ class Soak:
 
 
 def soak(installed: Installation, rounds: int, minutes: float, seed: int) -> dict[str, float]:
-    """One run; the figures of its last line.
+    """Run once; return the figures of the last line.
 
     Raises:
         TooLate: something did not happen in its time. RuntimeError: something acknowledged is lost or doubled; a request met a server
@@ -195,7 +195,7 @@ def soak(installed: Installation, rounds: int, minutes: float, seed: int) -> dic
 
 
 def _begun(installed: Installation, begun: float) -> tuple[Soak, Study]:
-    """An installation with a study that is written to."""
+    """Start an installation with a study that is written to."""
     tokens = installed.add_people(PEOPLE)
     made = time.monotonic()
     for web in installed.webs:
@@ -275,7 +275,7 @@ def _left_after_the_stop(installed: Installation) -> list[str]:
 
 
 def _folder(child: psutil.Process) -> str:
-    """The folder of the step that a child computes, which it holds locked; empty where it has not begun."""
+    """Find the folder of the step that a child computes, which it has locked; empty where it has not begun."""
     return next((str(Path(held.path).parent) for held in child.open_files() if held.path.endswith("/.lock")), "")
 
 

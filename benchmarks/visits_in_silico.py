@@ -62,7 +62,7 @@ class Day:
 
     @classmethod
     def planned(cls, rules: Rules) -> Day:
-        """The service's plan with as many sessions of the controller as fit: policies of it, each repeated."""
+        """Lay out the service's plan with as many sessions of the controller as fit: policies of it, each repeated."""
         repeated = [replace(rules, repeats=r) for r in range(1, MOST_REPEATS + 1)]
         best = max(repeated, key=lambda r: most_policies(r) * r.repeats)
         sessions = schedule([Candidate(i, Controller.RL) for i in range(most_policies(best))], best, seed=0)
@@ -70,7 +70,7 @@ class Day:
         return cls(places, [s.start_minute / 60 for s in sessions], round(rules.session_minutes * STEPS_PER_MINUTE))
 
     def of(self, level: float) -> list[int]:
-        """Places of a level; 1 is cDBS."""
+        """List the places of a level; 1 is cDBS."""
         return self.places[level != 1]
 
 
@@ -86,7 +86,7 @@ class Question:
 
 
 def kept(code: str, day: Day, seeds: range, visits: int, folder: Path | None) -> list[Question]:
-    """Every question of one participant; read where the folder has them from an earlier run of the same studies."""
+    """Answer every question of one participant; read where the folder has them from an earlier run of the same studies."""
     name = f"visits-{code}-{seeds.start}-{len(seeds)}-{visits}-{day.steps}-{len(day.places[True])}.json"
     path = folder / name if folder else None
     if path and path.exists():
@@ -103,7 +103,7 @@ def kept(code: str, day: Day, seeds: range, visits: int, folder: Path | None) ->
 def simulate(
     code: str, level: float, visits: Sequence[int], hours: Sequence[float], studies: Sequence[int], steps: int, seed: int
 ) -> list[Means]:
-    """The metrics of sessions at a constant level."""
+    """Simulate the metrics of sessions at a constant level."""
     rng = np.random.default_rng([seed, round(100 * level)])
     controller = "cdbs" if level == 1 else ConstantPolicy(level)
     seeds = rng.integers(0, 2**63, len(visits), dtype=np.uint64)
@@ -117,7 +117,7 @@ def simulate(
 
 
 def truth(code: str, level: float, day: Day, seed: int) -> Means:
-    """True means of a level over days, at the hours of its sessions."""
+    """Compute the true means of a level over days, at the hours of its sessions."""
     rng, n = np.random.default_rng(seed), TRUTH_SESSIONS
     hours = rng.choice([day.hours[i] for i in day.of(level)], n)
     rows = simulate(code, level, rng.integers(1, 7, n).tolist(), hours.tolist(), rng.integers(1, 2**62, n).tolist(), day.steps, seed + 1)
@@ -125,19 +125,19 @@ def truth(code: str, level: float, day: Day, seed: int) -> Means:
 
 
 def beyond(level: Means, cdbs: Means) -> set[str]:
-    """Outcomes whose true loss is beyond its margin."""
+    """List the outcomes whose true loss is beyond its margin."""
     losses = {name: cdbs[name] - level[name] for name in ("grasp", "rating")} | {"tremor": level["tremor"] - cdbs["tremor"]}
     margins = {"grasp": MARGINS.grasp_share * cdbs["grasp"], "rating": MARGINS.rating_points, "tremor": MARGINS.tremor_points}
     return {name for name, loss in losses.items() if loss > margins[name]}
 
 
 def recorded(visit: int) -> datetime:
-    """When a visit's sessions were recorded: after the lock."""
+    """Return the time of a visit's recordings: after the lock."""
     return LOCKED_AT + timedelta(days=28 * visit)
 
 
 def studies(code: str, level: float, day: Day, seeds: range, visits: int) -> list[list[Facts]]:
-    """The sessions of a level in every study; one study a seed."""
+    """Simulate the sessions of a level in every study; one study a seed."""
     mine = day.of(level)
     of_visit = np.tile(np.repeat(np.arange(1, visits + 1), len(mine)), len(seeds)).tolist()
     hours = np.tile([day.hours[i] for i in mine], visits * len(seeds)).tolist()
@@ -154,7 +154,7 @@ def studies(code: str, level: float, day: Day, seeds: range, visits: int) -> lis
 
 
 def known_spread(found: Sequence[Assessment]) -> dict[str, float]:
-    """Standard deviation of the average of every outcome, from all studies together."""
+    """Estimate the standard deviation of the average of every outcome, from all studies together."""
     spread: dict[str, list[float]] = {}
     for one in found:
         for o in one.outcomes:
@@ -164,7 +164,7 @@ def known_spread(found: Sequence[Assessment]) -> dict[str, float]:
 
 
 def bound(found: Assessment, spread: dict[str, float]) -> str:
-    """What is concluded where the standard deviations are known."""
+    """Derive the conclusion from known standard deviations."""
     averages = [(o, o.average) for o in found.outcomes if isinstance(o.average, Average)]
     lost = [float(ndtr((a.estimate + o.margin) / spread[o.name])) for o, a in averages]
     if min(hommel(lost), default=1.0) < found.alpha:
@@ -175,7 +175,7 @@ def bound(found: Assessment, spread: dict[str, float]) -> str:
 
 
 def questions(code: str, day: Day, seeds: range, visits: int) -> list[Question]:
-    """Every question of one participant."""
+    """Answer every question of one participant."""
     cdbs, reference = truth(code, 1.0, day, 101), studies(code, 1.0, day, seeds, visits)
     locked = LockedMargins(MARGINS, 1, LOCKED_AT, "benchmark")
     asked = []

@@ -1,4 +1,4 @@
-"""How far the order of candidates can be told at all from so many visits, by an observer that knows how virtual patients come about.
+"""Best possible order of candidates after so many visits, by an observer that knows how virtual patients are made.
 
     python -m benchmarks.evaluation.ideal_observer --quick               one world of part A, few patients
     python -m benchmarks.evaluation.ideal_observer --every 6 --out FOLDER
@@ -39,7 +39,7 @@ MEASURES = ("rank", "regret", "error", "error of differences", "width")
 
 
 def observed(w: World, patients: int, sessions: int, tested: int, truth: int, visits: Sequence[int]) -> dict[str, Any]:
-    """`MEASURES` by design and number of visits: of the world itself (`own`) and of every tested patient of its kind (`others`)."""
+    """Compute `MEASURES` by design and number of visits: of the world itself (`own`) and of every tested patient of its kind (`others`)."""
     policies = list(w.candidates().values())
     learnt = [patient_alike(w, k) for k in range(patients)]
     runs = np.stack([returns_of(p, policies, sessions) for p in learnt])  # [N, C, M]
@@ -56,7 +56,7 @@ def observed(w: World, patients: int, sessions: int, tested: int, truth: int, vi
 
 
 def scores(said: np.ndarray, true: np.ndarray, error: np.ndarray) -> list[float]:
-    """`MEASURES` of one patient; errors and widths are shares of the range of true returns."""
+    """Compute `MEASURES` of one patient; errors and widths are shares of the range of true returns."""
     spread, miss = float(np.ptp(true)), said - true
     return [
         spearman(true, said) or 0.0,
@@ -68,7 +68,7 @@ def scores(said: np.ndarray, true: np.ndarray, error: np.ndarray) -> list[float]
 
 
 def lines(found: Sequence[dict[str, Any]]) -> list[str]:
-    """Means over worlds with standard errors; a world's patients count together."""
+    """Tabulate means over worlds with standard errors; a world's patients count together."""
     result = [f"{'':16} {'rank ± error':>14} {'decile':>7} {'regret':>7} {'error':>7} {'differences':>12} {'width':>7} {'own rank':>14}\n"]
     for key in found[0]:
         each = np.array([np.mean([f[key]["own"], *f[key]["others"]], axis=0) for f in found])

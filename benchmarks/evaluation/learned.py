@@ -1,4 +1,4 @@
-"""What three visits teach: six policies by the default sweep on virtual patients, the posterior's first of them, and the best by truth.
+"""Policies that three visits teach: six by the default sweep on virtual patients, the posterior's first of them, and the best by truth.
 
     python -m benchmarks.evaluation.learned --worlds 12 --out FOLDER             every fifth world of part A; resumable
     python -m benchmarks.evaluation.learned --updates 2000 --minutes 20          shorter trainings; no further world after so long
@@ -49,7 +49,7 @@ DESIGNS: tuple[DataDesign, ...] = ("stratified", "paper")
 
 
 class Arm(NamedTuple):
-    """How data are made and policies trained; not `trained`, the dose alone that they would be held near."""
+    """Way in which data are made and policies trained; without `trained`, the dose alone that they would be kept near."""
 
     design: DataDesign
     trained: bool = True
@@ -61,7 +61,7 @@ class Arm(NamedTuple):
 
 
 def sweep(buffer: ReplayBuffer, updates: int | None) -> dict[str, Policy]:
-    """Six policies as a sweep of the service trains them."""
+    """Train six policies as a sweep of the service does."""
     found: dict[str, Policy] = {}
     for group in training_groups(TrainParams(preset="quick", count=POLICIES, updates=updates, **DEFAULT_SWEEP), [None] * POLICIES):
         given = with_best_anchor(group["configs"], buffer, margins=None)
@@ -73,13 +73,14 @@ def sweep(buffer: ReplayBuffer, updates: int | None) -> dict[str, Policy]:
 
 
 def anchor_alone(buffer: ReplayBuffer) -> dict[str, Policy]:
-    """The dose that the anchor `best` holds a policy near, as a policy."""
+    """Return the dose that the anchor `best` keeps a policy near, as a policy."""
     best = supported_best(buffer, margins=None)
     return {"anchor": ConstantPolicy(1.0 if best is None else best)}
 
 
 def cell(w: World, arm: Arm, updates: int | None, truth: int) -> dict[str, Any]:
-    """What the six of one virtual patient are, by the posterior and by truth; none are trained for who responds to nothing simple."""
+    """Measure the six of one virtual patient, by the posterior and by truth; none are trained for patients who respond to nothing
+    simple."""
     cdbs = w.truth(ConstantPolicy(1.0), truth)
     if not is_responder({name: w.truth(policy, truth) for name, policy in simple_policies(w.settings, w.spread).items()}, cdbs):
         return {"responder": False, "policies": {}}
@@ -104,18 +105,18 @@ def cell(w: World, arm: Arm, updates: int | None, truth: int) -> dict[str, Any]:
 
 
 def first_by(rows: dict[str, dict[str, Any]], column: str) -> dict[str, Any]:
-    """The row with the largest value of a column, of those that the ranking does not put last where any is."""
+    """Find the row with the largest value of a column, of those that the ranking does not put last where any is."""
     fit = [row for row in rows.values() if row["supported"] and 1 - row["within"] < Levels().unsafe_beyond]
     return max(fit or rows.values(), key=lambda row: float(row[column]))
 
 
 def expected_saving(one: PosteriorGain) -> float:
-    """Energy that a policy is expected to save times its probability of keeping the margins, as the anchor `best` is found."""
+    """Compute the energy that a policy is expected to save times its probability of keeping the margins, as the anchor `best` is found."""
     return (one.saves or 0.0) * (1.0 if one.within is None else one.within)
 
 
 def outcomes(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
-    """One patient's figures."""
+    """Compute one patient's figures."""
     first, saving = first_by(rows, "posterior"), first_by(rows, "expected_saving")
     best = max(rows.values(), key=lambda row: float(row["gain"]))
     return {
@@ -132,14 +133,14 @@ def outcomes(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
 
 
 def told(cells: list[dict[str, Any]]) -> dict[str, float]:
-    """Shares and means over responders."""
+    """Compute shares and means over responders."""
     each = [outcomes(one["policies"]) for one in cells if one["responder"]]
     means = {name: float(np.mean([one[name] for one in each])) for name in (each[0] if each else ())}
     return {"responders": float(len(each))} | means | {"seconds": float(np.mean([one["seconds"] for one in cells if one["responder"]]))}
 
 
 def differences(cells: dict[str, dict[str, Any]], others: dict[str, dict[str, Any]]) -> dict[str, tuple[float, float]]:
-    """Mean and standard error of one arm less another over the responders of both, which are the same patients."""
+    """Compute the mean and standard error of one arm less another over the responders of both, which are the same patients."""
     both = [(outcomes(cells[k]["policies"]), outcomes(others[k]["policies"])) for k in cells if k in others and cells[k]["responder"]]
     if len(both) < 2:
         return {}
@@ -153,7 +154,7 @@ def arms(chosen: argparse.Namespace) -> list[Arm]:
 
 
 def trained(chosen: argparse.Namespace, of: list[Arm]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Finished worlds of every arm, by its key and the world's number."""
+    """Collect the finished worlds of every arm, by its key and the world's number."""
     out = chosen.out or Path(tempfile.mkdtemp(prefix="betaloop-learned-"))
     out.mkdir(parents=True, exist_ok=True)
     updates, truth = (QUICK_UPDATES, QUICK_TRUTH) if chosen.quick else (chosen.updates, TRUTH)

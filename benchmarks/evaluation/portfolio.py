@@ -1,4 +1,4 @@
-"""Which policies three visits find: the portfolio of the posterior against rankings by single methods and against chance.
+"""Policies that three visits find: the portfolio of the posterior against rankings by single methods and against chance.
 
     python -m benchmarks.evaluation.portfolio --quick                    two worlds of part A
     python -m benchmarks.evaluation.portfolio --worlds 40 --out FOLDER   40 worlds; resumable
@@ -83,14 +83,14 @@ class Clinic:
     policies: Mapping[str, Policy]
 
     def visit(self, number: int, names: tuple[str, ...]) -> list[TestSession]:
-        """The visit's cDBS sessions and one session of each named policy. A policy meets the same noise whoever chose it."""
+        """Run the visit's cDBS sessions and one session of each named policy. A policy meets the same noise in every arm."""
         placed = [*((CDBS, place) for place in CDBS_PLACES), *zip(names, TEST_PLACES, strict=False)]
         return [self._session(number, name, place) for name, place in placed]
 
     def held(
         self, number: int, levels: Sequence[float], free: Sequence[int], controls: Sequence[int] = CDBS_PLACES
     ) -> tuple[SessionTrajectory, ...]:
-        """The visit's cDBS sessions at places `controls`, and sessions held near levels in free slots, as they join the data."""
+        """Run the visit's cDBS sessions at places `controls`, and sessions near levels in free slots, as they join the data."""
         s = self.world.settings
         rows: list[tuple[int, str, Floats, tuple[Hold, ...]]] = [(place, "cdbs", np.ones(STEPS), ()) for place in controls]
         for place, level in zip(free, levels, strict=True):
@@ -122,7 +122,7 @@ class Clinic:
         return visit_days(self.world.key, np.array([EARLY_VISITS + number]), np.array([HOURS[place]]))
 
     def early(self, buffer: ReplayBuffer) -> list[TestSession]:
-        """The cDBS sessions of the visits before, which tell how sessions of one day differ; no test is held against them."""
+        """List the cDBS sessions of earlier visits, which show how sessions of one day differ; no test is compared with them."""
         s, found = self.world.settings, []
         for one in buffer.sessions:
             if one.controller == "cdbs":
@@ -165,7 +165,7 @@ class Found:
 
 
 def by_posterior(clinic: Clinic, fitted: FittedPosterior, *, respecting: bool, holding: bool = False) -> Found:
-    """Three visits of portfolios; each visit's sessions move the posterior, and what is held in free slots joins the data."""
+    """Run three visits of portfolios; each visit's sessions move the posterior, and those of free slots join the data."""
     sessions: list[TestSession] = clinic.early(fitted.buffer)
     tested, kept, held = [], [], []
     everyone = {**clinic.policies, **HELD} if holding else clinic.policies
@@ -193,14 +193,15 @@ def _ordered(estimates: Mapping[str, Estimate]) -> bool:
 
 
 def asked_for(estimates: Mapping[str, Estimate], buffer: ReplayBuffer, slots: int) -> list[float]:
-    """Levels of the sessions to hold in free slots, as the plan's page says."""
+    """Choose the levels of the sessions in free slots, as the plan's page says."""
     ordered = _ordered(estimates)
     holds = worth_holding(waiting_for(estimates, buffer)[0], slots) if ordered else worth_exploring(_place(buffer), slots)
     return [hold.fraction for hold in holds for _ in range(hold.here)]
 
 
 def waiting_for(estimates: Mapping[str, Estimate], buffer: ReplayBuffer) -> tuple[dict[str, tuple[Further, float | None]], list[str]]:
-    """Candidates of which a number of sessions would tell, with their probability within the margins; and all that sessions may settle.
+    """Find the candidates that a number of sessions would settle, with their probability within the margins; and all that sessions may
+    settle.
 
     Args:
         estimates: of the candidates, cDBS and `HELD`. buffer: that they rest on.
@@ -223,7 +224,7 @@ def _place(buffer: ReplayBuffer) -> Place:
 
 
 def suggested(estimates: Mapping[str, Estimate], respecting: bool, had: set[str]) -> tuple[str, ...]:
-    """The portfolio of a visit among what may be proposed, or among all without a hazard."""
+    """Choose the portfolio of a visit among what may be proposed, or among all without a hazard."""
     cdbs = estimates[CDBS]
     verdicts = {n: verdict(e, cdbs, Margins(), Levels()) for n, e in estimates.items() if n not in (CDBS, *HELD)}
     able = {n for n, v in verdicts.items() if (v.proposed if respecting else not v.hazards)}
@@ -234,7 +235,7 @@ def suggested(estimates: Mapping[str, Estimate], respecting: bool, had: set[str]
 
 
 def in_order(clinic: Clinic, order: list[str]) -> Found:
-    """The next four of an order at each visit; kept is what showed the largest mean difference to cDBS above 0."""
+    """Test the next four of an order at each visit; keep what showed the largest mean difference to cDBS above 0."""
     seen: dict[str, float] = {CDBS: 0.0}
     tested, kept = [], []
     for number in range(1, TEST_VISITS + 1):
@@ -248,7 +249,7 @@ def in_order(clinic: Clinic, order: list[str]) -> Found:
 
 
 def named(part: Part, index: int) -> dict[str, Any]:
-    """What is said of further sessions after the early visits, and what comes of them."""
+    """Collect the numbers of further sessions after the early visits, and their results."""
     w = world(part, index)
     clinic = Clinic(w, {**w.candidates(), CDBS: ConstantPolicy(1.0)})
     buffer = w.data("stratified", visits=EARLY_VISITS)
@@ -262,7 +263,7 @@ def named(part: Part, index: int) -> dict[str, Any]:
 
 
 def _told(clinic: Clinic, buffer: ReplayBuffer, name: str, further: Further, *, hold: bool) -> bool:
-    """Whether a verdict is told after the sessions that are named, or after the same visits without them."""
+    """Decide whether a verdict is settled after the sessions that are named, or after the same visits without them."""
     visits = max(further.visits, -(-further.sessions // MOST_HELD))
     for number in range(1, visits + 1):
         here = further.sessions // visits + (number <= further.sessions % visits)
@@ -273,7 +274,7 @@ def _told(clinic: Clinic, buffer: ReplayBuffer, name: str, further: Further, *, 
 
 
 def print_named(part: Part, worlds: int) -> None:
-    """A line for each policy and, as the last line, one JSON object."""
+    """Print a line for each policy and, as the last line, one JSON object."""
     begun, found = time.process_time(), [named(part, index) for index in range(worlds)]
     rows = [(index, *row) for index, one in enumerate(found) for row in one["rows"]]
     sys.stdout.writelines(f"{part}{i:02d} {name}: {n} sessions; told {told}, without them {bare}\n" for i, name, n, told, bare in rows)
@@ -288,7 +289,7 @@ def print_named(part: Part, worlds: int) -> None:
 
 
 def arms(part: Part, index: int, truth_sessions: int, dlsm: bool) -> dict[str, Any] | None:
-    """Shares of the best gain by arm and visit; None where no candidate gains more than two standard errors."""
+    """Compute shares of the best gain by arm and visit; None where no candidate gains more than two standard errors."""
     case, w = virtual_case(part, index, truth_sessions), world(part, index)
     clinic, buffer = Clinic(w, {**case.candidates, CDBS: case.probes[CDBS]}), case.data("stratified")
     true = {n: case.truth["policies"][n]["total"] for n in clinic.policies}
@@ -322,7 +323,7 @@ def _shares(found: Found, gains: Mapping[str, float], best: float) -> dict[str, 
 
 
 def curves(shares: Mapping[str, list[dict[str, list[float]]]], figure: str) -> dict[str, list[Point]]:
-    """Means over patients with 90 % intervals after each visit, by arm."""
+    """Compute means over patients with 90 % intervals after each visit, by arm."""
     rng, found = np.random.default_rng(0), {}
     for arm, rows in shares.items():
         points = []
@@ -334,7 +335,7 @@ def curves(shares: Mapping[str, list[dict[str, list[float]]]], figure: str) -> d
 
 
 def lines(shares: Mapping[str, list[dict[str, list[float]]]]) -> Iterator[str]:
-    """A table of the curves, one row for each arm and figure."""
+    """Yield a table of the curves, one row for each arm and figure."""
     yield f"{'':12} {'':8} {'after visit 1':>24} {'2':>24} {'3':>24} {f'>= {SHARE:g} after 3':>16}\n"
     for figure in ("tested", "kept"):
         for arm, points in curves(shares, figure).items():

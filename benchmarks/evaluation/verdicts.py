@@ -1,4 +1,4 @@
-"""What verdicts are worth: how many candidates are told, how often *test* is right, and when an order is refused for want of skill.
+"""Worth of verdicts: how many candidates get one, how often `test` is right, and when an order is refused for want of skill.
 
     python -m benchmarks.evaluation.verdicts --quick
     python -m benchmarks.evaluation.verdicts --out FOLDER                   the 60 worlds of part A; resumable
@@ -45,7 +45,7 @@ UNANSWERED = 1 << 42
 
 
 def without_answer(w: World, design: DataDesign) -> ReplayBuffer:
-    """The data of a world whose beta and QoCs are those of cDBS, whatever amplitude stands beside them."""
+    """Make the data of a world whose beta and QoCs are those of cDBS, whatever the logged amplitude."""
     buffer, rows = w.data(design), visit_plan(w.settings, design, 0, VISITS)
     days, sessions = w.data_days(rows, 0), []
     for i, (session, row) in enumerate(zip(buffer.sessions, rows, strict=True)):
@@ -57,7 +57,7 @@ def without_answer(w: World, design: DataDesign) -> ReplayBuffer:
 
 
 def worth_a_test(case: Case, name: str) -> bool:
-    """Whether a candidate is truly within the margins and saves energy."""
+    """Decide whether a candidate is truly within the margins and saves energy."""
     own, cdbs = case.truth["policies"][name], case.truth["policies"][CDBS]
     return bool(
         all(o.slack(own[o.field][0], cdbs[o.field][0], MARGINS.of(o)) >= 0 for o, _ in PREDICTED) and own["energy"][0] < cdbs["energy"][0]
@@ -65,7 +65,7 @@ def worth_a_test(case: Case, name: str) -> bool:
 
 
 def measured(case: Case, w: World, design: DataDesign) -> dict[str, Any]:
-    """Verdicts of one data set with what is true, its order, and whether one is told where nothing answers."""
+    """Compare the verdicts of one data set with the truth, its order, and whether an order is given where nothing answers."""
     estimates = build("posterior", 0, "demo").fit(case.data(design)).evaluate({**case.candidates, CDBS: case.probes[CDBS]}, STEPS)
     found = {n: verdict(estimates[n], estimates[CDBS], Margins(), Levels()) for n in case.candidates}
     true = [case.truth["policies"][n]["total"][0] for n in case.candidates]
@@ -79,7 +79,7 @@ def measured(case: Case, w: World, design: DataDesign) -> dict[str, Any]:
 
 
 def summary(cells: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Shares over the worlds of one design."""
+    """Compute shares over the worlds of one design."""
     rows = [(code, right) for c in cells for code, right, _ in c["verdicts"]]
     codes, worth = Counter(code for code, _ in rows), sum(right for _, right in rows)
     right = Counter(code for code, ok in rows if ok)
@@ -101,7 +101,7 @@ def summary(cells: Sequence[dict[str, Any]]) -> dict[str, float]:
 
 
 def reliability(cells: Sequence[dict[str, Any]]) -> list[str]:
-    """How often outcomes and energy are truly as wanted, by the probability that all outcomes are within their margins."""
+    """Tabulate how often outcomes and energy are truly as wanted, by the probability that all outcomes are within their margins."""
     rows = np.array([(within, right) for c in cells for _, right, within in c["verdicts"] if within is not None], dtype=np.float64)
     lines = []
     for low, high in ((0.0, 0.1), (0.1, 0.25), (0.25, 0.5), (0.5, 0.65), (0.65, 0.8), (0.8, 0.9), (0.9, 1.001)):

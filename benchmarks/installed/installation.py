@@ -58,10 +58,10 @@ class Server(Protocol):
     """The PostgreSQL of an installation."""
 
     def pid(self) -> int:
-        """Of its postmaster."""
+        """Find the process of its postmaster."""
 
     def admin_conninfo(self, database: str = "postgres") -> str:
-        """What libpq connects with as superuser."""
+        """Return what libpq connects with as superuser."""
 
     def remove(self) -> None:
         """Stop it and delete its data."""
@@ -101,15 +101,15 @@ class OwnPostgres:
         raise RuntimeError(f"PostgreSQL does not start:\n{(self.data / 'log').read_text()[-2000:]}")
 
     def url(self, role: str) -> str:
-        """Its address for a role of betaloop."""
+        """Return its address for a role of betaloop."""
         return f"postgresql://{role}@/betaloop?host={quote(str(self.data), safe='/')}"
 
     def pid(self) -> int:
-        """Of its postmaster."""
+        """Find the process of its postmaster."""
         return int((self.data / "db" / "postmaster.pid").read_text().splitlines()[0])
 
     def admin_conninfo(self, database: str = "postgres") -> str:
-        """What libpq connects with as superuser."""
+        """Return what libpq connects with as superuser."""
         return f"host={self.data} dbname={database} user=postgres"
 
     def remove(self) -> None:
@@ -168,12 +168,12 @@ class Installation:
             )
 
     def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """A command of `betaloop`."""
+        """Run a command of `betaloop`."""
         command = [sys.executable, "-m", "app.cli", *arguments]
         return subprocess.run(command, cwd=ROOT, env=self._env(), capture_output=True, text=True, timeout=2 * STARTED_S, check=False)
 
     def wait_until(self, what: str, condition: Callable[[], Any], seconds: float, every_s: float = 0.05) -> float:
-        """Seconds until a condition held.
+        """Wait for a condition; return the seconds.
 
         Raises:
             TooLate: it did not within `seconds`; names `what`.
@@ -186,26 +186,26 @@ class Installation:
         return time.monotonic() - begun
 
     def is_ready(self, web: str) -> bool:
-        """Whether a web answers, with its database at the schema of this version."""
+        """Decide whether a web answers, with its database at the schema of this version."""
         try:
             return httpx.get(f"{self.bases[self.webs.index(web)]}/readyz", timeout=5).status_code == 200
         except httpx.HTTPError:
             return False
 
     def webs_are_ready(self) -> bool:
-        """Whether every web is."""
+        """Decide whether every web is."""
         return all(self.is_ready(web) for web in self.webs)
 
     def lives_since(self, worker: str, moment: datetime) -> bool:
-        """Whether the present process of a worker has given a sign of life after a moment."""
+        """Decide whether the present process of a worker has given a sign of life after a moment."""
         return bool(self.ask("select 1 from worker where pid = %s and seen_at > %s", self.processes[worker].pid, moment))
 
     def workers_live_since(self, moment: datetime) -> bool:
-        """Whether every worker's has."""
+        """Decide whether every worker's has."""
         return all(self.lives_since(worker, moment) for worker in self.workers)
 
     def ask(self, query: str, *values: Any) -> list[Any] | None:
-        """Rows of a query as the database's administrator; None while it does not answer."""
+        """Fetch the rows of a query as the database's administrator; None while it does not answer."""
         try:
             with psycopg.connect(self.database.admin_conninfo("betaloop"), connect_timeout=5) as connection:
                 return connection.execute(query, values).fetchall()  # type: ignore[arg-type]
@@ -213,7 +213,7 @@ class Installation:
             return None
 
     def children(self, name: str) -> list[psutil.Process]:
-        """Processes below a web or worker that compute: compute steps, and the forks that read uploads."""
+        """List the processes below a web or worker that compute: compute steps, and the forks that read uploads."""
         found = []
         with contextlib.suppress(psutil.Error):
             for process in psutil.Process(self.processes[name].pid).children(recursive=True):
@@ -224,7 +224,7 @@ class Installation:
         return found
 
     def left(self) -> list[str]:
-        """Processes that name the data folder, in words; a PostgreSQL of one's own is meant to go on."""
+        """Describe the processes that name the data folder; the machine's own PostgreSQL is meant to go on."""
         found = []
         for process in psutil.process_iter():
             with contextlib.suppress(psutil.Error):
@@ -246,7 +246,7 @@ class Installation:
         self.processes.clear()
 
     def said(self) -> str:
-        """The end of what webs and workers said."""
+        """Return the ends of the logs of webs and workers."""
         logs = sorted(self.folder.glob("*.log"))
         return "\n".join(f"--- {log.name}\n" + "\n".join(log.read_text(errors="replace").splitlines()[-15:]) for log in logs)
 
@@ -260,7 +260,7 @@ class Installation:
 
 @contextmanager
 def installation(webs: int = 1, workers: int = 1, own_server: bool = False, keep: bool = False) -> Iterator[Installation]:
-    """An installation in a new folder; whatever of it runs at the end is killed, and the folder removed unless it is kept."""
+    """Make an installation in a new folder; at the end its processes are killed, and the folder removed unless it is kept."""
     folder = Path(tempfile.mkdtemp(prefix="betaloop-", dir="/tmp"))
     folder.chmod(0o711)  # PostgreSQL runs as a user of its own where root starts it
     one = Installation(folder, webs, workers, own_server)
@@ -278,7 +278,7 @@ def installation(webs: int = 1, workers: int = 1, own_server: bool = False, keep
 
 
 def times_slower(load: float, own: float) -> float:
-    """How many times as long an answer may take as on a machine with nothing else to do, where it is exactly 1.
+    """Compute how many times as long an answer may take as on a machine with nothing else to do, where it is exactly 1.
 
     Args:
         load: processes that wait for a processor or have one, on average (`os.getloadavg`).
@@ -288,7 +288,7 @@ def times_slower(load: float, own: float) -> float:
 
 
 def utc() -> datetime:
-    """The present."""
+    """Return the present."""
     return datetime.now(UTC)
 
 

@@ -33,7 +33,7 @@ ALLOWED = (503, 507)
 
 @dataclass
 class Acknowledged:
-    """What the service said is stored.
+    """Writes that the service acknowledged.
 
     Attributes:
         uploads: number of the upload to its session. qocs: (session, grasp frequency), each frequency once. entries: of the clinic day.
@@ -67,7 +67,7 @@ class Study:
 
 
 def table(rng: np.random.Generator, steps: int = STEPS) -> bytes:
-    """A session as a CSV that no other is equal to."""
+    """Write a session as a CSV that equals no other."""
     sink = io.StringIO()
     sink.write("t_s,beta,amplitude_fraction\n")
     for k in range(-10, steps):
@@ -76,7 +76,7 @@ def table(rng: np.random.Generator, steps: int = STEPS) -> bytes:
 
 
 def make_study(installed: Installation, tokens: dict[str, str]) -> Study:
-    """Participants S1 (two visits, the second with a signed plan) and S2 (six sessions, a policy)."""
+    """Make participants S1 (two visits, the second with a signed plan) and S2 (six sessions, a policy)."""
     rng = np.random.default_rng(1)
     # patiently: the first upload of a machine compiles what reads recordings
     admin, signer = (client(installed, tokens[address], 5 * ANSWER_S) for address in PEOPLE)
@@ -99,7 +99,7 @@ def make_study(installed: Installation, tokens: dict[str, str]) -> Study:
 
 
 def client(installed: Installation, token: str, patience_s: float = ANSWER_S) -> httpx.Client:
-    """A caller of the REST interface."""
+    """Make a caller of the REST interface."""
     return httpx.Client(base_url=f"{installed.bases[0]}/api/v1", headers={"Authorization": f"Bearer {token}"}, timeout=patience_s)
 
 
@@ -227,7 +227,7 @@ class Writers:
 
 
 def what_is_wrong(installed: Installation, said: Acknowledged, study: Study) -> list[str]:
-    """Sentences about what was acknowledged and is not there, or is there twice, and about server errors; empty where all is right."""
+    """List what was acknowledged and is absent or there twice, and server errors; empty where all is right."""
     wrong = [f"a request was answered with a server error: {fault}" for fault in said.faults]
 
     def rows(query: str, *values: Any) -> list[Any]:
@@ -260,7 +260,7 @@ def what_is_wrong(installed: Installation, said: Acknowledged, study: Study) -> 
 
 
 def live_jobs(installed: Installation) -> list[str] | None:
-    """Jobs that have not ended, in words; None while the database does not answer."""
+    """Describe the jobs that have not ended; None while the database does not answer."""
     found = installed.ask(
         "select j.id, j.kind, j.status, j.message, w.executor_id, w.status from job j left join dbos.workflow_status w"
         " on w.workflow_uuid = j.id where j.finished_at is null"

@@ -1,1 +1,1 @@
-"""What the benchmark scripts share: none of these modules is a script, and `make bench` runs none of them."""
+"""Modules that the benchmark scripts share: none of these modules is a script, and `make bench` runs none of them."""

@@ -16,7 +16,7 @@ PANEL, LEFT, TOP, GAP, GROUP_GAP, BAR = 170, 70, 40, 46, 26, 13
 
 
 def draw(found: dict[str, dict[str, dict[str, list[float]]]], metrics: tuple[str, ...]) -> str:
-    """The figure. `found`: world -> method -> metric -> one number per seed; bars are means, error bars standard deviations."""
+    """Draw the figure. `found`: world -> method -> metric -> one number per seed; bars are means, error bars standard deviations."""
     methods = list(dict.fromkeys(m for table in found.values() for m in table))
     group = len(methods) * BAR + GROUP_GAP
     width = LEFT + max(1, len(found)) * group + 150
@@ -75,7 +75,7 @@ def _panel(
 
 
 def _axis(metric: str, means: Sequence[float]) -> tuple[float, float, float]:
-    """Ends of a panel's axis and the step of its ticks.
+    """Compute the ends of a panel's axis and the step of its ticks.
 
     A method that is off by several ranges would flatten all others: the axis ends at twice the median where a mean lies beyond that and
     120 %, such a bar is cut, and its number stands on it.
@@ -94,7 +94,7 @@ Point = tuple[float, float, float]
 
 
 def draw_curves(panels: Mapping[str, Mapping[str, Sequence[Point]]], across: str) -> str:
-    """The figure: title -> arm -> one point per visit, shares from 0 to 1; `across` names the axis below."""
+    """Draw the figure: title -> arm -> one point per visit, shares from 0 to 1; `across` names the axis below."""
     arms = list(dict.fromkeys(arm for curves in panels.values() for arm in curves))
     width = MARGIN + len(panels) * (CURVES + MARGIN) + LEGEND
     height = ABOVE + HIGH + BELOW

@@ -1,4 +1,4 @@
-"""How often the parts of the virtual population that nothing may be tuned on have been looked at; the count is kept in `looks.json`."""
+"""Count of looks at the parts of the virtual population that nothing may be tuned on, kept in `looks.json`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class LookError(ValueError):
 
 
 def counts(file: Path = FILE) -> dict[str, list[dict[str, Any]]]:
-    """Looks so far, by part, oldest first."""
+    """List the looks so far, by part, oldest first."""
     return json.loads(file.read_text())
 
 
@@ -41,6 +41,6 @@ def look(part: str, what: str, release: str | None = None, file: Path = FILE) ->
 
 
 def said(file: Path = FILE) -> str:
-    """One sentence on the looks so far."""
+    """Describe the looks so far in one sentence."""
     known = counts(file)
     return "; ".join(f"part {p} has been looked at {len(known[p])} time{'' if len(known[p]) == 1 else 's'}" for p in COUNTED)

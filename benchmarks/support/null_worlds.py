@@ -77,7 +77,7 @@ WORLDS = {
 
 
 def layout(world: World, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Visit, arm and place in the visit of every session."""
+    """Draw visit, arm and place in the visit of every session."""
     visit, tested, order = [], [], []
     for v in range(world.visits):
         if world.design == "apart":
@@ -99,7 +99,7 @@ def layout(world: World, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarr
 def latent(
     world: World, effect: float, rng: np.random.Generator, design: tuple[np.ndarray, np.ndarray, np.ndarray], either: bool = False
 ) -> np.ndarray:
-    """What a metric is made of, in standard deviations of a session.
+    """Draw what a metric is made of, in standard deviations of a session.
 
     `either`: what differs between visits befalls either arm with the same chance, so that the average effect is nil in every metric, also
     in one that has a floor or a ceiling.
@@ -114,7 +114,7 @@ def latent(
 
 
 def measure(metric: str, z: np.ndarray, design: tuple[np.ndarray, np.ndarray, np.ndarray], world: World, rng: np.random.Generator):
-    """A metric of the study from its latent value."""
+    """Derive a metric of the study from its latent value."""
     visit, tested, order = design
     value = {
         "grasp": lambda: GRASP_HZ + 0.15 * z,
@@ -141,7 +141,8 @@ def metric_average(world: World, metric: str, visits: int = 20_000, seed: int = 
 
 
 def tremor_effect(world: World, points: float) -> float:
-    """The average effect in the latent value that brings so many more percentage points of tremor on average over sessions and visits."""
+    """Find the average effect in the latent value that brings so many more percentage points of tremor on average over sessions and
+    visits."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(60)
 
     def tremor(effect: float, spread: float) -> float:
@@ -170,14 +171,14 @@ class Tally:
             cell[1] += number
 
     def write(self, path: Path) -> None:
-        """Whole or not at all."""
+        """Write the file whole or not at all."""
         draft = path.with_suffix(".part")
         draft.write_text(json.dumps([[*key, *counts] for key, counts in self.counts.items()]))
         draft.replace(path)
 
     @classmethod
     def read(cls, path: Path) -> Tally:
-        """What `write` wrote."""
+        """Read what `write` wrote."""
         tally = cls()
         tally.counts = {tuple(row[:-2]): row[-2:] for row in json.loads(path.read_text())}
         return tally
@@ -187,7 +188,7 @@ class Tally:
         return (hits / number if number else float("nan")), number
 
     def pooled(self, name: str, metrics: tuple[str, ...], label: str) -> tuple[float, int]:
-        """Over metrics that follow the same law."""
+        """Pool metrics that follow the same law."""
         cells = [self.counts.get((name, m, label), [0, 0]) for m in metrics]
         number = sum(c[1] for c in cells)
         return (sum(c[0] for c in cells) / number if number else float("nan")), number
@@ -204,7 +205,7 @@ TREMOR_ALONE = (1.0, 2.0, 3.0)
 
 
 def margin_studies(visits: int, studies: int, seed: int) -> Tally:
-    """One outcome exactly at its margin, or everything equal to cDBS; energy saved by a third."""
+    """Run studies with one outcome exactly at its margin, or everything equal to cDBS; energy saved by a third."""
     tally = Tally()
     cells = [(at, slope, slope, stops, studies) for slope, stops in EVERYWHERE for at in KEYS]
     cells += [("nothing", slope, slope, stops, studies // 4) for slope, stops in EVERYWHERE]
@@ -222,7 +223,7 @@ def margin_studies(visits: int, studies: int, seed: int) -> Tally:
 
 
 def judged(worlds: dict[str, World], at: str, stops: float, rng: np.random.Generator, seed: int) -> tuple[bool, bool]:
-    """Whether non-inferiority is shown by the service's rule, and whether the saving is shown too; `at`: the outcome at its margin."""
+    """Decide whether non-inferiority is shown by the service's rule, and whether the saving is too; `at`: the outcome at its margin."""
     design = layout(worlds["grasp"], rng)
     visit, tested, order = design
     stopped = (rng.random(visit.size) < stops) & tested
@@ -250,7 +251,7 @@ def _share(share: float) -> str:
 
 
 def show_margin(tally: Tally) -> dict[str, float]:
-    """Non-inferiority at the margin and where nothing is lost."""
+    """Print non-inferiority at the margin and where nothing is lost."""
     emit("non-inferiority shown: grasp, rating, tremor exactly at its margin (an error)")
     emit(" | nothing lost (power), of it with the saving shown\n")
     asked = {k: c for k, c in tally.counts.items() if len(k) == 5}

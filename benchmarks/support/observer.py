@@ -42,7 +42,7 @@ RBF_SHARES, LENGTHS, NOISES = (0.0, 0.3, 0.7, 1.0), (0.7, 1.5, 3.0), (0.01, 0.03
 
 
 def patient_alike(w: World, number: int) -> World:
-    """A world of the same kind with other constants: the same mechanism, trait and threshold, days and noise of its own."""
+    """Draw a world of the same kind with other constants: the same mechanism, trait and threshold, days and noise of its own."""
     rng = np.random.default_rng([w.key, number, 0x1DEA])
     patient = with_trait(draw_patient(MECHANISMS.index(w.patient.mechanism), rng), w.trait, rng)
     key = KEYS + 4096 * w.key + number
@@ -50,19 +50,19 @@ def patient_alike(w: World, number: int) -> World:
 
 
 def _with_threshold(patient: Patient, key: int, xi: float) -> Patient:
-    """The patient with the unit of beta at which the threshold midway between cDBS and 0.3 is xi."""
+    """Scale the patient to the unit of beta at which the threshold midway between cDBS and 0.3 is xi."""
     days = new_days(key, CALIBRATION, CALIBRATION_DAYS)
     full, low = (simulate(patient, 1.0, ConstantPolicy(a), days=days, key=key, first=CALIBRATION).beta.mean() for a in (1.0, 0.3))
     return patient._replace(unit=float(2 * xi / (full + low)))
 
 
 def returns_of(w: World, policies: Sequence[Policy], sessions: int) -> Floats:
-    """True returns [P, sessions] on new days; session i of two policies has the same day and noise."""
+    """Compute true returns [P, sessions] on new days; session i of two policies has the same day and noise."""
     return np.stack([w.truth(policy, sessions).returns for policy in policies])
 
 
 def statistics(w: World, design: DataDesign, visits: int) -> Floats:
-    """What the sessions of early visits show, [k], the same numbers in the same order for every patient."""
+    """Compute what the sessions of early visits show, [k], the same numbers in the same order for every patient."""
     rows = visit_plan(w.settings, design, 0, visits)
     longest = max(row.amplitudes.size for row in rows)
     shortest = min(row.amplitudes.size for row in rows)
@@ -83,7 +83,7 @@ def statistics(w: World, design: DataDesign, visits: int) -> Floats:
 
 
 def _by_bin(rows: Sequence[DataSession], each: Floats) -> Floats:
-    """Means over the cDBS sessions, those without stimulation, and random ones of like mean amplitude, flat."""
+    """Average over the cDBS sessions, those without stimulation, and random ones of like mean amplitude, flat."""
     kinds = np.array([row.controller for row in rows])
     doses = np.array([row.amplitudes.mean() for row in rows])
     random = np.flatnonzero(kinds == "random")
@@ -93,7 +93,8 @@ def _by_bin(rows: Sequence[DataSession], each: Floats) -> Floats:
 
 
 def _answers(rows: Sequence[DataSession], log_beta: Floats) -> Floats:
-    """Covariance of beta with the amplitude some steps before, within the random sessions, over the amplitude's variance, [LAGS]."""
+    """Compute the covariance of beta with the amplitude some steps before, within the random sessions, over the amplitude's variance,
+    [LAGS]."""
     found = np.zeros(len(LAGS))
     total = 0.0
     for i, row in enumerate(rows):
@@ -126,7 +127,7 @@ class Regression:
     left_out: Floats
 
     def predict(self, statistics: Floats) -> Floats:
-        """Mean of the targets [..., C] given statistics [..., k]."""
+        """Predict the mean of the targets [..., C] given statistics [..., k]."""
         x = standardised(np.atleast_2d(statistics), self.centre, self.spread)
         found = self.mean + kernel(x, self.points, self.rbf_share, self.length) @ self.weights
         return np.asarray(found[0] if statistics.ndim == 1 else found)
@@ -156,12 +157,12 @@ def regress(statistics: Floats, targets: Floats) -> Regression:
 
 
 def standardised(statistics: Floats, centre: Floats, spread: Floats) -> Floats:
-    """Statistics in standard deviations, cut at `LARGEST`."""
+    """Express statistics in standard deviations, cut at `LARGEST`."""
     return np.asarray(np.clip((statistics - centre) / spread, -LARGEST, LARGEST), dtype=np.float64)
 
 
 def kernel(a: Floats, b: Floats, rbf_share: float, length: float) -> Floats:
-    """Straight and curved similarity of standardised statistics, [A, B]."""
+    """Compute the straight and curved similarity of standardised statistics, [A, B]."""
     k = a.shape[1]
     straight = a @ b.T / k
     squared = np.maximum((a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T, 0.0)
@@ -170,7 +171,7 @@ def kernel(a: Floats, b: Floats, rbf_share: float, length: float) -> Floats:
 
 @dataclass(frozen=True)
 class Observed:
-    """What an observer with so many visits says of a world and of others of its kind.
+    """Predictions of an observer with so many visits, of a world and of others of its kind.
 
     Attributes:
         said: of the world itself, [C]. others: of patients that it did not learn from, [T, C].
@@ -185,7 +186,7 @@ class Observed:
 def observe(
     w: World, design: DataDesign, visits: int, learnt: Sequence[World], targets: Floats, scatter: Floats, others: Sequence[World]
 ) -> Observed:
-    """The observer of a world.
+    """Fit the observer of a world.
 
     Args:
         w: the world. design, visits: of its data, 0 for none. learnt: patients of its kind, N. targets: their simulated returns, [N, C].

@@ -37,7 +37,7 @@ class Case:
 
 
 def virtual_case(part: str, index: int, sessions: int, known: dict[str, Any] | None = None) -> Case:
-    """A world of the virtual population.
+    """Make the case of a world of the virtual population.
 
     Args:
         part, index: which. sessions: simulated ones behind each true return. known: truth from an earlier run.

@@ -45,7 +45,7 @@ class Table(Protocol):
 
 @dataclass
 class Row:
-    """What one method did with one design: metrics per world, in order, and its answers about signs."""
+    """Results of one method with one design: metrics per world, in order, and its answers about signs."""
 
     worlds: list[str] = field(default_factory=list)
     scores: dict[str, list[float | None]] = field(default_factory=dict)
@@ -64,7 +64,7 @@ class Row:
         return over_worlds(self.scores.get(metric, []), worst_is_low=metric.removesuffix(" supported") in LOW_IS_WORSE)
 
     def drawn(self, metric: str) -> list[float]:
-        """The numbers of one panel of the figure: one for each world, of signs the share over worlds; empty where there is none."""
+        """List the numbers of one panel of the figure: one for each world, of signs the share over worlds; empty where there is none."""
         if metric in self.scores:
             return [(100 if "%" in DRAWN[metric] else 1) * x for x in self.scores[metric] if x is not None]
         answers, what = metric.split()
@@ -77,7 +77,7 @@ Summary = dict[tuple[str, str], Row]
 
 
 def summarise(names: Iterable[str], cells: Table, methods: list[str]) -> Summary:
-    """(design, method) -> what it did. Worlds whose range of true returns is within its error are left out."""
+    """Summarise what each (design, method) did. Worlds whose range of true returns is within its error are excluded."""
     result: Summary = {}
     for name in names:
         truth = cells.get(f"{name}/truth")
@@ -169,7 +169,7 @@ def _cell(s: dict[str, float]) -> str:
 
 
 def _paired(rows: dict[str, Row], headline: str, out: Callable[[str], Any]) -> None:
-    """Differences of `PAIRED` from the headline's, on the worlds that both have, with standard errors."""
+    """Print the differences of `PAIRED` from the headline's, on the worlds that both have, with standard errors."""
     base = rows.get(headline)
     for method, row in rows.items():
         if base is None or method == headline:
@@ -189,7 +189,7 @@ def _at(row: Row, name: str, metric: str) -> float:
 
 
 def figures(summary: Summary, headline: str) -> dict[str, float | None]:
-    """The figures of the last line: of the headline's method with the stratified design, and with the paper's (`_paper`)."""
+    """Compute the figures of the last line: of the headline's method with the stratified design, and with the paper's (`_paper`)."""
     result: dict[str, float | None] = {}
     for design, suffix in (("stratified", ""), ("paper", "_paper")):
         row = summary.get((design, headline), Row())

@@ -1,4 +1,4 @@
-"""How good estimates of candidates are in one world, and the means, medians and worst deciles over worlds.
+"""Scores of estimates of candidates in one world, and their means, medians and worst deciles over worlds.
 
 Shares are of the range of the candidates' true returns. Source of the metrics: Gao et al. 2023 (rank correlation, regret), SCOPE-RL
 (SharpeRatio@k), Gneiting and Raftery 2007 (interval score).
@@ -37,25 +37,25 @@ class Told:
 
     @property
     def told(self) -> bool:
-        """Whether the interval leaves 0 out."""
+        """True where the interval excludes 0."""
         return self.low > 0 or self.high < 0
 
     @property
     def right(self) -> bool | None:
-        """Whether the sign that is told is the true one; None where none is told or the truth is within its error of 0."""
+        """True where the sign that the interval shows is the true one; None where it shows none or the truth is within its error of 0."""
         if not self.told or abs(self.truth) < 2 * self.standard_error:
             return None
         return (self.low > 0) == (self.truth > 0)
 
 
 def interval_score(low: np.ndarray, high: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Width plus 2 / (1 - LEVEL) times the distance by which the truth is missed; small is good. Any shape."""
+    """Compute the width plus 2 / (1 - LEVEL) times the distance by which the truth is missed; small is good. Any shape."""
     penalty = 2 / (1 - LEVEL)
     return (high - low) + penalty * np.maximum(low - truth, 0) + penalty * np.maximum(truth - high, 0)
 
 
 def world_scores(truth: Sequence[float], estimates: Sequence[Mapping[str, Any]], cdbs: float) -> dict[str, float | None]:
-    """Metrics over all candidates of one world and, with " supported" behind their names, over those that the method supports.
+    """Compute metrics over all candidates of one world and, with " supported" behind their names, over those that the method supports.
 
     The latter are None below three of them, and where their true returns do not differ.
 
@@ -93,7 +93,7 @@ def _scores(v: np.ndarray, estimates: Sequence[Mapping[str, Any]], cdbs: float) 
 def scores_of_tests(
     truth: Sequence[float], spread_of_returns: Sequence[float], cdbs: float, sessions: int, draws: int = 50
 ) -> dict[str, Any]:
-    """Mean metrics of testing every candidate itself, each in its share of `sessions`, each on a day of its own."""
+    """Compute mean metrics of testing every candidate itself, each in its share of `sessions`, each on a day of its own."""
     rng, v = np.random.default_rng(0), np.asarray(truth)
     error = np.asarray(spread_of_returns) / np.sqrt(max(sessions / v.size, 1.0))
     found = []
@@ -105,7 +105,7 @@ def scores_of_tests(
 
 
 def over_worlds(values: Sequence[float | None], *, worst_is_low: bool) -> dict[str, float]:
-    """Mean with its standard error, median and worst decile; NaN where no world has the metric."""
+    """Compute the mean with its standard error, median and worst decile; NaN where no world has the metric."""
     x = np.array([v for v in values if v is not None], dtype=np.float64)
     if x.size == 0:
         return dict.fromkeys(("mean", "error", "median", "decile"), float("nan"))
@@ -119,6 +119,6 @@ def over_worlds(values: Sequence[float | None], *, worst_is_low: bool) -> dict[s
 
 
 def signs(told: Sequence[Told]) -> tuple[float, float]:
-    """Share of signs that are right among those told, and share of differences of which none is told; NaN without any."""
+    """Compute the share of right signs among those shown, and the share of differences without one; NaN without any."""
     right = [t.right for t in told if t.right is not None]
     return (float(np.mean(right)) if right else float("nan")), (1 - float(np.mean([t.told for t in told])) if told else float("nan"))

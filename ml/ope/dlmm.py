@@ -2,10 +2,10 @@
 
 Source: Gao et al. 2023, appendix C.2 (after Gao et al., ICCPS 2022): a variational auto-encoder of single transitions,
     prior p(z) = N(0, I),  encoder q(z_t | s_t),  decoder p(s_{t+1}, r_t | z_t, a_t),
-trained by the evidence lower bound of log p(s_{t+1}, r_t) and rolled out by encoding every predicted state anew. It carries nothing from
-one step to the next but the window of beta itself, and cannot predict end-of-session outcomes: those come from the same regression on a
-session's minutes that the linear model uses, so that the comparison is fair. Only the newest beta of s_{t+1} is decoded; the others
-are known from s_t. Everything enters standardised; the reward is the decoder's.
+trained by the evidence lower bound of log p(s_{t+1}, r_t) and rolled out by encoding every predicted state again. It carries nothing from
+one step to the next but the window of beta itself. It cannot predict end-of-session outcomes: those come from the linear model's regression
+on a session's minutes, so that the comparison is fair. Only the newest beta of s_{t+1} is decoded; the others are known from s_t.
+Everything enters standardised; the reward is the decoder's.
 """
 
 from __future__ import annotations

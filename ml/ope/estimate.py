@@ -37,7 +37,7 @@ class Estimate:
         step_return: the part of `value` from the steps.
         end_reward: the part from r_end; None where no session of the buffer has an r_end (then `value` lacks it and a flag says so).
         predicted: what the method predicts besides: `energy` (mean a^2), `mean_amplitude`, `mean_beta` (participant's unit), and outcomes
-            by their field; a key is absent where the method cannot say.
+            by their field. A key is absent where the method cannot say.
         supported: False when the data cannot speak about this policy.
         flags: the reasons why the data cannot speak, and warnings.
         n: sessions or roll-outs behind the value.

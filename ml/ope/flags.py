@@ -97,7 +97,7 @@ def not_counted_tests(without_cdbs: int = 0, of_unknown_noise: int = 0, without_
 
     Args:
         without_cdbs: at visits without a cDBS session. of_unknown_noise: with a quantity whose scatter between sessions is unknown.
-            without_policy: of policies that cannot be replayed, since their file is gone or they take other windows.
+            without_policy: of policies that cannot be replayed. Their file is gone, or they take other windows.
     """
     number = without_cdbs + of_unknown_noise + without_policy
     why = {"without_cdbs": without_cdbs, "of_unknown_noise": of_unknown_noise, "without_policy": without_policy}

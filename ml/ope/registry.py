@@ -15,7 +15,7 @@ from ml.ope.estimate import Estimator
 
 Family = Literal["model", "value", "density ratio", "importance weights", "combination"]
 Size = Literal["full", "demo", "held_out"]
-"""`full` for a study, `demo` for a first look, `held_out` where a method is fitted once for each controller that is left out."""
+"""`full` for a study, `demo` for a first look, `held_out` where a method is fitted once for each held-out controller."""
 
 Factory = Callable[[str, int, Size], Estimator]
 """Makes the estimator of a key with a seed at a size."""
@@ -38,7 +38,7 @@ class Method:
         family: what it learns.
         needs: what the data must have for it, for people.
         factory: `module:attribute` of a `Factory`; None for the combination.
-        held_out: whether it is fitted within seconds, so that it can be refitted without each controller and held against its sessions.
+        held_out: whether it is fitted within seconds, so that it can be refitted without each controller and compared with its sessions.
         by_default: whether it runs where no methods are named: the answer rests on it, or it checks the answer within seconds.
         combines: whether the combination of all takes it where it ran.
         preference: place in the usual order where the data choose no method; None for a method that is never taken by default.

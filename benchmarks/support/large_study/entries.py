@@ -1,4 +1,4 @@
-"""What a large study for measuring pages needs beside its rows, entered as people enter it: through the REST interface of the service."""
+"""Entries of a large study for measuring pages besides its rows, made as people make them: through the REST interface of the service."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WHY_UNSAFE = "A plan of every participant is measured, whatever the verdict."
 
 
 def callers(app: Any, admin: str) -> tuple[TestClient, TestClient]:
-    """Who signs, and who drafts what is signed; both with tokens."""
+    """Make a signer and a drafter, both with tokens."""
     with transaction("bench") as db:
         if not any(u.email == DRAFTER for u in repository.users(db)):
             accounts.add_user(db, DRAFTER, Role.CLINICIAN, "pages of a large study")
@@ -31,7 +31,8 @@ def callers(app: Any, admin: str) -> tuple[TestClient, TestClient]:
 
 
 def complete(signer: TestClient, drafter: TestClient, code: str, password: str, visit: int, policies: list[int]) -> dict[str, Any]:
-    """A session with samples, a proposal, a table of unknown columns, a device's history, an approved plan with a day, events, questions.
+    """Enter a session with samples, a proposal, a table of unknown columns, a device's history, an approved plan with a day, events,
+    questions.
 
     Args:
         signer, drafter: who calls. code: of the participant. password: the signer's. visit: number of the newest visit.
@@ -78,7 +79,7 @@ def _upload(client: TestClient, code: str, *files: tuple[str, bytes], **stated: 
 
 
 def _samples(rng: np.random.Generator) -> bytes:
-    """A table of raw samples with a beta rhythm, from 20 s before its session on."""
+    """Write a table of raw samples with a beta rhythm, from 20 s before its session on."""
     t = (np.arange(-20 * LFP_HZ, 60 * LFP_MINUTES * LFP_HZ) + 1) / LFP_HZ
     lfp = 4 * np.sin(2 * np.pi * 20 * t) + rng.standard_normal(t.size)
     return ("t_s,lfp [uV],amplitude_ma\n" + "".join(f"{a:.3f},{b:.3f},2.0\n" for a, b in zip(t, lfp, strict=True))).encode()
@@ -95,7 +96,7 @@ def _unknown(rng: np.random.Generator) -> bytes:
 
 
 def _report(rng: np.random.Generator) -> bytes:
-    """A report of a device with a trend of two months."""
+    """Write a report of a device with a trend of two months."""
     begin = dt.datetime(2026, 2, 1, tzinfo=dt.UTC)
 
     def at(minutes: int) -> str:

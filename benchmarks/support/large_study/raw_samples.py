@@ -1,4 +1,4 @@
-"""How long the service works until a session of many raw samples is drawn, and for every stretch that a reader then zooms to.
+"""Time until the service has drawn a session of many raw samples, and each stretch that a reader zooms to.
 
 The session is uploaded as a table. The first request of its chart decodes the file in a child, which writes extremes per bin of time (a
 min-max pyramid) and the spectrogram; every later one reads what stands in its window.
@@ -29,7 +29,7 @@ EMAIL = "admin@clinic.example"
 
 
 def table(samples: int) -> bytes:
-    """Samples with a beta rhythm, from before the session on; times in s."""
+    """Write samples with a beta rhythm, from before the session on; times in s."""
     rng = np.random.default_rng(1)
     t = (np.arange(samples) - LEAD_S * RATE_HZ + 1) / RATE_HZ
     values = 4 * np.sin(2 * np.pi * 20 * t) + rng.standard_normal(samples)
@@ -37,7 +37,7 @@ def table(samples: int) -> bytes:
 
 
 def windows(duration_s: float, count: int) -> list[tuple[float, float]]:
-    """Stretches as a reader zooms: from the whole session down to two seconds, at drawn places."""
+    """Draw stretches as a reader zooms: from the whole session down to two seconds, at drawn places."""
     rng = np.random.default_rng(2)
     widths = np.geomspace(duration_s, 2.0, count)
     begins = [float(rng.uniform(0, duration_s - width)) if width < duration_s else 0.0 for width in widths]
@@ -45,7 +45,7 @@ def windows(duration_s: float, count: int) -> list[tuple[float, float]]:
 
 
 def measured(client: TestClient, address: str, **params: float) -> tuple[float, float, int]:
-    """Milliseconds by the clock and of the processor, and bytes of an answer."""
+    """Measure milliseconds by the clock and of the processor, and bytes of an answer."""
     cpu, wall = time.process_time(), time.perf_counter()
     answer = client.get(address, params=params)
     if answer.status_code != 200:
@@ -80,7 +80,7 @@ def raw_samples(samples: int, count: int) -> dict[str, Any]:
 
 
 def figures(client: TestClient, session: int, samples: int, count: int) -> dict[str, Any]:
-    """What `raw_samples` returns."""
+    """Compute what `raw_samples` returns."""
     address = f"/sessions/{session}/signal.json"
     first, _, largest = measured(client, address)
     later = [measured(client, address, begin_s=b, end_s=e) for b, e in windows(samples / RATE_HZ - LEAD_S, count)]

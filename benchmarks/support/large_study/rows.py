@@ -45,7 +45,7 @@ BETWEEN_VISITS = dt.timedelta(days=28)
 
 @dataclass(frozen=True)
 class Extent:
-    """How large the study is."""
+    """Extent of the study."""
 
     participants: int = 20
     visits: int = 12
@@ -59,12 +59,12 @@ class Extent:
 
 
 def add_account(db: Session) -> None:
-    """Who looks at the pages."""
+    """Add the account that looks at the pages."""
     accounts.add_user(db, EMAIL, Role.ADMIN, PASSWORD)
 
 
 def add_participant(db: Session, number: int, extent: Extent) -> None:
-    """One participant with everything that pages show of it."""
+    """Add one participant with everything that pages show of it."""
     rng = np.random.default_rng(number)
     settings = {"xi_beta": 1.0, "cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"}
     participant = enrol(db, ParticipantIn.model_validate({"code": f"P{number:02d}", "settings": settings}), SYSTEM)
@@ -156,7 +156,7 @@ def _policy_file(db: Session, i: int) -> str:
 def _add_policies(
     db: Session, participant: Participant, snapshot: BufferSnapshot, stored: list[str], rng: np.random.Generator
 ) -> list[Policy]:
-    """Sweeps of eight, the last policy of each being a student of the one before."""
+    """Add sweeps of eight, the last policy of each being a student of the one before."""
     rows: list[Policy] = []
     for first in range(0, len(stored), PER_SWEEP):
         members = range(first, min(first + PER_SWEEP, len(stored)))

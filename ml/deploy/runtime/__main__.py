@@ -6,9 +6,9 @@
     --log=FILE         the session's log, a new file
     --ledger=FOLDER    which sessions this tablet has run (default: .betaloop-tablet in the home folder)
     --withdrawn=FILE   the study's signed list of withdrawn policies and plans
-    --bench            with --run: nobody is connected; any bundle runs, and lone numbers count as beta
+    --bench            with --run: no person is connected; any bundle runs, and lone numbers count as beta
     --replay           with --run and --bench: one line per period, as fast as they come, with no clock
-    --time=N           measure N decisions on this machine (200 where N is left out): mean and SD, milliseconds
+    --time=N           measure N decisions on this machine (200 where N is absent): mean and SD, milliseconds
 
 The lines are those of `protocol.py`. Without --key hashes and test vectors are checked, and the signature is not.
 """

@@ -1,1 +1,1 @@
-"""Estimates held against actual returns, against each other, and combined."""
+"""Comparison of estimates with actual returns and with each other, and their combination."""

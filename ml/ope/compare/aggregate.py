@@ -1,7 +1,7 @@
 """One estimate from several methods: the convex combination of least estimated error. Source: OPERA, Nie et al. 2024.
 
-The error of a combination is estimated from refits on resampled sessions, which see variance and not bias; what left-out controllers
-showed of each method's bias is added where it is known.
+The error of a combination is estimated from refits on resampled sessions, which see variance and not bias. The bias that held-out
+controllers showed of each method is added where it is known.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ Floats = NDArray[np.float64]
 def error_matrix(estimates: Mapping[str, Mapping[str, Estimate]], methods: list[str], bias: Mapping[str, float] | None = None) -> Floats:
     """Estimate the mean product of the errors of two methods, averaged over policies, [M, M].
 
-    Draws of two methods count together where both were made on the same resamples of the sessions, which they name (`resampled`): the first
-    ones are then the same sessions. Draws from a posterior or of an ensemble stand side by side with no others, and their chance products
-    are no covariance; such methods, and those that keep no draws, have the square of their standard error alone.
+    Draws of two methods count together where both name the same resamples of the sessions (`resampled`), because the first ones are then
+    the same sessions. Draws from a posterior or of an ensemble match no others, and their chance products are no covariance. Such methods,
+    and those that keep no draws, have the square of their standard error alone.
     """
     policies = common_policies(estimates, methods)
     total = np.zeros((len(methods), len(methods)))

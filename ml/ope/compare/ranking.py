@@ -71,8 +71,8 @@ def rank_policies(
 def probability_best(estimates: Mapping[str, Estimate], draws: int = 4000, seed: int = 0) -> dict[str, float]:
     """Compute the probability that each policy has the highest return, summing to 1.
 
-    Where every estimate keeps as many draws (aligned over policies, so that what is common to them cancels), those are counted; else
-    independent normals of value and standard error.
+    Where every estimate keeps as many draws, those are counted: they are aligned over policies, so that what is common to them cancels.
+    Else independent normals of value and standard error are counted.
     """
     names = list(estimates)
     if not names:

@@ -1,8 +1,8 @@
-"""Errors of methods on these data: each predicts the return of controllers that were left out of its fit, compared with what their
-sessions returned. No true return, no simulator: sessions alone.
+"""Errors of methods on these data: each predicts the return of controllers that its fit excluded, compared with what their sessions
+returned. No true return, no simulator: sessions alone.
 
-A controller is left out whole (the question that a new policy asks), and what it did is given to the methods as a policy: the policy itself
-where it is at hand, uniform draws for the random controller, else a clone. The errors widen the intervals of the methods.
+A controller is held out whole, as a new policy would be. Methods get what it did as a policy: the policy itself where it is at hand,
+uniform draws for the random controller, else a clone. The errors widen the intervals of the methods.
 """
 
 from __future__ import annotations
@@ -212,7 +212,7 @@ def _combined(found: Mapping[str, Estimate]) -> dict[str, Estimate]:
 def _comparable(groups: Mapping[Key, list[int]], truth: Mapping[Key, Observed]) -> tuple[dict[Key, list[int]], bool]:
     """Find the controllers that can be compared, and whether by whole returns.
 
-    A return with r_end and one without differ by r_end alone. Where enough controllers have it, the others are left out; else all are
+    A return with r_end and one without differ by r_end alone. Where enough controllers have it, the others are excluded. Else all are
     compared by their steps.
     """
     complete = {k: i for k, i in groups.items() if k in truth and truth[k].end_reward is not None}
@@ -220,7 +220,7 @@ def _comparable(groups: Mapping[Key, list[int]], truth: Mapping[Key, Observed]) 
 
 
 def _prediction(method: str, key: Key, estimate: Estimate, truth: Observed, whole: bool) -> Prediction:
-    # Held against the same parts: a method without r_end is compared by its steps.
+    # Compared with the same parts: a method without r_end is compared by its steps.
     with_end = whole and estimate.end_reward is not None and truth.end_reward is not None
     name = key[0] if key[1] is None else f"{key[0]} {key[1]}"
     return Prediction(

@@ -20,17 +20,17 @@ class DlsmConfig:
         latent, hidden, heads: size of z, units of both LSTMs, hidden layers of the heads.
         objective: `posterior` (Theorem 1), or its `sum` with free runs (Algorithm 1 to the letter).
         state_terms: `window` reconstructs every beta of s_t (paper), `newest` only the one that s_{t-1} does not hold.
-        action_emission: heads of steps see a_{t-1} beside z_t, so that beta and reward answer to the action.
+        action_emission: heads of steps see a_{t-1} next to z_t, so that beta and reward answer to the action.
         end_features: outcomes from z_T (`final`, paper) or from z_T and the mean of z (`pooled`).
         start: roll-outs from `observed` s_0 through q(z_0 | s_0), or from the `prior` (paper).
         skip: a linear path from z_{t-1} and the inputs to the mean of z_t past the LSTM; without it z_t is drawn given h_t alone (paper).
         qoc_terms: the QoCs shape the latent state as r_end does; without it they are only read from it (paper).
-        residual: the head of beta predicts what a linear one-step prediction from window and recent amplitudes leaves; it starts at zero,
-            and the untrained model is one of the checks.
+        residual: the head of beta predicts what a linear one-step prediction from window and recent amplitudes leaves. It starts at zero.
+            The untrained model is one of the checks.
         reward_terms: a Gaussian density of the reward in the objective (paper); without it the reward is the known one of sampled beta.
         free_bits: KL of a step that costs nothing, nats.
-        overshoot: free runs of the objective start from posterior states at a multiple of so many steps, drawn anew at every
-            gradient step; 0: from the first step alone.
+        overshoot: free runs of the objective start from posterior states at a multiple of so many steps, drawn again at every gradient
+            step. At 0 they start from the first step alone.
         members: ensemble size, one seed each.
         steps: gradient steps at most. batch: sessions per step. learning_rate: of Adam, falling to a tenth along a half cosine.
         clip_norm: largest norm of the gradient. weight_decay: decoupled.
@@ -44,9 +44,9 @@ class DlsmConfig:
         rollouts: trajectories per policy and member. block: trajectories advanced together.
         reward_source: step return from the learnt reward `head`, from the `known` reward on sampled beta, or whichever predicts
             `held_out` sessions better.
-        end_source: r_end and QoCs from the `latent` state (paper), from the `summaries` of its minutes as in the other methods
-            (`ml.ope.outcomes`), or whichever predicts r_end of `held_out` sessions better.
-        decode_all_window: draw all W betas of s_t anew instead of shifting the window (paper; needs `window`).
+        end_source: r_end and QoCs from the `latent` state (paper), or from the `summaries` of its minutes as in other methods
+            (`ml.ope.outcomes`). `held_out`: whichever predicts r_end of held-out sessions better.
+        decode_all_window: draw all W betas of s_t again instead of shifting the window (paper; needs `window`).
         seed: first seed.
 
     Raises:

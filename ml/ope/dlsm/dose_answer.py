@@ -1,6 +1,6 @@
 """Check of whether the members of an ensemble answer to a lasting dose as the data do.
 
-In a random session the dose is drawn, so how beta moves with it within the session is an experiment; the level of the session cancels. A
+In a random session the dose is drawn, so how beta moves with it within the session is an experiment. The level of the session cancels. A
 controller that follows beta gives more where beta is high, which would turn the sign: its sessions do not count.
 """
 
@@ -38,7 +38,7 @@ class DoseAnswer:
     """Change of standardised beta per unit of the dose (1: from none to cDBS) within random sessions.
 
     Attributes:
-        slope: pooled over sessions. error: its standard error, over sessions. sessions: that tell anything.
+        slope: pooled over sessions. error: its standard error, over sessions. sessions: that inform it.
         low, high: doses between which members are asked for theirs: the lower and upper decile of those in random sessions.
     """
 

@@ -1,7 +1,7 @@
 """Off-policy evaluation by the deep latent sequential model (DLSM). Source: Gao et al. 2023, section 5.
 
-An ensemble of models is trained on the sessions, each with some sessions left out; every policy is rolled out in each of them. What
-the interval holds: the spread of the ensemble, the error of the level measured on held-out sessions, and Monte-Carlo error.
+An ensemble of models is trained on the sessions, each with some sessions held out; every policy is rolled out in each of them. What the
+interval holds: the spread of the ensemble, the error of the level measured on held-out sessions, and Monte-Carlo error.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Dlsm:
         """Train every member; what a checkpoint in `checkpoint_dir` calls finished is not trained again.
 
         Raises:
-            ValueError: fewer than four sessions, no usable step, a checkpoint of another buffer or other settings, or so many members are
+            ValueError: fewer than four sessions, no usable step, or a checkpoint of another buffer or other settings. So many members are
                 discarded for their answer to a lasting dose that no spread is left.
         """
         data = self._prepare(buffer)
@@ -160,7 +160,7 @@ class FittedDlsm:
     def held_out_skill(self) -> dict[str, Any]:
         """Compute the held-out free-running skill of the members together: 1 is perfect, 0 no better than the mean of the learnt sessions.
 
-        `answer_skill` is that of the differences in mean beta between controllers, of sessions that some member did not learn from; None
+        `answer_skill` is that of the differences in mean beta between controllers, of sessions that some member did not learn from. None
         where these are of one controller.
         """
         sessions = {e.session for c in self.checks for e in c.errors}
@@ -228,8 +228,8 @@ class FittedDlsm:
     def _uncertainty(self, values: Floats, runs: list[Rollouts], horizon: int) -> tuple[Floats, Floats]:
         """Draw around the values, [DRAWS, P], and standard errors, [P].
 
-        Spread of the ensemble (correlated over policies), error of the level from held-out sessions and from few days (common to all
-        policies), coefficients of the outcome model where it is used (correlated), Monte-Carlo error (of each policy).
+        The spread of the ensemble and the coefficients of the outcome model, where it is used, are correlated over policies. The error of
+        the level, from held-out sessions and from few days, is common to all policies. The Monte Carlo error is of each policy.
         """
         rng = np.random.default_rng(self.config.seed + 2000)
         members, p = values.shape

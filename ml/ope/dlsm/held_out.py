@@ -1,7 +1,7 @@
 """Held-out free-running prediction: how a DLSM is chosen, and how far its level may be off. No true return of any policy enters.
 
-Sessions that a model has not learnt from are run freely from q(z_0 | s_0) under their own actions. Compared are means over blocks of steps,
-since single steps are noise and the return follows levels, each as a share of the error of a constant, the mean of the learnt sessions.
+Sessions that a model has not learnt from are run freely from q(z_0 | s_0) under their own actions. Means over blocks of steps are compared,
+since single steps are noise and the return follows levels. Each error is a share of that of a constant, the mean of the learnt sessions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BLOCK = 30
 """Steps whose means are compared: about a minute."""
 
 FEWEST_BLOCKS, LEAST_DOSE = 3, 0.03
-"""Blocks of a session, and standard deviation of their doses, that tell how beta moves with the dose within it."""
+"""Blocks of a session, and standard deviation of their doses, that show how beta moves with the dose within it."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class Shares:
 
     Attributes:
         beta, head, known: of block means. outcomes: None where none was measured.
-        contrast: of the differences in mean beta between controllers, as a share of these differences: the answer to the action, free of
-            what all sessions are off by alike. None where the sessions are of one controller.
+        contrast: of the differences in mean beta between controllers, as a share of these differences. It is the answer to the action, free
+            of a common error of all sessions. None where the sessions are of one controller.
         dose: of how beta moves with the dose within random sessions, as a share of that movement; None where it was not asked for.
     """
 
@@ -142,7 +142,7 @@ def _contrast(errors: Sequence[SessionError], kinds: Mapping[int, object]) -> fl
     by_session: dict[int, list[tuple[float, float]]] = {}
     for e in errors:
         by_session.setdefault(e.session, []).append((e.beta_seen, e.beta_predicted))
-    # a session that several members left out counts once
+    # a session that several members held out counts once
     for session, each in by_session.items():
         seen_mean, predicted_mean = np.mean(each, axis=0)
         by_kind.setdefault(kinds[session], []).append((float(seen_mean), float(predicted_mean)))
@@ -299,7 +299,7 @@ def block_error(seen: Floats, predicted: Floats) -> Floats:
     """Compute the mean over blocks of the squared difference of block means, [C], for a trace [T] with NaN gaps and predictions of it, [C,
     T].
 
-    A block counts when a third of it is known; where none does, all known steps are one block, and without any the result is NaN.
+    A block counts when a third of it is known. Where none does, all known steps are one block. Without any the result is NaN.
     """
     known = np.isfinite(seen)
     if not known.any():

@@ -1,7 +1,7 @@
 """Linear prediction of beta one step ahead, to which the heads of a DLSM add what it leaves.
 
 The model is that of `ml.ope.linear.dynamics` (answer to the amplitude, autoregression of order W) at the mean level of the sessions it was
-fitted to: the level of a day or a session is for the latent state to find.
+fitted to. The latent state has to find the level of a day or a session.
 """
 
 from __future__ import annotations

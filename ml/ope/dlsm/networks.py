@@ -97,8 +97,9 @@ class Terms:
 class DlsmNetworks(nn.Module):
     """Encoder, decoder and heads of a DLSM.
 
-    Heads: p(s_0 | z_0); p(s_t | z_t) for t >= 1, of the whole window or of its newest beta alone (the older ones are known from s_{t-1},
-    so nothing is lost); p(r_{t-1} | z_t); p(r_end | z_T) and one of each QoC. With `action_emission` the heads of steps see a_{t-1} too.
+    Heads: p(s_0 | z_0); p(s_t | z_t) for t >= 1, of the whole window or of its newest beta alone; p(r_{t-1} | z_t); p(r_end | z_T) and one
+    of each QoC. The newest beta alone loses nothing, because the older ones are known from s_{t-1}. With `action_emission` the heads of
+    steps see a_{t-1} too.
     """
 
     def __init__(self, window: int, config: DlsmConfig) -> None:
@@ -155,7 +156,7 @@ class DlsmNetworks(nn.Module):
         """Compute the terms of algorithm 1 to the letter: reconstruction along the decoder's own path, its actions replayed.
 
         z_0 comes from the prior or from q(z_0 | s_0) by `start`. The encoder beyond t = 0 would only see its divergence from the decoder,
-        which is 0 at the optimum whatever the data: it is left out.
+        which is 0 at the optimum whatever the data: it is omitted.
         """
         z0, kl_first, first_states = self._first(batch, noise)
         start = noise.first if self.config.start == "prior" else z0

@@ -27,8 +27,8 @@ class Rollouts:
 
     Attributes:
         return_head: discounted step return by the learnt reward head's mean.
-        return_known: discounted step return by the known reward on sampled beta (never on its mean: a policy whose mean beta lies just
-            under the threshold would look perfect).
+        return_known: discounted step return by the known reward on sampled beta, never on its mean. By the mean, a policy whose mean beta
+            is just under the threshold would look perfect.
         outcomes: `ml.ope.estimate.OUTCOMES` in their units, [P, M, K].
         minutes: what outcomes follow in every simulated session.
         actions: one in `keep_every` of all actions, [P, K], for the coverage of the policy's own states.

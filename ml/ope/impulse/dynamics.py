@@ -41,7 +41,7 @@ ALPHAS = (0.5, 0.75, 0.88, 0.94, 0.97, 0.985, 0.993)
 SHAPES = ("line", "hill", "threshold", "late")
 TURNS = 3
 FEWEST_WEIGHT = 1e-3
-"""Combinations below this share of the evidence are left out of the draws."""
+"""Combinations below this share of the evidence get no draws."""
 
 
 def dose(shape: str, a: Floats) -> Floats:
@@ -62,9 +62,9 @@ def dose(shape: str, a: Floats) -> Floats:
 def prior_root(alpha: float) -> Floats:
     """Compute R [STRETCHES, STRETCHES + 1] with g = R u, u independent of one variance, where g has the stable-spline prior at `alpha`.
 
-    Columns of the design are means of f over a stretch of lags, so that a coefficient is the sum of the impulse response over the
-    stretch. R R^T is scaled so that the prior variance of the sustained answer, the sum of g, is 1. The last u is the immediate answer's
-    own, whose prior standard deviation is 0.3 of it.
+    Columns of the design are means of f over a stretch of lags. A coefficient is then the sum of the impulse response over the stretch. R
+    R^T is scaled so that the prior variance of the sustained answer, the sum of g, is 1. The last u is the immediate answer's own, whose
+    prior standard deviation is 0.3 of it.
     """
     starts, ends = np.array(EDGES[:-1]), np.array(EDGES[1:])
     lags = np.arange(MEMORY)
@@ -168,7 +168,7 @@ class ImpulseDynamics:
 
     @property
     def sustained(self) -> Floats:
-        """Answer of standardised beta to a dose held for ever, from no stimulation to cDBS, [D]."""
+        """Answer of standardised beta to a dose that lasts for ever, from no stimulation to cDBS, [D]."""
         return np.asarray(self.gains.sum(1), dtype=np.float64)
 
     def rest(self, table: ResponseTable) -> Floats:

@@ -3,9 +3,9 @@
     y_t = mu + visit + session + g(amplitudes up to t) . beta + eta_t,    eta_t = sum over l <= W of phi_l eta_{t-l} + e_t
 
 y is standardised (log) beta. Regressing beta on its own past alone would take sessions of different level for a slow walk and forget what
-the amplitude does; with levels as random effects the answer to the amplitude is read off within sessions, where random amplitudes are
-an experiment, and between sessions as far as sessions of one visit differ little. Estimated by turns: the mixed model on rows filtered
-by phi (Cochrane and Orcutt 1949; generalised least squares), then phi on what it leaves.
+the amplitude does. With levels as random effects, the answer to the amplitude is read off within sessions, where random amplitudes are an
+experiment. Sessions of one visit that differ little add what they show between them. Estimated alternately: the mixed model on rows
+filtered by phi (Cochrane and Orcutt 1949; generalised least squares), then phi on what it leaves.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Dynamics:
         phi: autoregression of eta on lags 1 ... W, [W].
         beta: answers to the amplitude, [D, 7]. levels: mu + visit + session, [D, n].
         noise_weights: of the log of an innovation's scale on (1, a, predicted beta), [3].
-        shares: lambda / (1 + lambda) of the visits' and the sessions' levels; how far they stand out of one step's noise.
+        shares: lambda / (1 + lambda) of the visits' and the sessions' levels; how far they exceed one step's noise.
         before: dose before each session, [n]; NaN: its first amplitude. log_evidence: of the fit, up to a constant of the rows.
         ratios: likeliest lambdas of the fit, by group.
     """

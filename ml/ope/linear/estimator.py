@@ -1,9 +1,9 @@
 """Off-policy evaluation by replaying every logged session under another policy, in a linear model of beta with the known reward.
 
-The paper did not compare with it. A regression, no network, and hard to beat: every other method must earn its place against it. What a
-session had of its own (its level, its innovations in their order, what its outcomes had beyond the regression) stays with it, so that only
-what the amplitude changes has to be modelled: a policy that would have done what was done gets back exactly what was observed. The reward
-is that of the replayed beta, never of its mean. The dynamics are in `linear_dynamics`, the outcomes in `ml.ope.outcomes`.
+The paper did not compare with it. A regression, no network, and hard to beat: every other method must earn its place against it. A session
+keeps what is its own: its level, its innovations in their order, and the residuals of its outcomes. Only what the amplitude changes has to
+be modelled: a policy that would have done what was done gets exactly what was observed. The reward is that of the replayed beta, never of
+its mean. The dynamics are in `linear_dynamics`, the outcomes in `ml.ope.outcomes`.
 """
 
 from __future__ import annotations
@@ -85,7 +85,8 @@ class LinearConfig:
     Attributes:
         draws: draws of the coefficients from their posterior; every session is replayed with each.
         most_rows: replayed sessions per policy at most; a longer record takes fewer draws, though never fewer than 20.
-        folds: groups of sessions for the held-out skill beside the estimates. seed: of draws and of innovations that are missing.
+        folds: groups of sessions for the held-out skill that is shown with the estimates. seed: of draws and of innovations that are
+            missing.
     """
 
     draws: int = 60
@@ -281,8 +282,8 @@ class FittedLinear:
         value = step + (end or 0.0)
         model = self._returns(spread)[i] @ weights
         model = model - model.mean()
-        # Every pair of a draw of the model and a draw of the days: what is common to all policies widens the interval, but is no part of
-        # the kept draws.
+        # Every pair of a draw of the model and a draw of the days counts. What is common to all policies widens the interval, but is no
+        # part of the kept draws.
         interval = percentile_interval(np.add.outer(model, days.common + days.own[i]).ravel() + value, LEVEL)
         logged, simulated = support.of_policy(policy), support.look(main.sample[i])
         flags = list(flags_of(logged, simulated))

@@ -20,10 +20,10 @@ BLOCK = 30
 def replay_skill(
     buffer: ReplayBuffer, tables: Sequence[SessionTable], folds: Sequence[Sequence[int]], before: float | None = None
 ) -> float | None:
-    """Compute 1 - error / error of the learnt sessions' mean beta, over block means of left-out sessions run freely under their own
+    """Compute 1 - error / error of the learnt sessions' mean beta, over block means of held-out sessions run freely under their own
     amplitudes.
 
-    A left-out session runs from its own s_0 at the level of its visit's other sessions. None where no session could be left out.
+    A held-out session runs from its own s_0 at the level of its visit's other sessions. None where no session could be held out.
 
     Args:
         tables: of all sessions, made with the dose `before` those that say none.
@@ -59,7 +59,7 @@ def mean_path(model: Dynamics, table: SessionTable, level: float) -> Floats:
 
 
 def block_error(seen: Floats, predicted: Floats) -> float:
-    """Sum over blocks of the squared difference of block means, for beta [T] with gaps; blocks that are mostly gaps are left out."""
+    """Sum over blocks of the squared difference of block means, for beta [T] with gaps; blocks that are mostly gaps are excluded."""
     total = 0.0
     for start in range(0, seen.size, BLOCK):
         known = np.isfinite(seen[start : start + BLOCK])

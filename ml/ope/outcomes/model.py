@@ -1,8 +1,8 @@
 """One hierarchical model of the end-of-session outcomes and r_end, for all methods of off-policy evaluation.
 
 Outcomes follow the minutes of a session (`regressions`); r_end is their weighted sum, of what is predicted, so that a session without one
-outcome still counts for the others. Draws are those of one joint posterior: draw d of two policies shares its
-coefficients, and what the model gets wrong for both cancels in their difference.
+outcome still counts for the others. Draws are those of one joint posterior. Draw d of two policies shares its coefficients, so that a
+common error of the model cancels in their difference.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class LeftOut:
 
     Attributes:
         predicted: [n, 4]; NaN where there is none.
-        mean: what to say without a model, [n, K]: the mean of the sessions, for a left-out visit that of the other visits; NaN where none
-            is known.
+        mean: prediction without a model, [n, K]: the mean of the sessions, for a held-out visit that of the other visits. NaN where none is
+            known.
         residual: root mean squared error, [K]; of sessions 0 where unseen, of visits NaN where unseen or where there is one visit.
         skill: 1 - squared error / that of saying the mean, [K]; NaN where unseen.
     """
@@ -60,8 +60,8 @@ class EndModel:
         sessions: of the buffer.
         draws: D.
         seen: outcomes that are predicted; r_end where every QoC that counts in it is, or where none counts.
-        by_session: predictions of sessions from all others; an outcome that follows another given that of the session. by_visit: from the
-            other visits, as a day to come is predicted.
+        by_session: predictions of sessions from all others; an outcome that follows another is given that of the session. by_visit: from
+            the other visits, as a future day is predicted.
         day_share: share of an outcome's unexplained variance that sessions of one visit have in common, [K]; NaN where unseen.
     """
 
@@ -115,8 +115,8 @@ class EndModel:
     def carried(self, predicted: Floats, known: Floats, seen: Floats) -> Floats:
         """Predict outcomes [..., n, K] of sessions under another policy, where what each session had of its own stays with it.
 
-        A share y that was s on average becomes y p / s where p < s and y + (1 - y)(p - s) / (1 - s) where p > s: what is left on
-        average is p, the range is kept, and p = s gives back y. (Of a yes or no this is the same uniform number held against s and p.)
+        A share y that was s on average becomes y p / s where p < s. It becomes y + (1 - y)(p - s) / (1 - s) where p > s. The average is
+        then p, the range is kept, and p = s gives back y. (For a yes or no this compares one uniform number with s and with p.)
 
         Args:
             predicted: under the other policy, [..., n, K]. known: measured, [n, K], NaN where not. seen: prediction of the session as it
@@ -179,8 +179,8 @@ def fit_end_model(
 ) -> EndModel:
     """Fit to all sessions.
 
-    A controller that follows beta gives more in a bad hour, so that more stimulation seems to do worse. What it gives depends on beta
-    alone: with the level of beta that is not the amplitude's doing beside the amplitude, such sessions compare like with like (the
+    A controller that follows beta gives more in a bad hour, so that more stimulation seems to do worse. Its amplitude depends on beta
+    alone. The model also has the level of beta that the amplitude does not cause, so that such sessions compare like with like (the
     back-door criterion of Pearl 1995).
 
     Args:

@@ -1,14 +1,14 @@
 """Dose shapes of outcomes pooled over participants, where leaving each of them out shows that it helps.
 
 What is pooled is which of `SHAPES` an outcome has beforehand. The size of an effect, its sign and levels stay each participant's own, and
-so does the evidence: a prior only stands beside it. Participant i has shape s_i, and of its data only their evidence L_ik under shape k is
+so does the evidence: a prior only adds to it. Participant i has shape s_i, and of its data only their evidence L_ik under shape k is
 known:
 
     p ~ Dirichlet(c, ..., c),    s_i | p ~ p,    prior of a further participant = E[p | data] = (c + sum_i r_ik) / (K c + N)
 
-with r_ik = P(s_i = k | data of all N participants). Without others it is flat, as it is where their data tell no shape, and one of them
-moves it by no more than 1 / (K c + N). The r_ik are found by r_ik ~ L_ik (c + sum over j != i of r_jk), collapsed variational inference of
-order zero (Asuncion, Welling, Smyth and Teh 2009): exact where evidences are certain, and for one participant.
+with r_ik = P(s_i = k | data of all N participants). Without others it is flat, as it is where their data show no shape. One of them moves
+it by no more than 1 / (K c + N). The r_ik are found by r_ik ~ L_ik (c + sum over j != i of r_jk), collapsed variational inference of order
+zero (Asuncion, Welling, Smyth and Teh 2009). It is exact where evidences are certain, and for one participant.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Pooled:
 def pool(own: Evidence, others: Sequence[Evidence]) -> Pooled:
     """Compute priors from the others' evidences, and whether to use them.
 
-    The participant is one of those who are left out: without it the proof would hold most easily where it alone is unlike the others.
+    The participant is one of those held out in turn: without it the proof would be easiest where it alone is unlike the others.
 
     Args:
         own, others: of the participant, and of every other one, log evidence of `SHAPES` by outcome, [K], up to a constant; an outcome may

@@ -30,7 +30,7 @@ Outcome = str
 """A key of `ml.outcomes`."""
 
 Left = Literal["session", "visit"]
-"""What is left out at a time: a session, of whose visit the others are known, or a visit, as a day to come is predicted."""
+"""Parts that are held out in turn: a session, whose visit's others are known, or a visit, as a future day is predicted."""
 
 ORDER: Final[tuple[Outcome, ...]] = ("tremor", "grasp", "rating")
 """In which outcomes are predicted: the rating follows the tremor."""
@@ -72,10 +72,9 @@ PRIORS: Final[dict[Outcome, dict[str, tuple[float, float]]]] = {
         "worn late": (0.4, 0.8),
     },
 }
-"""Mean and standard deviation. `one` of grasp and rating is relative to the mean of the sessions. Dose is the change from no stimulation to
-cDBS, burden and severity that of one standard deviation between sessions, tremor that from none to all minutes, the worn ones that of
-medication that has worn off altogether. Chosen on part A of the
-virtual population, by the error of r_end given true sessions."""
+"""Mean and standard deviation. `one` of grasp and rating is relative to the mean of the sessions. Dose is the change from no stimulation
+to cDBS. Burden and severity change by one standard deviation between sessions, tremor from none to all minutes. The worn ones are the
+change when medication has worn off altogether. Chosen on part A of the virtual population, by the error of r_end given true sessions."""
 
 DAYS: Final[dict[Outcome, float]] = {"grasp": 0.15, "rating": 0.5, "tremor": 0.4}
 """Standard deviation of the levels of visits, in the unit of the predictor; `DAY_TIMES` of it are averaged over."""
@@ -83,12 +82,12 @@ DAYS: Final[dict[Outcome, float]] = {"grasp": 0.15, "rating": 0.5, "tremor": 0.4
 DAY_TIMES: Final = (0.3, 1.0, 3.0)
 
 WIDER: Final = 1.4
-"""Factor on what draws of the coefficients differ from those of their shape by: a dose works differently from visit to visit, and has other
-shapes than these, of which Laplace's approximation knows nothing. On part A of the virtual population 90 % intervals of differences to cDBS
-given true sessions then hold 89 % (paper's design) and 86 % of them; without it 76 and 73 %."""
+"""Factor on the deviations of drawn coefficients from those of their shape. A dose works differently from visit to visit, and has other
+shapes than these: Laplace's approximation has neither. On part A of the virtual population 90 % intervals of differences to cDBS given
+true sessions then hold 89 % (paper's design) and 86 % of them; without it 76 and 73 %."""
 
 KEPT: Final = 0.01
-"""Members whose weight is less than this share of the largest are left out."""
+"""Members whose weight is less than this share of the largest are dropped."""
 
 
 @dataclass(frozen=True)
@@ -257,7 +256,7 @@ def fit(
 
 
 def _left_out(found: Solved, problem: Problem, weights: Floats, at: Floats, visit: NDArray[np.int64], day: Floats) -> dict[Left, Floats]:
-    """Compute `Regression.left_out` of n sessions of the visits [n]; NaN where only one visit is there to be left out.
+    """Compute `Regression.left_out` of n sessions of the visits [n]; NaN where there is only one visit.
 
     Args:
         weights: of the regressions, given all, [K]. at: their design with the tremor as predicted of left-out visits. day: variances, [K].

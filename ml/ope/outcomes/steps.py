@@ -1,9 +1,9 @@
 """Share of every step in a session's expected outcomes: the outcome model taken apart into steps.
 
-The model is of sessions and minutes, and bends: a share of minutes is a logistic, a rating is cut at its ends, a dose saturates. At a
-session as it was, a step adds what its minute has, and beyond that what its own dose and beta differ by from the minute, times the slope
-there. So the shares of a session have the mean that the model expects of the session, a dose counts for more in a minute that is
-about to tremble than in a quiet one, and one noisy beta is not taken for a minute of it.
+The model is of sessions and minutes, and is curved. A share of minutes is a logistic, a rating ends at its limits, a dose saturates. A step
+adds what its minute has. Beyond that it adds the difference of its own dose and beta from the minute, times the slope there. So the shares
+of a session have the mean that the model expects of the session. A dose counts for more in a minute that is about to tremble than in a
+quiet one. One noisy beta is not taken for a whole minute.
 """
 
 from __future__ import annotations

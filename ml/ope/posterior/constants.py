@@ -1,7 +1,7 @@
 """Errors of the structures beyond those that they state: constants from part A of the virtual population, never from B or C.
 
 Variance of the error of a component = what the draws say + unit^2 (base^2 + reach^2 leverage), leverage from `ml.ope.posterior.support`.
-Version 2 has the constants of least interval score of differences to cDBS over the 60 worlds of part A, both designs together, each
+Version 2 has the constants of least interval score of differences to cDBS over the 60 worlds of part A. Both designs count together, each
 component by itself, and `COMMON_SHARE` that of absolute returns, rounded. Version 1 was set by hand from eleven of them.
 """
 
@@ -43,14 +43,15 @@ LEAST_POINTS = 0.2
 _OF_MINUTES = frozenset(o.field for o, p in PREDICTED if p.kind == "binomial")
 
 COMMON_SHARE = 0.6
-"""Share of the error of a mean over few days, common to all policies, that is drawn: its prior of how days differ is wider than they do."""
+"""Share of the error of a mean over few days, common to all policies, that is drawn. Its prior of the differences between days is too
+wide."""
 
 
 def error_unit(component: str, expected: Floats, reach: float) -> Floats:
     """Compute the unit of what structures get wrong, [P].
 
-    A share of time that is nearly 0 or 1 can hardly be wrong by ten points: an error of it is one of its logit, and moves the share
-    p by p (1 - p) of that.
+    A share of time that is nearly 0 or 1 can hardly be wrong by ten points. Its error is one of its logit, and moves the share p by p (1 -
+    p) of that.
 
     Args:
         component: of `MODEL_ERRORS`. expected: mean of each policy, natural unit, [P].

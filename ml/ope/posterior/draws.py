@@ -50,11 +50,11 @@ class Draws:
     """Draws [P, KEPT] by quantity: `steps`, `r_end`, `return`, `energy` and the QoCs that sessions have.
 
     `STATISTICAL` is the return without what structures get wrong: tested sessions move it with the others, so that what is left of either
-    error can be told.
+    error is known.
 
     Attributes:
         between_visits: standard deviation of a policy's true difference to cDBS between visits, by quantity.
-        unknown: a flag where days cannot be told apart.
+        unknown: a flag where days cannot be distinguished.
     """
 
     values: dict[str, Floats]

@@ -308,7 +308,7 @@ def _apart(own: Floats, without_model_errors: Floats) -> dict[str, float]:
     """Split the standard errors of a return by their cause: `statistical`, too few sessions; `model_error`, what structures get wrong that
     far away.
 
-    Before any test their squares add up to that of the whole but for chance; a test ties the two together, and the whole is less.
+    Before any test their squares add up to that of the whole but for chance. A test ties the two together, and the whole is less.
     """
     said = {"statistical": without_model_errors, "model_error": own - without_model_errors}
     return {name: round(float(drawn.std(ddof=1)), 4) for name, drawn in said.items()}

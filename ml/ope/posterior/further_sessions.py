@@ -1,12 +1,12 @@
 """Number of further sessions near a dose that would settle an open verdict, by simulation.
 
-Preposterior analysis (Raiffa and Schlaifer 1961, ch. 4): a truth is drawn from the posterior, the mean of n sessions under it is drawn
-with the noise of sessions, the posterior is moved by that mean as tested sessions move it (linear prediction over joint draws), and the
-verdict is asked again. n is the least number with which it is told in four of five such futures.
+Preposterior analysis (Raiffa and Schlaifer 1961, ch. 4): a truth is drawn from the posterior, and the mean of n sessions under it with the
+noise of sessions. The posterior is moved by that mean as tested sessions move it (linear prediction over joint draws), and the verdict is
+asked again. n is the least number with which it is settled in four of five such futures.
 
-What the sessions show is not the policy itself but an amplitude that is held near its dose, as a plan can hold it: below `LOW_AMPLITUDE`
-for the last `LOW_SECONDS` of a session alone. So a policy whose dose no session of a plan comes near has no number, nor one whose
-outcomes go their own way beside those of the amplitudes that can be held.
+The sessions do not run the policy itself but an amplitude near its dose. A plan allows amplitudes below `LOW_AMPLITUDE` for the last
+`LOW_SECONDS` of a session alone. So a policy has no number where no session of a plan is near its dose. It has none where its outcomes
+differ from those of constant amplitudes.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from ml.trajectories import ReplayBuffer
 Floats = NDArray[np.float64]
 
 NUMBERS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
-"""Numbers of sessions that are tried; where none of them would do, no number is told."""
+"""Numbers of sessions that are tried; where none of them would do, no number is given."""
 
 TOLD = 0.8
-"""Share of simulated futures in which the verdict must be told."""
+"""Share of simulated futures in which the verdict must be settled."""
 
 FUTURES = 200
 STEP = 0.01
@@ -45,7 +45,7 @@ _FEWEST = 3
 
 @dataclass(frozen=True)
 class Further:
-    """Sessions that would tell: how many, on how many visits at least, held near which fraction of cDBS."""
+    """Sessions that would settle a verdict: how many, on how many visits at least, near which fraction of cDBS."""
 
     sessions: int
     visits: int
@@ -64,8 +64,8 @@ def further_sessions(
     """Find the fewest sessions that would settle a policy's verdict; None where no plan can have them, or the dose is not known.
 
     Args:
-        own, cdbs: posteriors of the policy and of cDBS. held: amplitude and posterior of constants. noise: of a session, by outcome.
-        margins, levels: of the verdict. place: within what sessions are held.
+        own, cdbs: posteriors of the policy and of cDBS. `held`: amplitude and posterior of constants. noise: of a session, by outcome.
+        margins, levels: of the verdict. place: limits of the sessions.
     """
     support = own.details.get("support") or {}
     near = reachable(float(support["dose"]), place) if support.get("dose") is not None else None
@@ -85,7 +85,7 @@ def further_sessions(
 
 
 ALIKE = NEAR_SPREAD
-"""Amplitudes closer than this are held by the same sessions: their draws reach as far."""
+"""Amplitudes closer than this share their sessions: their draws reach as far."""
 MOST_HELD = 4
 """Sessions near one amplitude in a visit, at most."""
 
@@ -95,8 +95,8 @@ class Hold:
     """Sessions of one visit near an amplitude.
 
     Attributes:
-        fraction: of cDBS. here: how many. further: what would tell; None where they explore, and nothing is known to tell.
-        names: of which policies they would tell.
+        fraction: of cDBS. here: how many. further: what would settle the verdict; None where they explore.
+        names: of the policies whose verdicts they would settle.
     """
 
     fraction: float
@@ -110,7 +110,7 @@ def worth_holding(waiting: Mapping[str, tuple[Further, float | None]], slots: in
     one takes half.
 
     Args:
-        waiting: of policies that cannot be told yet, what would tell, and their probability of keeping within the margins.
+        waiting: by open policy the sessions that would settle it, and its probability of keeping within the margins.
     """
     made: list[Hold] = []
     for name, (further, _) in sorted(waiting.items(), key=lambda item: (item[1][0].sessions, -(item[1][1] or 0.0), item[0])):
@@ -194,7 +194,7 @@ class Reachable:
     """An amplitude that a plan can hold so that its sessions lie near a policy.
 
     Attributes:
-        level: that is held, fraction of cDBS. dose: mean of such a session.
+        level: that is kept, fraction of cDBS. dose: mean of such a session.
     """
 
     level: float
@@ -204,10 +204,10 @@ class Reachable:
 def reachable(dose: float, place: Place) -> Reachable | None:
     """Find the level nearest to a policy's mean dose whose sessions are near the policy (`support.NEAR`); None where there is none.
 
-    A session is not held much lower than the policy itself would go, so as to make up for minutes at which it may not be low.
+    A session is not kept much lower than the policy itself would go to make up for minutes at which it may not be low.
 
     Args:
-        dose: of the policy, fraction of cDBS. place: within what sessions are held.
+        dose: of the policy, fraction of cDBS. place: limits of the sessions.
     """
     mean_within, late_within = float(NEAR[0]) - _SLACK, float(NEAR[1]) - _SLACK
     lowest, highest = place.bound, 1.0 - NEAR_SPREAD
@@ -246,8 +246,8 @@ def sessions_to_tell(
         noise: of a session, by outcome (`session_noise`). levels: of the verdict.
         shown: what such a session shows of each outcome less what cDBS shows, from the same draws, [draws]; the policy's own where None.
         saved: energy of cDBS less that of the policy, [draws]; above 0 everywhere where None.
-        near: sessions, and their visits, that were near already. supported: whether the data support the policy; else two sessions on two
-            visits near it are needed besides.
+        near: sessions, and their visits, that were near already. supported: whether the data support the policy. Else two sessions on two
+            visits near it are needed too.
         seed: of the simulated futures.
 
     Returns:
@@ -268,7 +268,7 @@ def sessions_to_tell(
     for n in NUMBERS:
         if n < max(least, visits):
             continue
-        # a visit of held sessions alone has one of cDBS, from which all of them differ together
+        # a visit of such sessions alone has one of cDBS, from which all of them differ together
         days = max(visits, -(-n // MOST_HELD))
         told = _told(asked, len(gaps), seen, variance * (1 / n + 1 / days), truths, futures, own, levels)
         if told >= TOLD:
@@ -279,7 +279,7 @@ def sessions_to_tell(
 def _shown(dose: float, cdbs: Estimate, held: Sequence[tuple[float, Estimate]]) -> dict[str, Floats] | None:
     """Predict what a session of a mean dose would show of each outcome less cDBS, by draw: between the constants next to it.
 
-    None where there are no two constants: then the policy's own outcomes stand for them.
+    None where there are no two constants: then the policy's own outcomes take their place.
     """
     rows = sorted(held, key=lambda pair: pair[0])
     if len(rows) < 2:

@@ -31,8 +31,8 @@ class PosteriorGain:
     """One policy's gain over cDBS.
 
     Attributes:
-        gain: of the return. supported: whether sessions lie near what the policy would do. told: whether the sessions can order policies.
-        within: probability that every known QoC lies within its margin of cDBS; None where no QoC is known.
+        gain: of the return. supported: whether sessions are near what the policy would do. `told`: whether the sessions can order policies.
+        within: probability that every known QoC is within its margin of cDBS; None where no QoC is known.
         saves: share of cDBS's energy that it is expected to save; None where no energy is predicted.
     """
 
@@ -81,7 +81,7 @@ def gains_over_cdbs(
 
     Args:
         buffer: the sessions. policies: whose gains are asked for. seed: of all draws. report: progress.
-        margins: the default ones where None. tests: of any policies; each is replayed beside those asked for, so that it informs them.
+        margins: the default ones where None. tests: of any policies; each is replayed with those asked for, so that it informs them.
 
     Raises:
         ValueError: fewer than two sessions with usable steps.

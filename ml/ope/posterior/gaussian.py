@@ -1,9 +1,9 @@
 """The Gaussian process over candidates: what the structures leave out, and what tested sessions add.
 
-Candidates are alike as far as they would do the same in logged states (Konyushkova et al. 2021): k(i, j) = exp(-d^2 / (2 l^2)), d the root
-mean squared difference of their amplitudes. What a structure gets wrong for one, it gets wrong for its neighbours. Draws are joint over
-policies and quantities, and a tested session moves them by Matheron's rule: a draw f of the prior becomes
-f + K_o (K_oo + R)^-1 (y - f_o - e), with o what was observed, e ~ N(0, R), and K the covariance of the draws.
+Candidates are alike as far as they would do the same in logged states (Konyushkova et al. 2021). The kernel is k(i, j) = exp(-d^2 / (2
+l^2)), with d the root mean squared difference of their amplitudes. What a structure gets wrong for one, it gets wrong for its neighbours.
+Draws are joint over policies and quantities, and a tested session moves them by Matheron's rule. A draw f of the prior becomes f + K_o
+(K_oo + R)^-1 (y - f_o - e), with o what was observed, e ~ N(0, R), and K the covariance of the draws.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LENGTH = 0.15
 MOST_STATES = 600
 JITTER = 1e-6
 _OWN = 0.1
-"""Least variance of a return beside its QoCs, as a share of theirs."""
+"""Least variance of a return apart from its QoCs, as a share of theirs."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class TestedDifference:
         policy_name: name under which the policy is evaluated. visit: its number. n_sessions: of the policy at that visit.
         differences: by `QUANTITIES`, in the unit of each (`energy`: mean squared amplitude fraction); a key is absent where not measured.
         standard_errors: of the same keys.
-        n_reference: sessions of cDBS at that visit, whose chance all policies of the visit share; None where it is not known (tests stored
-            before it was kept), and then their errors count as their own.
+        n_reference: sessions of cDBS at that visit, whose noise all policies of the visit share. None where it is not known, as in older
+            tests: then their errors count as their own.
 
     Raises:
         ValueError: no session, an unknown quantity, keys that differ, or a standard error that is not positive.
@@ -143,8 +143,8 @@ def errors_of_tests(
 ) -> Floats:
     """Compute the covariance [n, n] of the errors of observed differences, each of one test and one quantity.
 
-    Three things move a difference: its own sessions; the visit's cDBS sessions, which all tests of the visit share; and how the policy's
-    true difference varies between visits, in which policies that act alike go together. A return holds the session's QoCs, so that its
+    Three things move a difference: its own sessions, the visit's cDBS sessions, and how the policy's true difference varies between visits.
+    All tests of a visit share its cDBS sessions. Policies that act alike vary together. A return holds the session's QoCs, so that its
     chance, and its day, go with theirs. Every error is written as loadings on independent parts, so that the matrix is symmetric and
     positive definite whatever was measured in which test.
 

@@ -1,10 +1,10 @@
 """Skill of each structure on sessions that it has not learnt from, and the weights that follow from it.
 
-Each session in turn is left out of a structure's coefficients (its autoregression and hyperparameters stay) and runs freely from its own
-window under its own logged amplitudes, at a level that its visit suggests and with innovations of other sessions. What counts is what the
-return is made of: sums of the rewards over blocks of 30 steps, whose joint density is that of a normal with the runs' mean and covariance.
-Weights follow from the log densities of sessions by pseudo-BMA with the Bayesian bootstrap (Yao, Vehtari, Simpson and Gelman 2018): a
-structure that is ahead by the luck of a few sessions does not take all the weight.
+Each session in turn is excluded from a structure's coefficients; its autoregression and hyperparameters stay. The session runs freely from
+its own window under its own logged amplitudes. It has a level that its visit suggests, and innovations of other sessions. Sums of the
+rewards over blocks of 30 steps count, since the return is made of them. Their joint density is that of a normal with the runs' mean and
+covariance. Weights follow from the log densities of sessions by pseudo-BMA with the Bayesian bootstrap (Yao, Vehtari, Simpson and Gelman
+2018). A structure that is ahead by the luck of a few sessions does not take all the weight.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ BLOCK = 30
 RUNS = 40
 """Free runs behind the density of a left-out session."""
 SHRINK = 0.3
-"""Share of the runs' covariance that is taken from its diagonal: 40 runs do not tell ten blocks' covariances."""
+"""Share of the runs' covariance that is taken from its diagonal: 40 runs do not determine ten blocks' covariances."""
 OWN_VARIANCE = 1.0
 """Variance of a block's sum that no run shows, in squared rewards: sums of few distinct rewards are no normals."""
 LEARNING_RATE = 0.25
-"""Power of the densities: every structure is wrong in its own way, so that what is far ahead by its own account is not so far ahead on
-policies that nobody ran (generalised Bayes; Grünwald and van Ommen 2017)."""
+"""Power of the densities. Every structure is wrong in its own way: one that is far ahead here is less so on policies that never ran
+(generalised Bayes; Grünwald and van Ommen 2017)."""
 RESAMPLES = 1000
 LEAST_KNOWN = 10
 """Known steps below which a block, or a session's innovations, count for nothing."""
@@ -46,7 +46,7 @@ class HeldOut:
     """Predictions of left-out sessions.
 
     Attributes:
-        densities: log density of each session's block sums, structure -> [n]; NaN where a session could not be left out.
+        densities: log density of each session's block sums, structure -> [n]; NaN where a session could not be held out.
         predicted: mean reward of each session's known steps without the price of the amplitude, structure -> [n]. observed: it, [n].
         weights: of the structures, summing to 1.
     """
@@ -78,7 +78,7 @@ def held_out(buffer: ReplayBuffer, scale: Scale, fits: Sequence[Fit], seed: int)
 
 
 def weights_of(densities: Mapping[str, Floats], seed: int) -> dict[str, float]:
-    """Compute pseudo-BMA weights with the Bayesian bootstrap over sessions; equal ones where fewer than two sessions could be left out."""
+    """Compute pseudo-BMA weights with the Bayesian bootstrap over sessions; equal ones where fewer than two sessions could be held out."""
     keys = list(densities)
     table = np.stack([densities[k] for k in keys])
     table = table[:, np.isfinite(table).all(0)]

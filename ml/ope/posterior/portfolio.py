@@ -4,12 +4,11 @@ A visit tests several policies, and what counts afterwards is the best of those 
 
     E[ max(0, max over i in S or tested of mu_i(S)) ],
 
-mu_i(S) the posterior mean, after the visit, of policy i's difference of the return to that of cDBS. What the visit shows is one session of
-each, with the noise of a session, and policies that act alike are learned of together (linear prediction over joint posterior draws). So
-a second policy that does what the first does adds nothing, nor does one that is known already; one that may turn out better adds much,
-whether it is new or has shown one lucky session. Without noise, and before any test, this is the expected improvement of a batch
-(Ginsbourger, Le Riche, Carraro 2010); with noise the knowledge gradient for correlated beliefs (Frazier, Powell, Dayanik 2009). Chosen
-greedily.
+mu_i(S) the posterior mean, after the visit, of policy i's difference of the return to that of cDBS. The visit shows one session of each,
+with the noise of a session. A session informs about policies that act alike (linear prediction over joint posterior draws). So a second
+policy that does what the first does adds nothing, nor does one that is known already. One that may be better adds much, whether it is new
+or has shown one lucky session. Without noise, and before any test, this is the expected improvement of a batch (Ginsbourger, Le Riche,
+Carraro 2010). With noise it is the knowledge gradient for correlated beliefs (Frazier, Powell, Dayanik 2009). Chosen greedily.
 
 One session with much noise may change no mean enough to count, while several would: the value of information is not concave (Frazier and
 Powell 2010). Slots that are left then go to policies that have never run, by what knowing them for certain would add.
@@ -39,8 +38,8 @@ class Suggestion:
     Attributes:
         name: of the policy.
         expected: mean difference of its return to that of cDBS, reward units.
-        adds: expected improvement of the best tested policy that its session adds to those chosen before it, reward units; about 0 of one
-            that several sessions would tell and one does not.
+        adds: expected improvement of the best tested policy that its session adds to those chosen before it, reward units. It is about 0
+            where only several sessions would show anything.
         better: probability that it returns more than all chosen before it; for the first, than cDBS.
         informs: share of the variance of the other candidates that its test alone would explain, from 0 to 1.
     """

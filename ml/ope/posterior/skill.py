@@ -25,15 +25,13 @@ OPPOSITE = 2.0
 NO_BETTER, LEVELS, CONTRASTS = "no_better_than_equal", "levels_follow_dose", "contrasts_not_reproduced"
 TOO_FEW = "too_few_left_out_sessions"
 MARGIN = 2.0
-"""Squared errors of left-out sessions must fall by more than so many of their standard errors below those of calling all doses equal: of
-the reward by beta, or of one of the outcomes.
+"""Squared errors of held-out sessions must be smaller than those of calling all doses equal by so many of their standard errors. This is
+asked of the reward by beta, or of one of the outcomes.
 
-From part A of the virtual population (60 worlds of 21 sessions, `benchmarks/evaluation/verdicts.py`): an order is told in 82 % of the
-worlds with stratified sessions and 77 % with the paper's, and in 20 and 17 % of the data in which nothing answers to the amplitude. With
-r_end instead of the three outcomes and a margin of 1 for beta, as before, it was told in 65 and 62 %, and in 30 % where nothing answers:
-the noise of one outcome hides in r_end what another tells, and where no outcome counts in r_end nothing of them was asked."""
+From part A of the virtual population (60 worlds of 21 sessions, `benchmarks/evaluation/verdicts.py`): an order is given in 82 % of the
+worlds with stratified sessions and 77 % with the paper's. Where nothing answers to the amplitude it is given in 20 and 17 % of the data."""
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""How much of the level of a visit may be told by its other sessions; the share that errs least counts."""
+"""How much of the level of a visit its other sessions may predict; the share that errs least counts."""
 CHANCE = 0.001
 """Chance below which levels that go with the dose are no chance."""
 
@@ -43,7 +41,7 @@ class Skill:
     """Skill of ordering.
 
     Attributes:
-        told: False where the data give no reason to believe an order of policies. reasons: codes of what speaks against it.
+        `told`: False where the data give no reason to believe an order of policies. reasons: codes of what speaks against it.
         held_out_correlation: of predicted with observed reward of left-out sessions; None where there are too few or they do not differ.
     """
 
@@ -60,9 +58,9 @@ def ordering_skill(buffer: ReplayBuffer, predictions: HeldOut, equal: Floats, en
     """Compare predictions of held-out sessions with calling all doses equal, and with contrasts between controllers.
 
     The reward of the amplitude's price is known and orders nothing by itself. The level of a visit, or of the window before a session,
-    orders no doses either: what predictions are held against knows both. Beta may answer to nothing while outcomes do: where an outcome
-    of left-out sessions is predicted better than by its visit's level, that alone is skill. Outcomes are asked whether
-    or not they count in r_end, because verdicts rest on each of them.
+    orders no doses either: the prediction that they are compared with has both. Beta may answer to nothing while outcomes do. Where an
+    outcome of held-out sessions is predicted better than by its visit's level, that alone is skill. Outcomes are asked whether or not they
+    count in r_end, because verdicts rest on each of them.
 
     Args:
         equal: mean reward of each left-out session where beta answers to no amplitude (`structures.no_answer`), as `predictions.predicted`.

@@ -1,6 +1,6 @@
 """The structures that the posterior averages: models of beta in which logged sessions can be replayed under a policy, with draws.
 
-Each is linear in its coefficients given a few hyperparameters, so that a session can be left out by taking its sums away (`LinearForm`).
+Each is linear in its coefficients given a few hyperparameters, so that a session is held out by taking its sums away (`LinearForm`).
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def fit_response(buffer: ReplayBuffer, scale: Scale, draws: int, seed: int, befo
         answers = tuple(t.means[shape] @ prior_root(alpha) for t in tables)
         sums, ratios = moved(by_shape[shape], alpha), drawn.ratios[shape, alpha]
         forms.append(LinearForm(weight, RESPONSE_MODEL, ratios, sums, answers, drawn.phi, drawn.noise_weights))
-    # its draws come combination by combination: shuffled, the first few stand for all
+    # its draws come combination by combination: shuffled, the first few represent all
     order = np.random.default_rng([seed, 0x0BDE]).permutation(len(drawn.levels))
     return Fit("impulse", tuple(tables), take(drawn, order), tuple(forms))
 

@@ -1,9 +1,10 @@
 """Support of policies by the logged sessions, by what sessions are as a whole: mean and late dose, burden of beta, switching.
 
-A step's amplitude may have been tried a thousand times and yet no session have held it. A policy is supported where at least two sessions
-on two visits lie near what it would do. How far it lies from all of them is its leverage: the share of the variance of a smooth function
-of the summaries that the sessions leave open (a Gaussian process on them), 0 beside many sessions, 1 far from all. Switching counts for the
-leverage alone: amplitudes that are held say little of a controller that changes them at every step, but do not keep it from being judged.
+A step's amplitude may have been tried a thousand times, and yet no session have kept it. A policy is supported where at least two sessions
+on two visits are near what it would do. Its leverage says how far it is from all of them. It is the share of the variance of a smooth
+function of the summaries that the sessions leave open. The function is a Gaussian process; the share is 0 near many sessions and 1 far from
+all. Switching counts for the leverage alone: sustained amplitudes say little of a controller that changes them at every step, but it can be
+judged.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ LATE_STEPS = 60
 """Steps before a session's end whose mean amplitude is its late dose."""
 
 NEAR = np.array([0.10, 0.15, 0.30, np.inf])
-"""A session is near a policy where no summary differs by more: amplitude fractions, the share of steps at or above the threshold, and the
-mean change of the amplitude from step to step."""
+"""A session is near a policy where no summary differs by more. These are amplitude fractions, the share of steps at or above the
+threshold, and the mean change of the amplitude from step to step."""
 LENGTHS = np.array([0.15, 0.20, 0.50, 0.10])
 """Distances over which a smooth function of the summaries changes."""
 NOISE = 0.25
@@ -44,8 +45,8 @@ class Support:
 
     Attributes:
         near_sessions, near_visits: sessions near it, and their visits. leverage: in [0, 1].
-        dose: mean amplitude that it would give. lowest_supported: lowest mean dose that two sessions on two visits held or went below,
-            sessions without stimulation aside; None where there is none.
+        dose: mean amplitude that it would give. lowest_supported: lowest mean dose that two sessions on two visits kept or went below.
+            Sessions without stimulation do not count. None where there is none.
     """
 
     near_sessions: int
@@ -76,7 +77,7 @@ class Support:
 
 
 class SessionSupport:
-    """The summaries of a buffer's sessions, [n, 4], against which policies are held."""
+    """The summaries of a buffer's sessions, [n, 4], with which policies are compared."""
 
     def __init__(self, buffer: ReplayBuffer) -> None:
         kept = [s for s in buffer.sessions if s.usable().sum() >= FEWEST_STEPS]

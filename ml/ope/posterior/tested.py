@@ -1,11 +1,11 @@
 """Tested sessions as differences to the same visit's cDBS, with their standard errors.
 
 A day moves policy and cDBS alike, so that their difference at one visit says more than either. The variance of a session is pooled over
-tests, within policy (or cDBS) and visit, with a prior: the spread of the random sessions around their visits and their dose, as a scaled
-inverse chi-square distribution of `PRIOR_FREEDOM` degrees of freedom (Gelman et al. 2013, section 2.6). Where both together have fewer than
-`FEWEST` degrees of freedom, the spread of a policy (or of cDBS) between visits takes the place of those that are missing; it holds the
-differences between days too and therefore claims less. A variance that rests on few degrees of freedom is itself uncertain, so that a
-standard error is the half-width of the central 68.3 % of Student's t, with Satterthwaite's (1946) degrees of freedom, not of the normal.
+tests, within policy (or cDBS) and visit, with a prior. The prior is the spread of the random sessions around their visits and their dose,
+as a scaled inverse chi-square distribution of `PRIOR_FREEDOM` degrees of freedom (Gelman et al. 2013, section 2.6). Where both together
+have fewer than `FEWEST` degrees of freedom, the spread of a policy (or of cDBS) between visits fills them up. It has the differences
+between days too and therefore claims less. A variance that rests on few degrees of freedom is itself uncertain. So a standard error is the
+half-width of the central 68.3 % of Student's t, with Satterthwaite's (1946) degrees of freedom, not of the normal.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ LEAST_ERROR = {"return": 0.1, "energy": 0.005} | {o.field: p.least_error for o, 
 """Smallest standard deviation of a session, by quantity: what its measurement resolves. Sessions that happen to agree prove no more."""
 
 PRIOR_FREEDOM = 3
-"""Weight of the random sessions' spread beside that of the tests, degrees of freedom; it is a little too wide, as a dose acts in curves."""
+"""Weight of the random sessions' spread against that of the tests, degrees of freedom. The spread is a little too wide, as a dose acts
+in curves."""
 
 FEWEST = 3
 """Degrees of freedom below which the spread between visits is asked as well."""
@@ -69,7 +70,7 @@ class Differences:
     Attributes:
         tests: one per policy and visit with sessions of both the policy and cDBS, in order of visit and name.
         without_cdbs: sessions of policies at visits without a cDBS session.
-        of_unknown_noise: sessions with a quantity that is left out, because nothing tells how far sessions differ by chance.
+        of_unknown_noise: sessions with a quantity that is excluded, because the noise of sessions is unknown.
     """
 
     tests: tuple[TestedDifference, ...]
@@ -112,7 +113,7 @@ def spread_of_random(buffer: ReplayBuffer, horizon_steps: int) -> dict[str, Spre
     """Measure how far random sessions are from their visit's mean and a straight line over their energy, by quantity.
 
     What does not follow such a line counts as noise. A quantity is absent where no degree of freedom is left; energy always is, because it
-    is the dose. Sessions that were stopped are left out.
+    is the dose. Stopped sessions are excluded.
 
     Args:
         buffer: the sessions. horizon_steps: of the returns.

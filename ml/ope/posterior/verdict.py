@@ -1,10 +1,10 @@
 """Verdict on a candidate: worth a test, a test with care, the same as cDBS, unsafe, or open. It is a pure function of posterior draws.
 
-Every probability is a share of draws that are aligned between the policy and cDBS, so that what the posterior gets wrong for both alike
-cancels. The order of precedence is safety first: unsafe, cannot tell, same as cDBS, test with care, test. Where the data cannot order
-policies at all, every verdict is *cannot tell*; what is dangerous whatever the data say (`HAZARDS`) still stands among its reasons.
+Every probability is a share of draws that are aligned between the policy and cDBS. A common error of the posterior cancels. The order of
+precedence is safety first: `unsafe`, `cannot_tell`, `same_as_cdbs`, `test_with_care`, `test`. Where the data cannot order policies at all,
+every verdict is `cannot_tell`. A danger that does not depend on the data (`HAZARDS`) is still among its reasons.
 
-The verdict asks for non-inferiority of the outcomes and for less energy, because that is what a test is for; superiority is for
+The verdict asks for non-inferiority of the outcomes and for less energy, because that is what a test is for. Superiority is for
 conclusions, which rest on visits and not on estimates.
 """
 
@@ -32,13 +32,13 @@ SAME_AMPLITUDE = 0.05
 """A policy whose amplitude is this close to that of cDBS on average (0.15 mA at 3 mA) does what cDBS does."""
 
 FEWEST_DRAWS = 50
-"""Fewer draws cannot tell a probability of 0.8 from one of 0.9."""
+"""Fewer draws cannot distinguish a probability of 0.8 from one of 0.9."""
 
 HAZARDS = frozenset({"adverse_event", "stopped", "nearly_off", "beyond_margin"})
 """Codes of reasons for which a policy is not to be run without a clinician's word, whatever the verdict."""
 
 SETTLED_BY_SESSIONS = frozenset({"undecided", "few_near_sessions", "few_near_visits"})
-"""Deciding reasons of *cannot tell* that more sessions near a policy may settle; whether they would is simulated."""
+"""Deciding reasons of `cannot_tell` that more sessions near a policy may settle; whether they would is simulated."""
 
 
 @dataclass(frozen=True)

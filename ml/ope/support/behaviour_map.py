@@ -45,8 +45,8 @@ class BehaviourMap:
         edges: of the columns, mean beta of a window, in its unit, [COLUMNS + 1].
         tried: recorded steps by column and row of amplitude, [COLUMNS][DOSES]; row i holds the fractions from i / DOSES on.
         policies: by name.
-        apart: mean absolute difference of the amplitudes of two policies over the recorded windows, fraction of cDBS, each pair once, under
-            the name that comes first.
+        apart: mean absolute difference of the amplitudes of two policies over the recorded windows, fraction of cDBS. Each pair is there
+            once, under the name that comes first.
     """
 
     edges: tuple[float, ...]

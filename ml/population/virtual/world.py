@@ -98,7 +98,7 @@ class World:
 
     Attributes:
         part, index: number of the world. patient: its constants. trait: what makes it difficult, `traits.TRAITS`; None for an ordinary one.
-            settings: of its MDP, with xi_beta midway between beta under cDBS and under 0.3.
+            settings: of its MDP. xi_beta is midway between beta under cDBS and under 0.3.
         spread: standard deviation of beta, its unit. key: of its random streams.
     """
 
