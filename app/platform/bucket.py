@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -23,6 +24,7 @@ log = structlog.get_logger()
 
 T = TypeVar("T")
 CHUNK = 1 << 20
+SLOW_S = 5.0
 SHARED_KEYS = ("quarantine", "pseudonyms", "second-factor", "sign-on", "bundle-signing", "audit-seals", "visit-day")
 """Keys that every machine of an installation must have alike."""
 _FINGERPRINT = b"betaloop key fingerprint 1\0"
@@ -71,6 +73,7 @@ class Bucket:
             raise RuntimeError("Files in a bucket need the packages of betaloop[s3].") from error
         # its own tries come on top of those above, and a bucket that hangs would hold its caller for minutes
         self._fs.retries = 1
+        self._asked: dict[object, float] = {}
 
     def size(self, sha256: str) -> int | None:
         """Return the size of an object in bytes; None where there is none."""
@@ -149,10 +152,16 @@ class Bucket:
     def _name(self, sha256: str) -> str:
         return f"{self._root}/files/{sha256[:2]}/{sha256}"
 
+    def is_slow(self) -> bool:
+        """Decide whether a call has waited for the bucket for longer than SLOW_S."""
+        return any(time.monotonic() - begun > SLOW_S for begun in list(self._asked.values()))
+
     def _ask(self, ask: Callable[[], T]) -> T:
         """Call the bucket. Raises FileNotFoundError, or StoreAway for all else that goes wrong there."""
         from botocore.exceptions import BotoCoreError, ClientError
 
+        call = object()
+        self._asked[call] = time.monotonic()
         try:
             return ask()
         except FileNotFoundError:
@@ -160,3 +169,5 @@ class Bucket:
         except (BotoCoreError, ClientError, OSError, TimeoutError) as error:
             log.error("the bucket cannot be used", error=type(error).__name__, what=str(error)[:200])
             raise StoreAway("The store of files does not answer.", "Nothing is lost. Try again in a while.") from error
+        finally:
+            del self._asked[call]

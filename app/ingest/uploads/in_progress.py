@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -12,13 +13,49 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from app.ingest import repository
+from app.platform.bucket import StoreAway, bucket
 from app.platform.database import lock_engine
-from app.platform.errors import passing
+from app.platform.errors import BetaloopError, passing
 
 log = structlog.get_logger()
 
 LOCKS = 0x75706C64
 """First key of the advisory locks of uploads; the second is the upload's number."""
+
+
+AT_ONCE = 8
+"""Uploads that one process receives at once. Each needs two connections of the database and a thread, which pages need too."""
+_places = threading.BoundedSemaphore(AT_ONCE)
+_NOTICED = ", ".join(
+    f"set_config('tcp_keepalives_{name}', '{seconds}', false)" for name, seconds in (("idle", 10), ("interval", 5), ("count", 3))
+)
+"""How the database's server notices within 25 s that a machine is gone, and frees its locks; 2 h otherwise."""
+
+
+class TooManyUploads(BetaloopError):
+    """As many uploads as may be received at once."""
+
+    status = 503
+    title = "Too many uploads at once"
+    retry_after_s = 20
+
+
+@contextmanager
+def place() -> Iterator[None]:
+    """Take one of the places of uploads; without one fail at once, rather than wait for it.
+
+    Raises:
+        TooManyUploads, StoreAway: none is free. StoreAway where that is because the bucket does not answer.
+    """
+    if not _places.acquire(blocking=False):
+        store = bucket()
+        if store is not None and store.is_slow():
+            raise StoreAway("The store of files does not answer, and other uploads wait for it.", "Nothing is lost. Try again in a while.")
+        raise TooManyUploads(f"{AT_ONCE} uploads are received here at this moment.", "Send this one again in half a minute.")
+    try:
+        yield
+    finally:
+        _places.release()
 
 
 @dataclass(frozen=True)
@@ -60,7 +97,7 @@ def told(upload_id: int) -> Progress | None:
 def in_progress(upload_id: int) -> Iterator[None]:
     """Lock an upload that is being received, on a connection of its own, for the upload itself commits in between."""
     with lock_engine().connect() as connection:
-        connection.execute(text("select pg_advisory_lock(:space, :upload)"), {"space": LOCKS, "upload": upload_id})
+        connection.execute(text(f"select {_NOTICED}, pg_advisory_lock(:space, :upload)"), {"space": LOCKS, "upload": upload_id})
         try:
             yield
         finally:

@@ -25,7 +25,7 @@ from app.tables.uploads import Upload
 
 log = structlog.get_logger()
 
-RESUME_EVERY_S = 60.0
+RESUME_EVERY_S = 20.0
 
 
 @dataclass(frozen=True)

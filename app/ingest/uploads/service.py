@@ -18,7 +18,7 @@ from app.ingest.sessions import StatedSession
 from app.ingest.stated_beta import BetaStated
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading
-from app.ingest.uploads.in_progress import in_progress, not_counted, tell_file
+from app.ingest.uploads.in_progress import in_progress, not_counted, place, tell_file
 from app.ingest.uploads.incoming import Incoming, arrange
 from app.ingest.uploads.receiving import LETHAL, FileOutcome, Receiver
 from app.ingest.uploads.reports import alike_together, known_recordings, store_reports, stored_reports, unreadable_members
@@ -167,13 +167,19 @@ def receive(
 
     Raises:
         TooLarge: every file exceeds the installation's limit. Invalid: no file. Conflict: the site has ended. CutShort: a fault, after
-            something was kept.
+            something was kept. TooManyUploads, StoreAway: too many at once.
     """
     study_service.require(caller, can.UPLOAD, participant)
     study_service.refuse_ended(participant.site)
     if not incoming:
         raise Invalid("The upload holds no file.", "Choose at least one file.", field="file")
-    beta = beta or BetaStated()
+    with place():
+        return _receive(db, participant, stated, incoming, caller, beta or BetaStated())
+
+
+def _receive(
+    db: Session, participant: Participant, stated: StatedSession, incoming: Sequence[Incoming], caller: Caller, beta: BetaStated
+) -> UploadOutcome:
     upload = Upload(participant_id=participant.id, created_by=caller.label, stated=_said(stated, beta))
     db.add(upload)
     db.flush()
