@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import logging
 import os
 import shutil
@@ -15,6 +17,7 @@ from datetime import timedelta
 from sqlalchemy import Connection, text
 from sqlalchemy.exc import DBAPIError
 
+from app.platform import kept
 from app.platform.database import database_url, get_engine, new_session, set_actor, transaction
 from app.platform.files import prune_copies_beside
 from app.platform.jobs import engine, repository
@@ -25,6 +28,7 @@ from app.tables.jobs import JobStatus
 log = logging.getLogger(__name__)
 
 CANCEL_POLL_S = 0.5
+IDLE_S = 20.0
 KEEP_FINISHED = timedelta(days=14)
 """How long the engine's rows and the working folders of finished jobs are kept."""
 _MOST_WORKERS = 1000
@@ -102,6 +106,7 @@ class WorkerMonitor:
         self._host, self._pid = socket.gethostname(), os.getpid()
         self._may_reap_at = 0.0
         self._lost: set[str] = set()
+        self._idle_since: float | None = None
         self._next_beat = self._next_housekeeping = 0.0
 
     def look(self) -> None:
@@ -112,6 +117,7 @@ class WorkerMonitor:
         """
         try:
             self._cancel()
+            self._return_memory()
             if time.monotonic() >= self._next_beat:
                 self._next_beat = time.monotonic() + self._pace.beat_s
                 self.beat()
@@ -133,6 +139,17 @@ class WorkerMonitor:
         if silent_s > self._pace.stale_s:
             # the machine slept: other workers of this machine did too, and need a moment to show that they live
             self._may_reap_at = time.monotonic() + self._pace.stale_s
+
+    def _return_memory(self) -> None:
+        """Return to the system what the last jobs have left in memory, once nothing has run for IDLE_S."""
+        if self._runner.running():
+            self._idle_since = time.monotonic()
+        elif self._idle_since is not None and time.monotonic() - self._idle_since > IDLE_S:
+            self._idle_since = None
+            kept.forget()
+            gc.collect()
+            if hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
+                libc.malloc_trim(0)  # else glibc keeps what is free below what is in use
 
     def _cancel(self) -> None:
         if running := self._runner.running():
