@@ -173,18 +173,12 @@ def receive(
     study_service.refuse_ended(participant.site)
     if not incoming:
         raise Invalid("The upload holds no file.", "Choose at least one file.", field="file")
-    with place():
-        return _receive(db, participant, stated, incoming, caller, beta or BetaStated())
-
-
-def _receive(
-    db: Session, participant: Participant, stated: StatedSession, incoming: Sequence[Incoming], caller: Caller, beta: BetaStated
-) -> UploadOutcome:
+    beta = beta or BetaStated()
     upload = Upload(participant_id=participant.id, created_by=caller.label, stated=_said(stated, beta))
     db.add(upload)
     db.flush()
     number = upload.id  # known whatever becomes of the database
-    with in_progress(number):
+    with place(), in_progress(number):
         arranged = arrange(incoming)
         receiver = Receiver(db, participant, upload, decode_options(participant, beta), beta)
         outcome = UploadOutcome(upload, participant, [], alike_together(arranged.asides))
