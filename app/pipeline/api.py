@@ -36,8 +36,8 @@ def start_job(participant: CurrentParticipant, body: JobIn, db: Db, caller: Curr
     one (202). A request may therefore be sent again after a timeout; `again` starts another job all the same. There is one
     `next_generation` at a time.
     """
-    params = body.model_dump(mode="json", exclude={"kind", "again"})
-    started = service.start_job(db, participant, body.kind, params, caller, again=body.again)
+    params = body.model_dump(mode="json", exclude={"kind", "again", "bulk"})
+    started = service.start_job(db, participant, body.kind, params, caller, again=body.again, bulk=body.bulk)
     response.status_code = 202 if started.new else 200
     return job_out(started.job, participant)
 

@@ -13,7 +13,7 @@ from app.pipeline.next_generation.parents import tested_policies
 from app.pipeline.params import NEXT_GENERATION, NextGenerationParams, PipelineParams
 from app.pipeline.training import training_starts
 from app.platform.errors import Invalid
-from app.platform.jobs import JobKind, register
+from app.platform.jobs import JobKind, Priority, register
 from app.tables.participants import Participant
 
 _TRAINING = {"train": "app.learning.training.compute:train", "baselines": "app.learning.training.compute:baselines"}
@@ -64,6 +64,7 @@ register(
         orchestration="app.pipeline.next_generation.job:run_next_generation",
         compute=_TRAINING | _DISTILLATION | _EVALUATION,
         requires=(usable_sessions, something_tested),
+        priority=Priority.INTERACTIVE,
         one_at_a_time=True,
     )
 )
@@ -75,6 +76,7 @@ register(
         orchestration="app.pipeline.evaluation:run_evaluate",
         compute=_EVALUATION,
         requires=(usable_sessions, policies_to_rank),
+        priority=Priority.INTERACTIVE,
     )
 )
 register(
@@ -85,6 +87,7 @@ register(
         orchestration="app.pipeline.training:run_train",
         compute=_TRAINING,
         requires=(usable_sessions, training_starts),
+        priority=Priority.BATCH,
     )
 )
 register(

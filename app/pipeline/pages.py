@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, get_args
 
 from fastapi import APIRouter, Request
@@ -23,13 +24,14 @@ from app.platform.jobs import registry
 from app.platform.jobs import repository as jobs
 from app.platform.jobs import service as job_service
 from app.platform.jobs.titles import failure, numbered
+from app.platform.web.charts import counted
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
 from app.study import repository as study
 from app.study.deps import CurrentParticipant
 from app.study.service import may, withdrawn_codes
-from app.tables.jobs import JobStatus
+from app.tables.jobs import Job, JobStatus
 from app.tables.participants import Participant
 from ml.ope import registry as estimators
 
@@ -133,6 +135,7 @@ def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller)
         params=_in_words(found.job.params),
         refresh_s=REFRESH_S,
         workers=len(jobs.live_workers(db, job_service.STALE_S)),
+        in_queue=_in_queue(db, found.job),
         may_run=may(caller, can.RUN_JOBS, found.participant),
     )
     return HTMLResponse(page)
@@ -193,6 +196,15 @@ def _jobs(
         may_run=may(caller, can.RUN_JOBS, participant),
     )
     return HTMLResponse(page, error.status if error else 200)
+
+
+def _in_queue(db: Session, job: Job) -> str:
+    """Say how many jobs begin before a waiting one, and how long they take where that is known."""
+    if job.status != JobStatus.QUEUED:
+        return ""
+    count, seconds = job_service.in_queue(db, job)
+    before = f"{counted(count, 'job')} before yours"
+    return f"{before}." if seconds is None else f"{before}, about {math.ceil(seconds / 60)} min."
 
 
 def _titles() -> dict[str, str]:

@@ -17,7 +17,9 @@ def _start_of(kind: registry.JobKind) -> type[BaseModel]:
     """Build the model of the kind's params and name, which is the body of `POST .../jobs`."""
     name = f"{kind.name.title().replace('_', '')}Job"
     again = Field(False, description="Whether to start another one although the same waits or runs.")
-    return create_model(name, __base__=kind.params, __doc__=f"{kind.title}.", kind=(Literal[kind.name], ...), again=(bool, again))  # type: ignore[arg-type]
+    bulk = Field(False, description="Whether no person waits for it: it begins after all other jobs, as of a night or a sweep.")
+    own: dict[str, Any] = {"kind": (Literal[kind.name], ...), "again": (bool, again), "bulk": (bool, bulk)}
+    return create_model(name, __base__=kind.params, __doc__=f"{kind.title}.", **own)
 
 
 if TYPE_CHECKING:

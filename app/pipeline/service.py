@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pydantic import BaseModel
 from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
+from app.evaluation.repository import newest_evaluation
 from app.learning import repository as learning
 from app.learning.snapshots.service import collect
 from app.pipeline.stages import PLAN, snapshot_facts
-from app.platform.jobs import registry
+from app.platform.jobs import Priority, registry
 from app.platform.jobs import service as jobs
 from app.study import service as study
 from app.tables.jobs import Job
@@ -35,6 +35,7 @@ def start_job(
     caller: Caller,
     *,
     again: bool = False,
+    bulk: bool = False,
     repeats: Job | None = None,
 ) -> Started:
     """Put a job of this participant on the queue, unless the same one is there: a request that is sent twice starts one job.
@@ -53,19 +54,22 @@ def start_job(
     # two requests at once: the second waits here and finds the job of the first
     learning.lock_participant(db, participant.id)
     if not again or wanted.one_at_a_time:
-        for live in jobs.live_of(db, participant.id):
-            if live.kind == kind and (wanted.one_at_a_time or _same(db, participant, live, checked)):
+        for live in jobs.live_of(db, participant.id, kind, None if wanted.one_at_a_time else checked):
+            if wanted.one_at_a_time or _same(db, participant, live):
                 return Started(live, False)
-    job = jobs.submit(db, kind, participant.id, checked, caller.label, repeats)
+    # a participant's first ranking is waited for, later pipelines are not
+    first = kind == "pipeline" and newest_evaluation(db, participant.id) is None
+    urgency = Priority.BATCH if bulk else Priority.INTERACTIVE if first else wanted.priority
+    job = jobs.submit(db, kind, participant.id, checked, caller.label, repeats, urgency)
     for requirement in wanted.requires:
         requirement(db, participant.id, checked)
     return Started(job, True)
 
 
-def _same(db: Session, participant: Participant, live: Job, params: BaseModel) -> bool:
+def _same(db: Session, participant: Participant, live: Job) -> bool:
     """Decide whether a job that has not ended does what these params ask for. One that waits reads its data when it begins, as a new one
     would."""
-    if live.cancel_requested_at is not None or live.params != params.model_dump(mode="json"):
+    if live.cancel_requested_at is not None:
         return False
     planned = next((s for s in live.steps if s.key == PLAN and s.result is not None), None)
     if planned is None or planned.result is None or planned.finished_at is None:

@@ -63,6 +63,10 @@ class Job(Base):
     code_version: Mapped[str] = mapped_column(String(80))
     repeats: Mapped[str | None] = mapped_column(ForeignKey("job.id"))
     """The job that had ended and that this one repeats."""
+    urgency: Mapped[int] = mapped_column(server_default="50")
+    """A `Priority`: smaller ones begin first."""
+    place: Mapped[int] = mapped_column(server_default="0")
+    """Order among waiting jobs of one urgency: studies take turns, and participants within them."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     created_by: Mapped[str] = mapped_column(String(254))
     started_at: Mapped[datetime | None]

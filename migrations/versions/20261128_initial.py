@@ -515,6 +515,8 @@ def upgrade() -> None:
         sa.Column("updated_at", sa.DateTime(timezone=True), server_default=sa.text("now()"), nullable=False),
         sa.Column("cancel_requested_at", sa.DateTime(timezone=True), nullable=True),
         sa.Column("repeats", sa.String(length=36), nullable=True),
+        sa.Column("urgency", sa.Integer(), server_default="50", nullable=False),
+        sa.Column("place", sa.Integer(), server_default="0", nullable=False),
         sa.ForeignKeyConstraint(["repeats"], ["job.id"], name=op.f("fk_job_repeats_job")),
         sa.CheckConstraint("(finished_at is not null) = (status in ('succeeded', 'failed', 'cancelled'))", name=op.f("ck_job_finished")),
         sa.CheckConstraint("status in ('queued', 'running', 'succeeded', 'failed', 'cancelled')", name=op.f("ck_job_status")),

@@ -20,6 +20,8 @@ from dbos._serialization import Serializer
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
+from app.platform.jobs.registry import Priority
+
 PROTOCOL = "4"
 """Version of the job protocol: raise it when orchestrations change the keys of their steps or the meaning of recorded results."""
 
@@ -29,6 +31,9 @@ MAX_RECOVERIES = 3
 APPLICATION = "betaloop"
 SCHEMA = "dbos"
 QUEUE = "jobs"
+URGENT_QUEUE = "urgent"
+"""Queue of its own for what a person waits for: it is taken although as many other jobs run as a worker takes."""
+MOST_PLACES = 1_000_000
 WORKFLOW = "betaloop.job"
 QUEUE_POLL_S = 0.5
 POOL = {"pool_size": 2, "max_overflow": 18}
@@ -78,10 +83,16 @@ def prepare(url: str) -> None:
     DBOS.migrate(url, schema=SCHEMA)
 
 
-def enqueue(db: Session, job_id: str, priority: int) -> None:
-    """Put a job on the queue within the caller's transaction: it exists when the caller commits, not before."""
+def enqueue(db: Session, job_id: str, urgency: int, place: int = 0) -> None:
+    """Put a job on the queue within the caller's transaction: it exists when the caller commits, not before.
+
+    Args:
+        urgency: a `Priority`. place: order among jobs of one urgency; the smaller begins first.
+    """
     # no app_version: a job runs on the newest protocol that any worker speaks
-    options: EnqueueOptions = {"workflow_name": WORKFLOW, "queue_name": QUEUE, "workflow_id": job_id, "priority": int(priority)}
+    queue = QUEUE if urgency > Priority.INTERACTIVE else URGENT_QUEUE
+    order = urgency * MOST_PLACES + min(place, MOST_PLACES - 1)
+    options: EnqueueOptions = {"workflow_name": WORKFLOW, "queue_name": queue, "workflow_id": job_id, "priority": order}
     # the insert must reach the rows that the session holds back, in order
     db.flush()
     client = _client(db.connection().engine.url.render_as_string(hide_password=False))
@@ -125,7 +136,7 @@ def launch(url: str, executor_id: str, jobs_at_once: int, runner: Callable[[str]
     Args:
         url: SQLAlchemy URL of the database.
         executor_id: no other live process may have it, and a restarted worker should have it again.
-        jobs_at_once: jobs this worker takes from the queue at a time.
+        jobs_at_once: jobs this worker takes from each queue at a time.
         runner: runs one job; called in a thread of its own.
     """
     global _runner
@@ -146,7 +157,8 @@ def launch(url: str, executor_id: str, jobs_at_once: int, runner: Callable[[str]
     DBOS(config=config)
     _quieten()
     DBOS.launch()
-    DBOS.register_queue(QUEUE, worker_concurrency=jobs_at_once, polling_interval_sec=QUEUE_POLL_S, on_conflict="always_update")
+    for queue in (QUEUE, URGENT_QUEUE):
+        DBOS.register_queue(queue, worker_concurrency=jobs_at_once, polling_interval_sec=QUEUE_POLL_S, on_conflict="always_update")
 
 
 def shutdown() -> None:

@@ -36,7 +36,7 @@ _REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 class Priority(IntEnum):
-    """Priority in the queue. The engine lets a missing priority overtake all others, so every kind has one."""
+    """Priority in the queue: a person waits for interactive jobs, and for no batch. The engine wants one of every job."""
 
     INTERACTIVE = 10
     NORMAL = 50

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from datetime import timedelta
 from typing import Any
 
-from sqlalchemy import ColumnElement, Interval, delete, func, literal, select, text, update
+from sqlalchemy import ColumnElement, Interval, delete, func, literal, select, text, tuple_, update
 from sqlalchemy.orm import Session, selectinload
 
 from app.platform.database import now
@@ -14,6 +14,7 @@ from app.platform.errors import NotFound
 from app.tables.jobs import Job, JobEvent, JobStatus, JobStep, Worker
 
 LIVE = (JobStatus.QUEUED, JobStatus.RUNNING)
+TYPICAL = 20
 ENDED = (JobStatus.SUCCEEDED, JobStatus.FAILED, JobStatus.CANCELLED)
 
 
@@ -69,6 +70,60 @@ def jobs_before(db: Session, job: Job) -> list[str]:
     while (earlier := db.get_one(Job, found[-1]).repeats if found else job.repeats) is not None:
         found.append(earlier)
     return found
+
+
+def next_place(db: Session, participant_id: int | None, urgency: int) -> int:
+    """Find the place of a new job among the waiting jobs of its urgency, so that studies take turns, and participants within a study.
+
+    The n-th job of a participant comes after the first n - 1 jobs of each other participant of the study, and no further. That count is its
+    place behind the job that begins next, whichever study asked for that.
+    """
+    row = db.execute(
+        text(
+            "with waiting as (select j.place, j.participant_id, s.study_id, row_number() over"
+            " (partition by j.participant_id order by j.place, j.created_at) as number from job j"
+            " left join participant p on p.id = j.participant_id left join site s on s.id = p.site_id"
+            " where j.status = 'queued' and j.urgency = :urgency),"
+            " mine as (select count(*) + 1 as number from waiting where participant_id is not distinct from cast(:participant as int)),"
+            " study as (select s.study_id from participant p join site s on s.id = p.site_id where p.id = :participant)"
+            " select coalesce((select min(place) from waiting), 0) + (select count(*) from waiting, mine"
+            " where waiting.number <= mine.number and waiting.study_id is not distinct from (select study_id from study))"
+        ),
+        {"participant": participant_id, "urgency": urgency},
+    )
+    return int(row.scalar_one())
+
+
+def live_of(db: Session, participant_id: int | None, kind: str | None = None, params: dict[str, Any] | None = None) -> list[Job]:
+    """List a participant's jobs that have not ended: all, those of one kind, or those of one kind with the same params."""
+    query = select(Job).where(Job.participant_id.is_not_distinct_from(participant_id), Job.status.in_(LIVE))
+    if kind is not None:
+        query = query.where(Job.kind == kind)
+    if params is not None:
+        query = query.where(Job.params == params)
+    return list(db.scalars(query.order_by(Job.created_at.desc(), Job.id)))
+
+
+def running(db: Session) -> Sequence[Job]:
+    """Load the jobs that run."""
+    return db.scalars(select(Job).where(Job.status == JobStatus.RUNNING)).all()
+
+
+def waiting_before(db: Session, job: Job) -> Sequence[str]:
+    """List the kinds of the waiting jobs that begin before a job."""
+    order = tuple_(Job.urgency, Job.place, Job.created_at, Job.id)
+    own = tuple_(job.urgency, job.place, job.created_at, job.id)
+    return db.scalars(select(Job.kind).where(Job.status == JobStatus.QUEUED, order < own)).all()
+
+
+def typical_seconds(db: Session) -> dict[str, float]:
+    """Compute the median length of the last TYPICAL jobs of each kind that succeeded, s."""
+    number = func.row_number().over(partition_by=Job.kind, order_by=Job.finished_at.desc())
+    length = func.extract("epoch", Job.finished_at - Job.started_at)
+    of_kind = select(Job.kind, length.label("length"), number.label("number")).where(Job.status == JobStatus.SUCCEEDED).subquery()
+    median = func.percentile_cont(0.5).within_group(of_kind.c.length)
+    rows = db.execute(select(of_kind.c.kind, median).where(of_kind.c.number <= TYPICAL).group_by(of_kind.c.kind))
+    return {kind: float(seconds) for kind, seconds in rows}
 
 
 def step(db: Session, job_id: str, key: str) -> JobStep:

@@ -22,9 +22,6 @@ from app.tables.jobs import Job, JobEvent, JobStatus
 STALE_S = 60.0
 """A worker that is silent for longer is taken for dead."""
 
-_MANY = 10_000
-"""More jobs of one kind than ever wait at once."""
-
 _ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -39,7 +36,13 @@ def checked_params(kind: str, params: Mapping[str, Any]) -> BaseModel:
 
 
 def submit(
-    db: Session, kind: str, participant_id: int | None, params: dict[str, Any] | BaseModel, created_by: str, repeats: Job | None = None
+    db: Session,
+    kind: str,
+    participant_id: int | None,
+    params: dict[str, Any] | BaseModel,
+    created_by: str,
+    repeats: Job | None = None,
+    urgency: int | None = None,
 ) -> Job:
     """Make a job and put it on the queue, both in the caller's transaction.
 
@@ -49,13 +52,14 @@ def submit(
         participant_id: whose data it works on.
         params: checked by the kind's schema.
         created_by: the user who asks for it; the audit trail names them with everything that the job writes.
+        urgency: a `Priority`; that of the kind when left open.
         repeats: a job that has ended: the results of its steps are taken over where code and params are the same.
 
     Raises:
         UnknownKind: there is no such kind.
         Invalid: the params break the kind's schema; `errors` lists where.
     """
-    wanted = registry.kind(kind)
+    urgency = int(registry.kind(kind).priority if urgency is None else urgency)
     checked = checked_params(kind, params.model_dump(mode="json") if isinstance(params, BaseModel) else params).model_dump(mode="json")
     job = Job(
         id=str(uuid.uuid4()),
@@ -68,18 +72,29 @@ def submit(
         code_version=code_version(),
         created_by=created_by,
         repeats=None if repeats is None else repeats.id,
+        urgency=urgency,
+        place=repository.next_place(db, participant_id, urgency),
     )
     db.add(job)
     db.flush()
     repository.add_event(db, job.id, "status", {"status": JobStatus.QUEUED})
-    engine.enqueue(db, job.id, wanted.priority)
+    engine.enqueue(db, job.id, job.urgency, job.place)
     return job
 
 
-def live_of(db: Session, participant_id: int) -> list[Job]:
-    """List a participant's jobs that have not ended."""
-    found, _ = repository.find(db, participant_id, None, repository.LIVE, limit=_MANY)
-    return [job for job in found if job.participant_id == participant_id]
+def in_queue(db: Session, job: Job) -> tuple[int, float | None]:
+    """Count the jobs that begin before a waiting one, and estimate the seconds until it begins; None where a kind has never run."""
+    running, waiting, lengths = repository.running(db), repository.waiting_before(db, job), repository.typical_seconds(db)
+    left = [found if (found := one.seconds_left(now())) is not None else lengths.get(one.kind) for one in running]
+    times = [*left, *(lengths.get(kind) for kind in waiting)]
+    workers = max(1, len(repository.live_workers(db, STALE_S)))
+    known = [seconds for seconds in times if seconds is not None]
+    return len(waiting), sum(known) / workers if len(known) == len(times) else None
+
+
+def live_of(db: Session, participant_id: int, kind: str | None = None, params: BaseModel | None = None) -> list[Job]:
+    """List a participant's jobs that have not ended: all, those of one kind, or those of one kind with the same params."""
+    return repository.live_of(db, participant_id, kind, None if params is None else params.model_dump(mode="json"))
 
 
 def cancel(db: Session, job: Job, by: str) -> Job:
@@ -115,9 +130,8 @@ def repeatable(db: Session, job: Job) -> Job:
     job = repository.locked(db, job.id)
     if not JobStatus(job.status).ended:
         raise Conflict(f"Job {job.id} is still {job.status}.", "Wait for it or cancel it, then retry.")
-    live, _ = repository.find(db, job.participant_id, job.kind, repository.LIVE, limit=_MANY)
-    for other in live:
-        if other.participant_id == job.participant_id and other.params == job.params and other.created_at >= job.created_at:
+    for other in repository.live_of(db, job.participant_id, job.kind, job.params):
+        if other.created_at >= job.created_at:
             raise Conflict(f"Job {other.id}, {other.status}, repeats job {job.id} already.", "Wait for it or cancel it, then retry.")
     return job
 

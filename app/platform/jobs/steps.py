@@ -56,6 +56,7 @@ class JobSteps:
     requests: StopRequests
     children: ChildProcesses
     slots: Slots
+    urgency: int = 0
     repeated: Sequence[str] = ()
     """Ids of the jobs that this one repeats, the latest first."""
 
@@ -75,7 +76,7 @@ class JobSteps:
             log.info("step %s of job %s has the result of the job that this one repeats", key, self.ledger.job_id)
         pauses = longer_pauses()
         while True:
-            with self.slots.hold(self.ledger.job_id, self.requests.check):
+            with self.slots.hold(self.ledger.job_id, self.requests.check, self.urgency):
                 if skip():
                     return {"ok": False, "skipped": True}
                 outcome = self._run(key, call)
@@ -180,7 +181,7 @@ class JobRunner:
         ledger = Ledger(job_id, job.created_by, self._worker, check)
         if not ledger.open():
             return
-        steps = JobSteps(ledger, requests, self._children, self._slots, repeated)
+        steps = JobSteps(ledger, requests, self._children, self._slots, job.urgency, repeated)
         context = JobContext(job_id, job.kind, job.participant_id, job.params, job.created_by, steps)
         try:
             if job.cancel_requested_at is not None:

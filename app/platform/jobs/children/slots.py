@@ -15,10 +15,11 @@ _RECHECK_S = 0.2
 class _Ticket:
     job_id: str
     number: int
+    urgency: int
 
 
 class Slots:
-    """`count` slots; a free one goes to the waiting job that has the fewest, of equals to the one served longest ago."""
+    """`count` slots. A free one goes to the most urgent job, then to the one with the fewest, then to the one served longest ago."""
 
     def __init__(self, count: int) -> None:
         self._free = count
@@ -29,11 +30,11 @@ class Slots:
         self._clock = 0
 
     @contextmanager
-    def hold(self, job_id: str, check: Callable[[], None]) -> Iterator[None]:
+    def hold(self, job_id: str, check: Callable[[], None], urgency: int = 0) -> Iterator[None]:
         """Wait for a slot and hold it; `check` is called while waiting and raises to give up."""
         with self._changed:
             self._clock += 1
-            ticket = _Ticket(job_id, self._clock)
+            ticket = _Ticket(job_id, self._clock, urgency)
             self._waiting.append(ticket)
             try:
                 while not (self._free and self._next() is ticket):
@@ -58,4 +59,4 @@ class Slots:
                 self._changed.notify_all()
 
     def _next(self) -> _Ticket:
-        return min(self._waiting, key=lambda t: (self._running[t.job_id], self._served.get(t.job_id, 0), t.number))
+        return min(self._waiting, key=lambda t: (t.urgency, self._running[t.job_id], self._served.get(t.job_id, 0), t.number))

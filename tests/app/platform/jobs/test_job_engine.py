@@ -93,10 +93,21 @@ def test_lower_numbers_go_first_and_every_job_has_one(ran):
     ids, _, launch = ran
     _enqueue("batch", priority=90)
     _enqueue("normal", priority=50)
-    _enqueue("interactive", priority=10)
+    _enqueue("before", priority=40)
     launch()
     _wait(lambda: len(ids) == 3)
-    assert ids == ["interactive", "normal", "batch"]
+    assert ids == ["before", "normal", "batch"]
+
+
+def test_what_a_person_waits_for_runs_beside_as_many_other_jobs_as_a_worker_takes(ran):
+    ids, gate, launch = ran
+    gate.clear()
+    _enqueue("normal")
+    launch()
+    _wait(lambda: _row("normal", "status") == ("PENDING",))
+    _enqueue("interactive", priority=10)
+    _wait(lambda: _row("interactive", "status") == ("PENDING",))
+    assert ids == []
 
 
 def test_a_job_without_a_version_runs_and_one_of_another_version_waits_until_it_is_adopted(ran):
