@@ -201,7 +201,7 @@ def ended(db: Session, job_ids: Sequence[str]) -> dict[str, str]:
 
 
 def adopt_older_protocols(db: Session) -> int:
-    """Move unfinished jobs of other protocol versions to ours, at start-up; returns how many.
+    """Move unfinished jobs of older protocol versions to ours, at start-up; returns how many. Those of newer ones wait for their workers.
 
     DBOS would leave them waiting for ever for a worker of their version. Their finished steps are found by their keys in `job_step`.
     """
@@ -209,7 +209,7 @@ def adopt_older_protocols(db: Session) -> int:
         text(
             "update dbos.workflow_status set application_version = :version"
             " where name = :name and status in ('ENQUEUED', 'DELAYED', 'PENDING')"
-            " and application_version is not null and application_version <> :version returning workflow_uuid"
+            " and cast(application_version as int) < cast(:version as int) returning workflow_uuid"
         ),
         {"version": PROTOCOL, "name": WORKFLOW},
     )

@@ -114,6 +114,7 @@ def test_a_job_without_a_version_runs_and_one_of_another_version_waits_until_it_
     ids, _, launch = ran
     _enqueue("new")
     _enqueue("old", application_version="0")
+    _enqueue("newer", application_version=str(int(engine.PROTOCOL) + 1))
     assert _row("new", "application_version") == (None,)
     launch()
     _wait(lambda: ids == ["new"])
@@ -121,6 +122,7 @@ def test_a_job_without_a_version_runs_and_one_of_another_version_waits_until_it_
         assert engine.adopt_older_protocols(db) == 1
         assert engine.adopt_older_protocols(db) == 0
     _wait(lambda: ids == ["new", "old"])
+    assert _row("newer", "status", "application_version") == ("ENQUEUED", str(int(engine.PROTOCOL) + 1)), "it is for newer workers"
 
 
 def test_a_stopping_worker_leaves_its_job_pending_and_takes_back_the_attempt(ran):
