@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -173,6 +174,7 @@ def _built() -> FastAPI:
     app.state.description = DESCRIPTION
     templates.provide(templates.Part.OUTLOOK, outlook)
     templates.provide(templates.Part.STANDINGS, standing_sentences)
+    templates.provide(templates.Part.TESTED_STANDINGS, partial(standing_sentences, every=False))
     templates.provide(templates.Part.SLOTS_OF_VISIT, slots_of_visit)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

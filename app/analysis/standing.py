@@ -78,11 +78,10 @@ def standings(db: Session, participant: Participant, caller: Caller) -> dict[int
     }
 
 
-def standing_sentences(db: Session, participant: Participant, caller: Caller) -> dict[int, str]:
-    """Return the sentences by policy: of those with sessions or harms first, then of the others."""
+def standing_sentences(db: Session, participant: Participant, caller: Caller, *, every: bool = True) -> dict[int, str]:
+    """Return the sentences by policy; without `every` only of policies with sessions or harms, for pages that list many."""
     found = standings(db, participant, caller)
-    order = sorted(found, key=lambda i: (not found[i].harms and not found[i].sessions, i))
-    return {i: found[i].sentence for i in order}
+    return {i: one.sentence for i, one in found.items() if every or one.harms or one.sessions}
 
 
 def outlook(db: Session, participant: Participant, caller: Caller) -> list[str]:

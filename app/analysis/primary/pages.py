@@ -33,7 +33,7 @@ def primary_page(request: Request, participant: CurrentParticipant, db: Db, call
         "analysis/primary.html",
         participant=participant,
         found=found,
-        standings=make_part(Part.STANDINGS, db, participant, caller),
+        standings=make_part(Part.TESTED_STANDINGS, db, participant, caller),
         wording=wording,
         units=_units(found),
     )

@@ -67,7 +67,7 @@ def ranking_page(
         "evaluation/ranking.html",
         participant=participant,
         ranking=found,
-        standings=make_part(Part.STANDINGS, db, participant, caller) if found else {},
+        standings=make_part(Part.TESTED_STANDINGS, db, participant, caller) if found else {},
         answer=judged.answer if judged else None,
         body=_body(judged, found, shown, may_plan, may_run, unfolded=bool(method)) if judged and found else "",
         missing=missing,
