@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from inspect import CO_OPTIMIZED
 from types import CodeType, FrameType
 from typing import Any
 
@@ -40,11 +41,9 @@ def modules_entered() -> Iterator[set[str]]:
 
 
 def module_of(code: CodeType) -> str | None:
-    """Name the module of a function; None for what is counted as no step of a call."""
+    """Name the module of a function; None for what is no step of a call. The body of a module or class that is loaded is none."""
     path = code.co_filename.removeprefix(f"{ROOT}/")
-    if code.co_name == "<module>" or not path.startswith(("app/", "ml/")) or not path.endswith(".py"):
+    if not code.co_flags & CO_OPTIMIZED or not path.startswith(("app/", "ml/")) or not path.endswith(".py"):
         return None
     name = path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-    if name.startswith(TABLES):
-        return TABLES
-    return None if name.startswith(EVERY_REQUEST) else name
+    return None if name.startswith(EVERY_REQUEST) else TABLES if name.startswith(TABLES) else name

@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
-from app.ingest.uploads import reading
+from app.ingest.uploads import compute, reading
 from app.learning.policies.baselines import constant_onnx
 from app.platform.jobs import registry
 from app.platform.kept import forget
@@ -34,6 +34,7 @@ def caller(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> TestClient:
 
 def decode_here_too(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     """Run what a limited child does in this process as well, before the child does it: no tracer sees the child."""
+    compute.prepare()  # as the process does whose forks decode: what is loaded first in a call is not part of it
     limited = reading.run_limited
 
     def both(reference: str, params: dict[str, Any], *more: Any) -> dict[str, Any]:
