@@ -6,7 +6,7 @@
 
 Verdicts are those of the service's defaults after three visits. A candidate is truly worth a test where all three QoCs are within the
 margins of cDBS and it saves energy. *Nothing answers*: the same sessions with beta and QoCs as under cDBS throughout, whatever amplitude
-the log says; whoever orders policies by them orders noise. True returns only measure. CPU seconds of one thread.
+the log says. An order of policies by them is an order of noise. True returns only measure. CPU seconds of one thread.
 """
 
 from __future__ import annotations

@@ -2,12 +2,12 @@
 
     y_t = mu + visit + session + sum over k of g_k f(a_{t-k}) + eta_t,    eta_t = sum over l <= W of phi_l eta_{t-l} + e_t
 
-y is standardised (log) beta, f one of `SHAPES` with f(0) = 0 and f(1) = 1 (a Hammerstein model). The impulse response g is constant
-over each of `EDGES`' stretches of lags and has the stable-spline prior of first order, cov(g_i, g_j) = c alpha^max(i, j) (Pillonetto and De
-Nicolao 2010; Chen, Ohlsson and Ljung 2012): smooth, and fading with a time constant that alpha states, plus an immediate answer g_0 of its
-own size. Which shape and which alpha the data ask for is weighed by the marginal likelihood and not chosen: where amplitudes that were held
-only briefly cannot tell a slow answer from none, the draws hold both, and the interval of a sustained dose shows it. Levels of visits and
-sessions are random effects.
+y is standardised (log) beta, f one of `SHAPES` with f(0) = 0 and f(1) = 1 (a Hammerstein model). The impulse response g is constant over
+each of `EDGES`' stretches of lags. It has the stable-spline prior of first order, cov(g_i, g_j) = c alpha^max(i, j) (Pillonetto and De
+Nicolao 2010; Chen, Ohlsson and Ljung 2012). So it is smooth and fades with a time constant that alpha states. An immediate answer g_0 of
+its own size is added. The marginal likelihood weighs shapes and alphas; none is chosen. Where amplitudes that lasted only briefly cannot
+separate a slow answer from none, the draws have both, and the interval of a sustained dose shows it. Levels of visits and sessions are
+random effects.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Penalised regression with a link, for many designs and variances of its levels at once: Fisher scoring and Laplace's approximation.
 
-Every outcome is a mean over weighted parts of a session: minutes, or one part where the outcome is of the session. mu = sum_m w_m g(eta_m),
-eta_m = x_m theta, with a Gaussian prior of theta. Three families:
+Every outcome is a mean over weighted parts of a session: minutes, or one part where the outcome is of the session. The mean is mu = sum_m
+w_m g(eta_m), eta_m = x_m theta, with a Gaussian prior of theta. Three families:
 
     gaussian   y ~ N(eta, s^2)
     rounded    y = round(eta + N(0, s^2)), cut to [low, high]: an ordinal regression with equally spaced limits

@@ -1,6 +1,6 @@
 """One hierarchical model of the end-of-session outcomes and r_end, for all methods of off-policy evaluation.
 
-Outcomes follow the minutes of a session (`regressions`); r_end is their weighted sum, of what is predicted, so that a session without one
+Outcomes follow the minutes of a session (`regressions`). r_end is the weighted sum of their predictions, so that a session without one
 outcome still counts for the others. Draws are those of one joint posterior. Draw d of two policies shares its coefficients, so that a
 common error of the model cancels in their difference.
 """
@@ -180,8 +180,8 @@ def fit_end_model(
     """Fit to all sessions.
 
     A controller that follows beta gives more in a bad hour, so that more stimulation seems to do worse. Its amplitude depends on beta
-    alone. The model also has the level of beta that the amplitude does not cause, so that such sessions compare like with like (the
-    back-door criterion of Pearl 1995).
+    alone. The model also has the level of beta that the amplitude does not cause. Such sessions then compare like with like (the back-door
+    criterion of Pearl 1995).
 
     Args:
         draws: D draws of the posterior besides its mean. seed: theirs.

@@ -49,8 +49,8 @@ class Replays:
 class Draws:
     """Draws [P, KEPT] by quantity: `steps`, `r_end`, `return`, `energy` and the QoCs that sessions have.
 
-    `STATISTICAL` is the return without what structures get wrong: tested sessions move it with the others, so that what is left of either
-    error is known.
+    `STATISTICAL` is the return without what structures get wrong: tested sessions move it with the others, so that the rest of either error
+    is known.
 
     Attributes:
         between_visits: standard deviation of a policy's true difference to cDBS between visits, by quantity.

@@ -179,8 +179,8 @@ class FittedPosterior:
 
     @property
     def shape_pooling(self) -> dict[str, Any]:
-        """By outcome what was found of pooling its dose shapes (`Proof.to_json`) and, where they are pooled, how much better the others'
-        prior predicts these very data than the flat one, `own_gain`, nats; empty where other participants were not asked."""
+        """By outcome the proof of pooling its dose shapes (`Proof.to_json`). Where they are pooled, `own_gain` says how much better the
+        others' prior predicts these very data than the flat one, nats. Empty where other participants were not asked."""
         if self.pooled is None:
             return {}
         own, priors = self.ends.shape_evidence, self.pooled.priors

@@ -1,8 +1,8 @@
 """Number of further sessions near a dose that would settle an open verdict, by simulation.
 
-Preposterior analysis (Raiffa and Schlaifer 1961, ch. 4): a truth is drawn from the posterior, and the mean of n sessions under it with the
-noise of sessions. The posterior is moved by that mean as tested sessions move it (linear prediction over joint draws), and the verdict is
-asked again. n is the least number with which it is settled in four of five such futures.
+Preposterior analysis (Raiffa and Schlaifer 1961, ch. 4): a truth is drawn from the posterior, and under it the mean of n sessions with
+their noise. The posterior is moved by that mean as tested sessions move it (linear prediction over joint draws), and the verdict is asked
+again. The number n is the least with which it is settled in four of five such futures.
 
 The sessions do not run the policy itself but an amplitude near its dose. A plan allows amplitudes below `LOW_AMPLITUDE` for the last
 `LOW_SECONDS` of a session alone. So a policy has no number where no session of a plan is near its dose. It has none where its outcomes

@@ -34,8 +34,8 @@ SHRINK = 0.3
 OWN_VARIANCE = 1.0
 """Variance of a block's sum that no run shows, in squared rewards: sums of few distinct rewards are no normals."""
 LEARNING_RATE = 0.25
-"""Power of the densities. Every structure is wrong in its own way: one that is far ahead here is less so on policies that never ran
-(generalised Bayes; Grünwald and van Ommen 2017)."""
+"""Power of the densities. Every structure is wrong in its own way: one that is far ahead here is less so on other policies (generalised
+Bayes; Grünwald and van Ommen 2017)."""
 RESAMPLES = 1000
 LEAST_KNOWN = 10
 """Known steps below which a block, or a session's innovations, count for nothing."""

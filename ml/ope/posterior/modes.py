@@ -4,12 +4,12 @@
     eta_t = sum over l <= W of phi_l eta_{t-l} + e_t
 
 y is standardised (log) beta, p_j one of `dose_functions`, L_m a first-order low-pass with one of `TIMES` (the first of them passes
-everything), U_k a low-pass that rises and falls at different speeds, F_k one of falls of the amplitude, after which beta may rebound: a
-controller that switches often may do worse than any dose that it switches between. Sums of exponentials are a dense family of impulse
+everything). U_k is a low-pass that rises and falls at different speeds. F_k is one of falls of the amplitude, after which beta may rebound:
+a controller that switches often may do worse than any dose that it switches between. Sums of exponentials are a dense family of impulse
 responses (Laguerre and Kautz bases: Wahlberg 1991). An answer at once, one over minutes, one that wears off and one that rings are all in
-it. The dose may have another shape at every speed. Coefficients of one group share a variance (`ml.statistics.mixed`): the straight dose at
-fast and at slow speeds, the bend of the dose, the difference between rising and falling, and falls. What the data leave open about them
-stays in the draws.
+it. The dose may have another shape at every speed. Coefficients of one group share a variance (`ml.statistics.mixed`). The groups are the
+straight dose at fast and at slow speeds, the bend of the dose, the difference between rising and falling, and falls. What the data leave
+open about them stays in the draws.
 
 Before its first step a session has been under the dose that was in force before it, on record or inferred (`ml.ope.lead`).
 """

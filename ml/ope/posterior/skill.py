@@ -28,7 +28,7 @@ MARGIN = 2.0
 """Squared errors of held-out sessions must be smaller than those of calling all doses equal by so many of their standard errors. This is
 asked of the reward by beta, or of one of the outcomes.
 
-From part A of the virtual population (60 worlds of 21 sessions, `benchmarks/evaluation/verdicts.py`): an order is given in 82 % of the
+On part A of the virtual population (60 worlds of 21 sessions, `benchmarks/evaluation/verdicts.py`) an order is given in 82 % of the
 worlds with stratified sessions and 77 % with the paper's. Where nothing answers to the amplitude it is given in 20 and 17 % of the data."""
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 """How much of the level of a visit its other sessions may predict; the share that errs least counts."""

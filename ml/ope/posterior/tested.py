@@ -1,11 +1,11 @@
 """Tested sessions as differences to the same visit's cDBS, with their standard errors.
 
 A day moves policy and cDBS alike, so that their difference at one visit says more than either. The variance of a session is pooled over
-tests, within policy (or cDBS) and visit, with a prior. The prior is the spread of the random sessions around their visits and their dose,
-as a scaled inverse chi-square distribution of `PRIOR_FREEDOM` degrees of freedom (Gelman et al. 2013, section 2.6). Where both together
-have fewer than `FEWEST` degrees of freedom, the spread of a policy (or of cDBS) between visits fills them up. It has the differences
-between days too and therefore claims less. A variance that rests on few degrees of freedom is itself uncertain. So a standard error is the
-half-width of the central 68.3 % of Student's t, with Satterthwaite's (1946) degrees of freedom, not of the normal.
+tests, within policy (or cDBS) and visit, with a prior. The prior is the spread of the random sessions around visits and dose, as a scaled
+inverse chi-square distribution of `PRIOR_FREEDOM` degrees of freedom (Gelman et al. 2013, section 2.6). Where both together have fewer than
+`FEWEST` degrees of freedom, the spread of a policy (or of cDBS) between visits fills them up. It has the differences between days too and
+therefore claims less. A variance that rests on few degrees of freedom is itself uncertain. So a standard error is the half-width of the
+central 68.3 % of Student's t, with Satterthwaite's (1946) degrees of freedom, not of the normal.
 """
 
 from __future__ import annotations
