@@ -284,6 +284,11 @@ def test_what_a_document_names_exists(document: Path) -> None:
     assert wrong(document.read_text(), document) == []
 
 
+def test_a_page_is_short_enough_to_be_read() -> None:
+    allowed = {"architecture.md", "hazards.md", "ingest.md", "operations.md", "trust.md"}  # lists, and what is still to be shortened
+    assert {p.name for p in DOCUMENTS if p.stat().st_size > 12_288} <= allowed
+
+
 def test_every_picture_is_shown_by_a_document() -> None:
     shown = {(d.parent / target).resolve() for d in DOCUMENTS for target in re.findall(r"!\[[^\]]*\]\(([^)\s]+)\)", d.read_text())}
     assert {p for p in (ROOT / "docs").rglob("*") if p.is_file() and p.suffix != ".md"} <= shown

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.support.results import RESULTS, emit, run_benchmark
+from benchmarks.support.results import emit, run_benchmark
 
 
 def test_a_page_has_the_command_the_commit_and_what_was_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -19,8 +19,7 @@ def test_a_page_has_the_command_the_commit_and_what_was_printed(tmp_path: Path, 
 
     run_benchmark(main, tmp_path)
     page = (tmp_path / "a-page.md").read_text()
-    assert page.startswith("# A page\n")
-    assert "growth.py --quick --write a-page` printed this at commit " in page
+    assert page.startswith("# A page\n\n`python benchmarks/growth.py --quick --write a-page` printed this at commit ")
     assert "```\n['--quick']\n37 sessions   5.2 s\n```" in page
 
 
@@ -43,7 +42,3 @@ def test_a_name_that_is_no_page_is_refused(name: list[str], tmp_path: Path, monk
     with pytest.raises(SystemExit, match="needs the name of a page"):
         run_benchmark(lambda: emit("x"), tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_every_page_of_results_names_a_command() -> None:
-    assert [p.name for p in RESULTS.glob("*.md") if "python " not in p.read_text()] == []
