@@ -79,16 +79,19 @@ def delivered_dose(
         return Dose(nothing, 0.0, running)
     if on is None or not programs:
         return Dose(unknown, UNKNOWN, running, ("no source tells whether therapy was on, or with which settings",))
+    if all(p.enabled is None for p in programs):
+        why = "no settings say which programs are enabled, or whether the therapy cycles: the amplitude is unknown"
+        return Dose(unknown, UNKNOWN, running, (why,))
     if cycle is not None and cycle.pauses:
         return Dose(tuple(UNKNOWN if p in running else 0.0 for p in range(size)), _share(cycle), running, (_cycling(cycle),))
     if since_on_s is not None and (ramp_s is None or since_on_s < ramp_s):
         ramp = "therapy was just switched on, and its ramp has not ended"
         return Dose(tuple(UNKNOWN if p in running else 0.0 for p in range(size)), UNKNOWN, running, (ramp,))
     found = [_amplitude(programs[p]) if p in running else (0.0, None) for p in range(size)]
-    why = [said for _, said in found if said]
+    reasons = [said for _, said in found if said]
     if len(running) > 1:
-        why.append(f"{len(running)} programs stimulate in turn (interleaving): the dose is that of all of them")
-    return Dose(tuple(amplitude for amplitude, _ in found), 1.0, running, tuple(why))
+        reasons.append(f"{len(running)} programs stimulate in turn (interleaving): the dose is that of all of them")
+    return Dose(tuple(amplitude for amplitude, _ in found), 1.0, running, tuple(reasons))
 
 
 def stimulating(programs: Sequence[Program]) -> tuple[int, ...]:

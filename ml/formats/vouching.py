@@ -7,7 +7,6 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Generic, TypeVar
 
 from ml.formats.dose import LIMIT_TOLERANCE_MA, Dose
@@ -34,8 +33,9 @@ class Vouching(Generic[T]):
     def combine(self, times_ms: Sequence[float], states: Sequence[T]) -> tuple[list[tuple[float, T]], list[tuple[float, Dose, Dose]]]:
         """Combine both sources.
 
-        Where the log is unknown, two consecutive statements that agree vouch for the time between them; with others it stays unknown. A
-        reading that contradicts the log makes the state unknown, from the statement before it to the next one that agrees with the log.
+        Where the log is unknown it stays so. Readings that agree say nothing of the time between them: what is changed and changed back
+        shows in none. A reading that contradicts the log makes the state unknown, from the statement before it to the next one that
+        agrees with the log.
 
         Args:
             times_ms: from which the log's states hold, [n], ascending. states: of the log, [n].
@@ -54,23 +54,11 @@ class Vouching(Generic[T]):
                 against.append((t, self.dose_of(states[max(0, bisect_right(times_ms, t) - 1)]), self.dose_of(state)))
         points = sorted([*self.log, *agreed], key=lambda point: point[0])
         out = list(zip(times_ms, states, strict=True))
-        for (begin, a), (end, b) in pairwise(points):
-            dose, other = self.dose_of(a), self.dose_of(b)
-            if end > begin and _known(dose) and _known(other) and _same(dose, other):
-                out = self._fill(out, begin, end, a)
         for t, _, _ in against:
             begin = max((p for p, _ in points if p <= t), default=times_ms[0])
             end = min((p for p, _ in points if p > t), default=math.inf)
             out = _replace(out, begin, end, self.unknown)
         return out, against
-
-    def _fill(self, course: list[tuple[float, T]], begin: float, end: float, state: T) -> list[tuple[float, T]]:
-        """Put a state where the course is unknown between two times."""
-        bounds = [*(t for t, _ in course[1:]), math.inf]
-        for (t, was), stop in zip(list(course), bounds, strict=True):
-            if was == self.unknown and t < end and stop > begin:
-                course = _replace(course, max(t, begin), min(stop, end), state)
-        return course
 
 
 def _replace(course: list[tuple[float, T]], begin: float, end: float, state: T) -> list[tuple[float, T]]:

@@ -6,7 +6,7 @@ enabled programs of the active group stimulate, and with therapy off the amplitu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,12 @@ class AmplitudeSteps:
     programs: tuple[int, ...]
     from_adaptive: bool
     assumed_program: bool
+
+    def end_at(self, end_ms: float) -> AmplitudeSteps:
+        """Make the amplitude unknown from a time on."""
+        first = int(np.searchsorted(self.t_ms, end_ms))
+        unknown = np.full((1, self.amplitude_ma.shape[1]), np.nan)
+        return replace(self, t_ms=np.append(self.t_ms[:first], end_ms), amplitude_ma=np.concatenate((self.amplitude_ma[:first], unknown)))
 
 
 def amplitude_steps(settings: Settings, adaptive: Adaptive | None, times: PacketTimes | None) -> AmplitudeSteps:

@@ -160,9 +160,12 @@ def describe_clock(timeline: RecordingTimes, start_ms: float, report: Callable[[
     pc_steps = list(zip(clock.timeline_ms(clock.steps_at_ms).tolist(), clock.steps_ms.tolist(), strict=True))
     for of, steps in (("the computer's", pc_steps), ("the implant's", timeline.implant_steps)):
         for at_ms, by_ms in steps:
-            report(STEMS[main]).understood.append(
-                f"{of} clock was set by {by_ms / 1000:+.1f} s after {(at_ms - start_ms) / 1000:.1f} s; times follow the implant's ticks"
-            )
+            text = f"{of} clock was set by {by_ms / 1000:+.1f} s after {(at_ms - start_ms) / 1000:.1f} s; times follow the implant's ticks"
+            if steps is pc_steps:
+                # nothing in the file shows which of its two times was right
+                report(STEMS[main]).flagged.append(f"{text}. The start is by one of its two times, and may be off by that")
+            else:
+                report(STEMS[main]).understood.append(text)
     at = np.concatenate([(t.last_ms - start_ms) / 1000.0 for t in streams.values()])
     residual = np.concatenate([t.residual_ms for t in streams.values()])
     known = np.flatnonzero(np.isfinite(at) & np.isfinite(residual))

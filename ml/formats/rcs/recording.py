@@ -81,6 +81,11 @@ def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) 
     duration_s = (end_ms - start_ms) / 1000.0
     grid = Grid(start_ms, duration_s, max(0, math.ceil(duration_s / options.period_s - 1e-6)), options)
     steps = amplitude_steps(settings, streams.adaptive if "adaptive" in times else None, times.get("adaptive"))
+    if (cut_ms := timeline.clock.shown_twice_ms(streams.settings.record_times_ms)) is not None:
+        steps = steps.end_at(cut_ms)
+        since_s = max(0.0, cut_ms - start_ms) / 1000.0
+        said = f"the computer's clock was set back, so that changes have no order: the amplitude is unknown from {since_s:.0f} s on"
+        report("StimLog").flagged.append(said)
     channels: dict[str, list[Stretch]] = {}
     if main and streams.time_domain is not None and "time_domain" in times:
         channels = time_domain_stretches(streams.time_domain, times["time_domain"], settings)
@@ -193,7 +198,7 @@ def _traces(
     amplitude = amplitude_traces(steps, grid)
     if not amplitude:
         report("StimLog").flagged.append("no enabled program known: the recording has no amplitude trace")
-    if steps.assumed_program:
+    if steps.assumed_program and steps.from_adaptive:
         report("StimLog").flagged.append("no settings say which programs are enabled: program 0 is taken to be the one that stimulates")
     _tell_dose(settings, grid, report)
     return traces + amplitude, spectra

@@ -6,6 +6,7 @@ A.2), and jumps where the PC's clock is set. Line and jumps are fitted here by m
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,10 @@ BIN_MS = 1_000.0
 BINS_AROUND = 5
 LEAST_PACKETS = 5
 """A step is judged by medians of up to so many seconds on either side, with at least so many packets on each."""
+
+
+STEP_MARGIN_MS = 2_000.0
+"""A step of a clock is found to the packet, and packets may be missing around it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +93,22 @@ class PcClock:
         device = (pc_ms - self.offsets_ms[piece]) / (1.0 + self.slope)
         begins = np.concatenate(([-np.inf], self.steps_at_ms))[piece]
         return self.timeline_ms(np.maximum(device, begins))
+
+    def shown_twice_ms(self, records_ms: Sequence[float]) -> float | None:
+        """Find from when on the order of records is unknown: the PC's clock was set back over the time of one.
+
+        Args:
+            records_ms: PC times of the records.
+
+        Returns:
+            Time on the timeline at which the clock first showed the earliest such time; None where there is none.
+        """
+        ends = self.pc_ms(np.nextafter(self.steps_at_ms, -np.inf)).tolist()
+        for at_ms, end_ms, by_ms in zip(self.timeline_ms(self.steps_at_ms).tolist(), ends, self.steps_ms.tolist(), strict=True):
+            margin_ms = STEP_MARGIN_MS
+            if by_ms < 0 and any(end_ms + by_ms - margin_ms <= record <= end_ms + margin_ms for record in records_ms):
+                return float(at_ms + by_ms - margin_ms)
+        return None
 
     @property
     def steps_ms(self) -> NDArray[np.float64]:

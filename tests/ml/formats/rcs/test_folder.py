@@ -74,11 +74,12 @@ def test_disabled_programs_and_therapy_off_deliver_nothing(rcs, pack):
     np.testing.assert_allclose(amplitude.values, [2] * 5 + [0] * 5, atol=1e-3)
 
 
-def test_a_stimulation_log_alone_is_decoded_with_its_program_assumed_and_said(rcs, pack):
+def test_a_stimulation_log_alone_is_decoded_with_its_amplitude_unknown(rcs, pack):
     decoded = decode(pack(session(rcs, DeviceSettings=None)))
     assert trace(one(decoded), "amplitude").details["assumed_program"]
     flagged = [text for r in decoded.reports for text in r.flagged]
-    assert any("program 0 is taken" in text for text in flagged)
+    assert any("no settings say which programs are enabled" in text for text in flagged)
+    assert not trace(one(decoded), "amplitude").valid.any()
     assert any("not in the upload" in text for text in flagged)
 
 
