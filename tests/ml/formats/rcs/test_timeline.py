@@ -206,8 +206,11 @@ def test_a_recording_says_how_its_clocks_ran_and_repairs_nothing_that_is_lost(rc
     assert [e.t_s for e in recording.events if "2.5 mA" in e.label] == [pytest.approx(25.0, abs=0.01)]
     about = next(r for r in decoded.reports if r.name == "RawDataTD.json")
     assert about.repaired == []
-    assert about.flagged == ["0.5 % of the signal is missing (0.2 s; 2 packets lost); 2 stretches without a gap"]
-    assert "the computer's clock was set by +10.0 s after 20.3 s; times follow the implant's ticks" in about.understood
+    assert about.flagged == [
+        "0.5 % of the signal is missing (0.2 s; 2 packets lost); 2 stretches without a gap",
+        "the computer's clock was set by +10.0 s after 20.3 s; times follow the implant's ticks. The start is by one of its two times, and "
+        "may be off by that",
+    ]
 
 
 def test_a_packet_that_only_looks_like_the_one_before_counts(rcs, pack):
