@@ -1,11 +1,10 @@
-"""Speed and memory of `app.ingest`: CPU seconds, one thread.
+"""Speed and memory of `app.ingest`: CPU seconds, one thread, peers timed in turn within the same run.
 
     python benchmarks/ingest.py [--megabytes N] [--repeats N] [--quick]
 
-`betaloop_s`: RawDataTD.json from disk to float arrays. `peak_rss_mb`: highest memory of a fresh process that decodes a session with a
-time-domain file of so many megabytes whole, traces and spectra included. `lfp_redact_s`, `lfp_decode_s`: CPU of cleaning a table of raw
-LFP, and of decoding it.
-
+`decode_vs_orjson`: RawDataTD.json from disk to float arrays, against `orjson.loads` of the same file with one array per channel (orjson is
+in the `bench` extra). `peak_rss_mb`: highest memory of a fresh process that decodes a session with a time-domain file of so many megabytes
+whole, traces and spectra included. `lfp_redact_s`, `lfp_decode_s`: CPU of cleaning a table of raw LFP, and of decoding it.
 `upload_quiet_s`, `upload_training_s`: wall seconds from sending a device recording until its decoded session can be read over the API. It
 is the montage of the test recordings, else a synthetic one. Each is the median over fresh participants, on a service of its own, without
 and with a training job on its worker. `upload_cpu_s`: CPU seconds of the web process and of the children that read its files, per upload.
@@ -14,9 +13,11 @@ and with a training job on its worker. `upload_cpu_s`: CPU seconds of the web pr
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import random
+import socket
 import statistics
 import subprocess
 import sys
@@ -24,14 +25,13 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import httpx2 as httpx
 import numpy as np
 import psutil
-from installed.installation import STARTED_S, Installation, installation
-from installed.writers import client as caller
 from support.results import run_benchmark
 
 from ml.formats import DecodeOptions, decode
@@ -98,11 +98,22 @@ def _packets(bodies: list[str]) -> Iterator[str]:
         yield f'{{"Header":{json.dumps(header, separators=(",", ":"))},{times},{bodies[i % TEMPLATES]}'
 
 
-def read_samples(path: Path) -> list[Any]:
+def ours(path: Path) -> list[Any]:
     """Read the samples per channel by the product's reader."""
     with path.open("rb") as stream:
         data = read_time_domain(batch for batch, _ in read_elements(stream, JsonNotes(), scan))
     return [x for x in data.samples if x.size]
+
+
+def peer(path: Path) -> list[Any]:
+    """Read the samples per channel by orjson, which makes a Python object of every number, and numpy."""
+    import orjson
+
+    channels: dict[int, list[Any]] = {}
+    for packet in orjson.loads(path.read_bytes())[0]["TimeDomainData"]:
+        for channel in packet["ChannelSamples"]:
+            channels.setdefault(channel["Key"], []).append(np.array(channel["Value"], dtype=np.float64))
+    return [np.concatenate(pieces) for _, pieces in sorted(channels.items())]
 
 
 def cpu_s(work: Callable[[], Any]) -> float:
@@ -127,16 +138,32 @@ def whole_decode_peak_mb(folder: Path) -> float:
     return float(done.stdout)
 
 
-def decode_figures(options: argparse.Namespace, folder: Path) -> dict[str, float]:
+def decode_figures(options: argparse.Namespace, folder: Path) -> tuple[dict[str, float], dict[str, float]]:
     """Measure decoding; print each figure as it comes."""
     path = folder / "RawDataTD.json"
     time_domain_file(path, options.megabytes)
     size_mb = path.stat().st_size / 1e6
     figures: dict[str, float] = {"megabytes": size_mb}
-    read_samples(path)  # compile
-    figures["betaloop_s"] = statistics.median(cpu_s(lambda: read_samples(path)) for _ in range(options.repeats))
-    print(f"{'to decode':<28}{'CPU s':>8}{'MB/s':>8}")
-    print(f"{'RawDataTD.json to arrays':<28}{figures['betaloop_s']:>8.3f}{size_mb / figures['betaloop_s']:>8.0f}")
+    ratios: dict[str, float] = {}
+    works: dict[str, Callable[[], Any]] = {"betaloop": lambda: ours(path)}
+    if importlib.util.find_spec("orjson") is not None:
+        works["orjson"] = lambda: peer(path)
+        if not all(np.array_equal(a, b) for a, b in zip(ours(path), peer(path), strict=True)):
+            raise SystemExit("betaloop and orjson read different numbers")
+    else:
+        print("orjson is not installed (the `bench` extra): no decode_vs_orjson")
+    ours(path)
+    times = {name: [0.0] * options.repeats for name in works}
+    for i in range(options.repeats):
+        for name, work in works.items():
+            times[name][i] = cpu_s(work)
+    print(f"{'RawDataTD.json to arrays':<28}{'CPU s':>8}{'MB/s':>8}")
+    for name, values in times.items():
+        figures[f"{name}_s"] = statistics.median(values)
+        print(f"{name:<28}{figures[f'{name}_s']:>8.3f}{size_mb / figures[f'{name}_s']:>8.0f}")
+    if "orjson" in times:
+        ratios["decode_vs_orjson"] = figures["orjson_s"] / figures["betaloop_s"]
+        print(f"decode_vs_orjson {ratios['decode_vs_orjson']:.2f}")
 
     zipped, clean = folder / "session.zip", folder / "clean.zip"
     with zipfile.ZipFile(zipped, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -147,7 +174,7 @@ def decode_figures(options: argparse.Namespace, folder: Path) -> dict[str, float
     ):
         figures[name.replace(" ", "_") + "_s"] = seconds = cpu_s(work)
         print(f"{name:<28}{seconds:>8.3f}{size_mb / seconds:>8.0f}")
-    return figures
+    return figures, ratios
 
 
 def table_figures(options: argparse.Namespace, folder: Path) -> dict[str, float]:
@@ -184,13 +211,39 @@ def device_recording() -> tuple[str, bytes]:
     return "synthetic.zip", rcs_session_zip(made, started_ms=START_MS)
 
 
-def client_of(installed: Installation) -> httpx.Client:
-    """Start a web service and a worker; return a client of the REST interface."""
-    token = installed.add_people({"bench@clinic.example": "admin"})["bench@clinic.example"]
-    for name in (*installed.webs, *installed.workers):
-        installed.start(name)
-    installed.wait_until("the first answer of the web service", installed.webs_are_ready, STARTED_S)
-    return caller(installed, token, 120)
+@contextmanager
+def service(folder: Path) -> Iterator[tuple[httpx.Client, int]]:
+    """Run a web service and a worker with a database of their own; yield a client, and the web process."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    environment = os.environ | {"BETALOOP_DATA_DIR": str(folder), "OMP_NUM_THREADS": "1"}
+    environment.pop("BETALOOP_DATABASE_URL", None)
+
+    def command(*arguments: str, **named: Any) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "app.cli", *arguments], env=environment, check=True, capture_output=True, text=True, **named
+        )
+
+    command("migrate")
+    command("user", "add", "bench@clinic.example", "--role", "admin", "--password-file", "-", input="a password for benchmarks\n")
+    token = command("token", "create", "bench@clinic.example", "--name", "bench").stdout.strip()
+    log = (folder / "service.log").open("wb")
+    children = [
+        subprocess.Popen([sys.executable, "-m", "app.cli", *arguments], env=environment, stdout=log, stderr=log)
+        for arguments in (["serve", "--port", str(port)], ["worker", "--slots", "2"])
+    ]
+    headers = {"Authorization": f"Bearer {token}"}
+    try:
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}/api/v1", headers=headers, timeout=120) as client:
+            _wait_until(lambda: _answers(client), 90)
+            yield client, children[0].pid
+    finally:
+        for child in reversed(children):
+            child.terminate()
+        for child in children:
+            child.wait(timeout=30)
+        log.close()
 
 
 def _process_cpu_s(pid: int) -> float:
@@ -198,6 +251,21 @@ def _process_cpu_s(pid: int) -> float:
     at = psutil.Process(pid)
     times = [p.cpu_times() for p in (at, *at.children(recursive=True))]
     return sum(t.user + t.system for t in times) + sum(t.children_user + t.children_system for t in times[1:])
+
+
+def _answers(client: httpx.Client) -> bool:
+    try:
+        return client.get("/participants").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def _wait_until(ready: Callable[[], bool], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while not ready():
+        if time.monotonic() > deadline:
+            raise SystemExit("the service did not get ready in time")
+        time.sleep(0.2)
 
 
 def _enrol(client: httpx.Client, code: str) -> None:
@@ -220,7 +288,7 @@ def upload_s(client: httpx.Client, code: str, name: str, content: bytes) -> floa
     return time.perf_counter() - start
 
 
-def _start_training(installed: Installation, client: httpx.Client) -> str:
+def _start_training(client: httpx.Client) -> str:
     """Start a training job that outlasts the uploads; return its id once it computes."""
     _enrol(client, "T0")
     for i in range(6):
@@ -234,22 +302,20 @@ def _start_training(installed: Installation, client: httpx.Client) -> str:
     if job.status_code >= 400:
         raise SystemExit(f"the training job was refused: {job.text}")
     number = str(job.json()["id"])
-    computes = lambda: any(s["status"] == "running" for s in client.get(f"/jobs/{number}").json()["steps"])  # noqa: E731
-    installed.wait_until("the training to begin", computes, STARTED_S)
+    _wait_until(lambda: any(s["status"] == "running" for s in client.get(f"/jobs/{number}").json()["steps"]), 90)
     time.sleep(5)  # the compute children are past their imports
     return number
 
 
-def latency_figures(options: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
+def latency_figures(options: argparse.Namespace, folder: Path) -> tuple[dict[str, float], dict[str, float]]:
     """Measure figures and ratios of uploads; print them."""
     name, content = device_recording()
-    with installation() as installed, client_of(installed) as client:
-        web = installed.processes["web 1"].pid
+    with service(folder) as (client, web):
         upload_s(client, "W0", name, content)
         before = _process_cpu_s(web)
         quiet = [upload_s(client, f"Q{i}", name, content) for i in range(options.uploads)]
         cpu = (_process_cpu_s(web) - before) / options.uploads
-        job = _start_training(installed, client)
+        job = _start_training(client)
         busy = [upload_s(client, f"B{i}", name, content) for i in range(options.uploads)]
         running = client.get(f"/jobs/{job}").json()["status"]
         client.post(f"/jobs/{job}/cancel").raise_for_status()
@@ -271,7 +337,7 @@ def main() -> None:
     parser.add_argument("--megabytes", type=float, default=50.0, help="size of the file that is timed")
     parser.add_argument("--whole-megabytes", type=float, default=WHOLE_MB, help="size of the file whose decoding is weighed")
     parser.add_argument("--lfp-rows", type=int, default=1_000_000, help="rows of the table of raw LFP")
-    parser.add_argument("--repeats", type=int, default=7, help="timings of a file")
+    parser.add_argument("--repeats", type=int, default=7, help="timings per peer")
     parser.add_argument("--uploads", type=int, default=7, help="uploads timed on a quiet and on a training service")
     parser.add_argument("--only", choices=("decode", "upload"), help="one half alone")
     parser.add_argument("--quick", action="store_true", help="a small file and few repeats, for a first look")
@@ -280,14 +346,14 @@ def main() -> None:
         options.megabytes, options.repeats, options.uploads, options.lfp_rows = 10.0, 3, 3, 100_000
     figures: dict[str, float] = {}
     ratios: dict[str, float] = {}
-    with tempfile.TemporaryDirectory() as timed, tempfile.TemporaryDirectory() as weighed:
+    with tempfile.TemporaryDirectory() as timed, tempfile.TemporaryDirectory() as weighed, tempfile.TemporaryDirectory() as data:
         if options.only != "upload":
-            figures = decode_figures(options, Path(timed))
+            figures, ratios = decode_figures(options, Path(timed))
             figures |= table_figures(options, Path(weighed)) | memory_figures(options, Path(weighed))
         if options.only != "decode":
-            more, shares = latency_figures(options)
+            more, shares = latency_figures(options, Path(data))
             figures, ratios = figures | more, ratios | shares
-    print(json.dumps({"name": "ingest", "figures": figures, "ratios": ratios, "baseline": "a quiet service"}))
+    print(json.dumps({"name": "ingest", "figures": figures, "ratios": ratios, "baseline": "orjson.loads and numpy"}))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Memory of an idle demo by process.
+"""Memory of an idle demo by process, and of another checkout.
 
-    python benchmarks/memory.py [--quick]
+    python benchmarks/memory.py [--quick] [--than /path/to/checkout]
 
 A real `betaloop demo` in a new folder: its study is uploaded, its rankings are made, and when nothing has run for IDLE_S its processes are
 measured. `--quick` cancels the rankings once the first training has begun, which loads what a worker ever loads for one.
@@ -59,8 +59,14 @@ class Demo:
     process: psutil.Popen
     folder: Path
     base: str
+    checkout: Path
 
-    def said(self) -> str:
+    def command(self, *arguments: str) -> list[str]:
+        """Name a command of betaloop."""
+        own = self.checkout / ".venv" / "bin" / "python"
+        return [str(own) if own.exists() else sys.executable, "-m", "app.cli", *arguments]
+
+    def output(self) -> str:
         """Return what it printed so far."""
         return (self.folder / "said.txt").read_text(errors="replace")
 
@@ -71,19 +77,14 @@ class Demo:
         return False
 
 
-def command(*arguments: str) -> list[str]:
-    """Name a command of betaloop."""
-    return [sys.executable, "-m", "app.cli", *arguments]
-
-
-def environment(folder: Path) -> dict[str, str]:
+def environment(folder: Path, checkout: Path) -> dict[str, str]:
     """Return the environment of a demo: its data folder, and of the caller's settings those of PASSED_ON alone."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("BETALOOP_") or k in PASSED_ON}
-    return kept | {"BETALOOP_DATA_DIR": str(folder), "PYTHONPATH": str(ROOT)}
+    return kept | {"BETALOOP_DATA_DIR": str(folder), "PYTHONPATH": str(checkout)}
 
 
 @contextmanager
-def demo() -> Iterator[Demo]:
+def demo(checkout: Path) -> Iterator[Demo]:
     """Run a demo; stop it at the end and remove its data."""
     with tempfile.TemporaryDirectory(prefix="betaloop-memory-", dir="/tmp", ignore_cleanup_errors=True) as name:
         folder = Path(name)
@@ -91,10 +92,13 @@ def demo() -> Iterator[Demo]:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
+        one = Demo(None, folder, f"http://127.0.0.1:{port}", checkout)
         with (folder / "said.txt").open("w") as out:
-            process = psutil.Popen(command("demo", "--port", str(port)), cwd=ROOT, env=environment(folder), stdout=out, stderr=out)
+            process = psutil.Popen(
+                one.command("demo", "--port", str(port)), cwd=checkout, env=environment(folder, checkout), stdout=out, stderr=out
+            )
         try:
-            yield Demo(process, folder, f"http://127.0.0.1:{port}")
+            yield Demo(process, folder, one.base, checkout)
         finally:
             process.send_signal(signal.SIGTERM)
             process.wait(120)
@@ -102,18 +106,18 @@ def demo() -> Iterator[Demo]:
 
 
 def wait_for(one: Demo, what: str, condition: object, seconds: float) -> None:
-    """Wait until a condition holds. Raises RuntimeError where the demo ends or it takes too long; the message has what the demo said."""
+    """Wait until a condition holds. Raises RuntimeError where the demo ends or it takes too long; the message has what the demo printed."""
     deadline = time.monotonic() + seconds
     while not condition():  # type: ignore[operator]
         if one.process.poll() is not None or time.monotonic() > deadline:
-            raise RuntimeError(f"{what} did not come about:\n{one.said()[-3000:]}")
+            raise RuntimeError(f"{what} did not come about:\n{one.output()[-3000:]}")
         time.sleep(1.0)
 
 
 def finish_jobs(one: Demo, cancel: bool) -> None:
     """Wait until every ranking has ended; or cancel them once a training of the first reports progress."""
     done = subprocess.run(
-        command("token", "create", ADMIN, "--name", "memory"), cwd=ROOT, env=environment(one.folder),
+        one.command("token", "create", ADMIN, "--name", "memory"), cwd=one.checkout, env=environment(one.folder, one.checkout),
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     token = done.stdout.split()[-1]
@@ -134,7 +138,7 @@ def finish_jobs(one: Demo, cancel: bool) -> None:
             left = [number for number, state in states.items() if state not in ("succeeded", "failed", "cancelled")]
             for number in left if cancel else ():
                 client.post(f"/jobs/{number}/cancel")
-            return READY in one.said() and not left
+            return READY in one.output() and not left
 
         if cancel:
             wait_for(one, "the first training", training, STARTED_S)
@@ -166,19 +170,19 @@ def measure(one: Demo) -> list[Used]:
     return sorted([*own, together], key=lambda used: -used.pss_mb)
 
 
-def measure_demo(quick: bool) -> list[Used]:
+def measure_demo(checkout: Path, quick: bool) -> list[Used]:
     """Start a demo, let it work, and measure it when it is idle."""
-    with demo() as one:
+    with demo(checkout) as one:
         wait_for(one, "the study", one.loaded, STARTED_S)
         finish_jobs(one, quick)
         time.sleep(IDLE_S)
         return measure(one)
 
 
-def show(found: list[Used]) -> float:
+def show(title: str, found: list[Used]) -> float:
     """Print the table; return the sum of PSS, MB."""
     total, private = sum(used.pss_mb for used in found), sum(used.private_mb for used in found)
-    print(f"{'process':<28}{'PSS MB':>9}{'private MB':>12}")
+    print(f"{title}\n{'process':<28}{'PSS MB':>9}{'private MB':>12}")
     for used in [*found, Used("together", total, private)]:
         print(f"{used.name:<28}{used.pss_mb:>9.0f}{used.private_mb:>12.0f}")
     return total
@@ -187,9 +191,14 @@ def show(found: list[Used]) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="cancel the rankings once the first training has begun")
+    parser.add_argument("--than", type=Path, help="another checkout, measured in the same way before this one")
     options = parser.parse_args()
     figures: dict[str, float | bool] = {}
-    figures["total_mb"] = total = round(show(measure_demo(options.quick)))
+    if options.than:
+        figures["than_mb"] = round(show(str(options.than), measure_demo(options.than.resolve(), options.quick)))
+    figures["total_mb"] = total = round(show("this checkout", measure_demo(ROOT, options.quick)))
+    if options.than:
+        figures["ratio"] = round(total / figures["than_mb"], 3)
     print(json.dumps(figures | {"meets_aim": total <= MOST_MB}))
 
 

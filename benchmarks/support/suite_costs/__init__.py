@@ -1,0 +1,1 @@
+"""Plugins that `benchmarks/suite.py` gives to pytest."""
