@@ -276,9 +276,11 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=2000, help="files in all, half of each device")
     parser.add_argument("--seed", type=int, default=0, help="first of the seeds")
     parser.add_argument("--faults", type=int, default=20, help="how many faults are listed")
+    parser.add_argument("--quick", action="store_true", help="40 files alone")
     args = parser.parse_args()
+    sessions = 40 if args.quick else args.sessions
     for kind in ("rcs", "percept"):
-        score = run(kind, range(args.seed, args.seed + args.sessions // 2))
+        score = run(kind, range(args.seed, args.seed + sessions // 2))
         share = 100.0 * score.usable / max(1, score.knowable)
         sys.stdout.write(
             f"{kind}: {score.sessions} recordings, {score.steps} steps; silently wrong {score.wrong} steps and {score.shifted} starts, "
@@ -290,4 +292,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from support.results import run_benchmark
+
+    run_benchmark(main)
