@@ -18,8 +18,7 @@ from app.accounts import commands as accounts
 from app.accounts.permissions import SYSTEM
 from app.evaluation.ranking import commands as ranking
 from app.ingest import commands as ingest
-from app.overview.package import commands as package
-from app.overview.trail import commands as trail
+from app.overview import commands as package
 from app.pipeline.next_generation import commands as next_generation
 from app.platform import logs
 from app.platform.audit.commands import app as audit_app
@@ -52,8 +51,8 @@ simulation.register(study_app)
 ingest.register(app)
 ranking.register(app)
 next_generation.register(app)
-package.register(app)
-trail.register(audit_app)
+package.register_export(app)
+package.register_trail(audit_app)
 app.add_typer(audit_app, name="audit")
 app.add_typer(upkeep_app)
 

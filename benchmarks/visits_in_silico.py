@@ -9,7 +9,7 @@ energy? A visit is the day that the service plans (`app.planning.protocol.schedu
 minutes, a cDBS session between any two of them: of 5 minutes, the protocol's shortest, six against five, of 10 minutes, the service's
 default, four against three.
 Studies whose first seeds lie apart by the number of seeds have nothing in common. The verdict is the
-service's own (`app.analysis.primary.verdict`); the truth is a large sample over other days at the same hours. Beside it, `bound` is what
+service's own (`app.analysis.primary_verdict`); the truth is a large sample over other days at the same hours. Beside it, `bound` is what
 would be concluded from the same averages by somebody who knows the standard deviation of every outcome: no test of these averages at
 these levels can conclude much more. The participants are synthetic and not fitted to patients. CPU seconds of one thread.
 """
@@ -29,8 +29,8 @@ import numpy as np
 from scipy.special import ndtr
 from support.results import emit, run_benchmark
 
-from app.analysis.evidence.facts import Facts
-from app.analysis.primary.verdict import LockedMargins, verdicts
+from app.analysis.facts import Facts
+from app.analysis.primary_verdict import LockedMargins, verdicts
 from app.planning.protocol.schedule import MOST_REPEATS, SESSION_MINUTES, Candidate, Rules, most_policies, schedule
 from app.study.blinding import Arm
 from app.tables.sessions import Controller

@@ -68,12 +68,12 @@ PROMISES = [
          f"{CHAIN}::test_what_leaves_and_who_looked_is_in_the_trail"),
     ),
     *_of(
-        "overview/package/export",
+        "overview/package",
         ("exports are in the trail", 'record(db, "export"', '(lambda *_: None)(db, "export"',
          f"{CHAIN}::test_what_leaves_and_who_looked_is_in_the_trail"),
     ),
     *_of(
-        "overview/trail/scope/repository",
+        "overview/trail_scope",
         ("nobody reads the trail of another study", "select(Site.id).where(or_(false(), *allowed))", "select(Site.id)",
          f"{SCOPE}::test_every_row_of_ones_own_study_is_shown_and_none_of_another"),
     ),

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import csv
+import io
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 
 from app.platform.web.charts import side_by_side
+from app.platform.web.csv_files import safe_cell
 from app.platform.web.numbers import stated
 
 COLOURS = {"cdbs": "#0067a8", "rl": "#c24e00", "distilled": "#9b3f86", "no_dbs": "#5d6770", "random": "#00795a", "other": "#7a6200"}
@@ -111,3 +114,15 @@ def _quantile(ordered: Sequence[float], q: float) -> float:
     at = q * (len(ordered) - 1)
     i = int(at)
     return ordered[i] if i + 1 == len(ordered) else ordered[i] + (at - i) * (ordered[i + 1] - ordered[i])
+
+
+# Tables of the analyses as CSV.
+
+
+def csv_of(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A CSV with its header; what is not there is empty."""
+    sink = io.StringIO()
+    out = csv.writer(sink, lineterminator="\n")
+    out.writerow(columns)
+    out.writerows([safe_cell(cell) for cell in row] for row in rows)
+    return sink.getvalue()

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.analysis import wording
-from app.analysis.evidence.service import evidence
-from app.analysis.primary.service import policy_names, policy_verdicts_of, verdicts_of
-from app.analysis.primary.verdict import VerdictResult
+from app.analysis import primary_words
+from app.analysis.evidence import evidence
+from app.analysis.primary import policy_names, policy_verdicts_of, verdicts_of
+from app.analysis.primary_verdict import VerdictResult
 from app.evaluation import repository as evaluations
 from app.evaluation import verdict_wording
 from app.evaluation.ranking.decisions import Decided, findings_of
@@ -48,14 +48,14 @@ class Standing:
     def _measurement(self) -> str:
         if self.measured is None:
             return "Not tested."
-        return f"Measured, exploratory: {wording.verdict(self.measured, self.name)}"
+        return f"Measured, exploratory: {primary_words.verdict(self.measured, self.name)}"
 
     def _prediction(self) -> str:
         if self.predicted is None:
             return "Not ranked."
         why = verdict_wording.plainly(self.predicted.hazards or self.predicted.reasons)
         code = verdict_wording.STANDING_NAMES[self.predicted.standing]
-        settled = self.measured is not None and self.measured.assessment is not None and not wording.is_open(self.measured)
+        settled = self.measured is not None and self.measured.assessment is not None and not primary_words.is_open(self.measured)
         return f"Predicted: {code}{f' ({why})' if why else ''}.{' The measurement counts before the prediction.' if settled else ''}"
 
 
@@ -91,5 +91,5 @@ def outlook(db: Session, participant: Participant, caller: Caller) -> list[str]:
     """
     found: dict[str, str] = {}
     for result in verdicts_of(db, participant, caller):
-        found.setdefault(result.controller.value, wording.outlook(result, PLANNED_SESSIONS))
+        found.setdefault(result.controller.value, primary_words.outlook(result, PLANNED_SESSIONS))
     return list(found.values())

@@ -3,16 +3,106 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 from sqlalchemy.orm import Session
 
 from app.overview import repository
-from app.overview.tasks import Actor, NextStep, Task
-from app.overview.visit_progress import VisitProgress, visit_progress
+from app.planning.slots import repository as slots
+from app.platform.web.charts import counted
 from app.tables.jobs import Job
 from app.tables.participants import Participant
+
+# What somebody may have to do for a participant, who may do it, and where: values; `state` says what is due, `wording` the sentences.
+
+
+class Actor(StrEnum):
+    """Whose turn it is."""
+
+    CLINICIAN = "clinician"
+    COORDINATOR = "coordinator"
+    ENGINEER = "engineer"
+    SERVICE = "service"
+
+
+class Task(StrEnum):
+    """What is to be done, in the order in which one thing waits for the other."""
+
+    ADD_VISIT = "add_visit"
+    STATE_AMPLITUDE = "state_amplitude"
+    UPLOAD = "upload"
+    SEND_LOGS = "send_logs"
+    CONFIRM = "confirm"
+    ENTER_QOCS = "enter_qocs"
+    SET_THRESHOLD = "set_threshold"
+    WAIT_FOR_RANKING = "wait_for_ranking"
+    RANK = "rank"
+    OPEN_KEY = "open_key"
+    RANK_AGAIN = "rank_again"
+    TRAIN_NEXT = "train_next"
+    DRAFT_PLAN = "draft_plan"
+    APPROVE_PLAN = "approve_plan"
+    LOOK_AT_FAILED = "look_at_failed"
+
+
+@dataclass(frozen=True)
+class NextStep:
+    """One thing to do.
+
+    Attributes:
+        task: what. actor: whose turn it is. url: where it is done. count: of sessions or jobs that it is about; 0 where it counts nothing.
+        blocks_visit: whether the next visit waits for it.
+        urgent: whether the participant is marked for it; what is merely next is not.
+    """
+
+    task: Task
+    actor: Actor
+    url: str
+    count: int = 0
+    blocks_visit: bool = True
+    urgent: bool = True
+
+
+# How far the visits with a signed plan are: sessions planned, held, and those whose logs are missing. What is to be done: `state`.
+
+
+@dataclass(frozen=True)
+class VisitProgress:
+    """One visit with a signed plan.
+
+    Attributes:
+        planned: sessions of the plan. held: those that a confirmed session fills.
+        logs_missing: those that none fills although the day is past; 0 before it, of a visit without a date, and of a
+            locked one, which takes no data any more.
+        tested: those held that ran a policy, which nobody is told while the key is sealed (0). sealed: whether it is.
+    """
+
+    visit_id: int
+    number: int
+    date: dt.date | None
+    planned: int
+    held: int
+    logs_missing: int
+    tested: int
+    sealed: bool = False
+
+
+def visit_progress(db: Session, participant_ids: Sequence[int], today: dt.date) -> dict[int, list[VisitProgress]]:
+    """By participant: its visits with a signed plan, by number; participants without one have none.
+
+    Plans of versions that kept no limits have no slots to fill and are left out.
+    """
+    found: dict[int, list[VisitProgress]] = {i: [] for i in participant_ids}
+    for row in slots.slots_filled(db, participant_ids):
+        past = row.date is not None and row.date < today
+        missing = row.slots - row.filled if past and not row.locked else 0
+        tested = 0 if row.sealed else row.tested
+        progress = VisitProgress(row.visit_id, row.number, row.date, row.slots, row.filled, missing, tested, row.sealed)
+        found[row.participant_id].append(progress)
+    return found
+
 
 PHASES = (("I", "Collect"), ("II", "Learn"), ("III", "Evaluate"), ("IV", "Plan"))
 
@@ -163,3 +253,48 @@ def _results(db: Session, ids: list[int], found: dict[int, State]) -> None:
     for job in repository.live_ranking_jobs(db, ids):
         if job.participant_id is not None and found[job.participant_id].evaluated_at is None:
             found[job.participant_id].ranking_job = job
+
+
+# Sentences of the pages that join phases.
+
+ACTORS = {
+    Actor.CLINICIAN: "Clinician",
+    Actor.COORDINATOR: "Coordinator",
+    Actor.ENGINEER: "Engineer",
+    Actor.SERVICE: "Nobody: the service works",
+}
+
+_TASKS: dict[Task, str | Callable[[int], str]] = {
+    Task.ADD_VISIT: "No visit yet",
+    Task.STATE_AMPLITUDE: "No cDBS amplitude in the settings",
+    Task.UPLOAD: "No session yet",
+    Task.SEND_LOGS: lambda n: f"{counted(n, 'planned session')} without a log",
+    Task.CONFIRM: lambda n: f"{counted(n, 'session')} to confirm",
+    Task.ENTER_QOCS: lambda n: f"{counted(n, 'session')} without outcomes",
+    Task.SET_THRESHOLD: "Beta threshold is not set; jobs cannot start",
+    Task.WAIT_FOR_RANKING: "The first ranking is being made",
+    Task.RANK: "No ranking yet: start the pipeline",
+    Task.OPEN_KEY: "A blinded visit is held, and nothing learns from it: open the key of its plan",
+    Task.RANK_AGAIN: "New sessions since the last ranking, which is out of date",
+    Task.TRAIN_NEXT: "New sessions since the last ranking: train the next generation",
+    Task.DRAFT_PLAN: "No plan for this visit yet",
+    Task.APPROVE_PLAN: "A visit plan waits for approval",
+    Task.LOOK_AT_FAILED: lambda n: f"{counted(n, 'job')} failed in the last 7 days",
+}
+
+
+def what(step: NextStep) -> str:
+    """What is to be done."""
+    said = _TASKS[step.task]
+    return said if isinstance(said, str) else said(step.count)
+
+
+def progress(visit: VisitProgress) -> str:
+    """How far a visit with a signed plan is."""
+    missing = f", {counted(visit.logs_missing, 'log')} missing" if visit.logs_missing else ""
+    return f"Visit {visit.number}: {visit.held} of {counted(visit.planned, 'planned session')} held{missing}"
+
+
+def in_days(days: int) -> str:
+    """How far a day lies ahead."""
+    return {0: "today", 1: "tomorrow"}.get(days, f"in {days} days")

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from app.analysis.evidence.facts import Facts
-from app.analysis.evidence.service import Evidence
+from app.analysis.evidence import Evidence
+from app.analysis.facts import Facts
 from app.platform.web.charts import ACCENT, GRID, MUTED, SYMBOLS, TEXT, WARN, Cell, Chart, Link, colour, counted, figure, marker
 from app.platform.web.numbers import hover
 from app.study.blinding import CONTROLLER_NAMES

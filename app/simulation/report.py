@@ -9,7 +9,7 @@ from rich.table import Table
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.analysis.trial_time.service import TrialTime, trial_time
+from app.analysis.pooled import TrialTime, trial_time
 from app.study import repository as study
 
 

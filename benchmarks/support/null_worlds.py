@@ -1,7 +1,7 @@
 """Worlds of the null studies, and how a study is drawn from one: who was tested when, and what a metric then shows; and studies of
 controllers that lose nothing, or exactly what is accepted of one outcome.
 
-Steps, bounds, margins, scales and values of failures are those of the service (`app.analysis.primary.verdict.judged_outcome`).
+Steps, bounds, margins, scales and values of failures are those of the service (`app.analysis.primary_verdict.judged_outcome`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import expit
 
-from app.analysis.evidence import measurements
-from app.analysis.primary.verdict import judged_outcome
+from app.analysis import facts
+from app.analysis.primary_verdict import judged_outcome
 from ml.outcomes import BY_KEY, KEYS
 from ml.qoc import Margins
 from ml.statistics.noninferiority import LEAST_VISITS, Inconclusive, NonInferiorAndSaving, assess
@@ -23,8 +23,8 @@ from ml.statistics.within_visits.contrasts import Measurements
 
 from .results import emit
 
-RESOLUTION = measurements.RESOLUTION
-BOUNDED = tuple(sorted(measurements.BOUNDED))
+RESOLUTION = facts.RESOLUTION
+BOUNDED = tuple(sorted(facts.BOUNDED))
 MINUTES = 10
 GRASP_HZ = 2.3
 METRICS = ("grasp", "beta", "rating", "tremor", "energy")

@@ -11,7 +11,7 @@ from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 
 from app.accounts import service as accounts
-from app.analysis.energy.schemas import ImplantIn
+from app.analysis.energy import ImplantIn
 from app.learning.policies.baselines import constant_onnx
 from app.main import DESCRIPTION
 from app.platform.database import transaction

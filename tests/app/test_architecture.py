@@ -144,7 +144,8 @@ def is_query(call: tuple[bool, str]) -> bool:
 
 
 RULES_WITH_QUERIES = """
-accounts/sign_on accounts/studies
+accounts/sign_on accounts/studies analysis/evaluations analysis/evidence analysis/pooled analysis/primary overview/trail_rows
+overview/trail_scope
 """.split()  # noqa: SIM905
 """Small features that keep their rules and their queries in one file."""
 LOCKS = {"app/ingest/uploads/in_progress.py", "app/simulation/run.py"}
@@ -206,7 +207,7 @@ def test_the_session_commits_and_nothing_else_but_what_must_in_the_middle() -> N
         "app/accounts/sign_on.py",  # a refusal stands in the trail whatever becomes of the request
         # a failed sign-in counts whatever becomes of the request; so does when a session or token was last used
         "app/accounts/service.py",
-        "app/overview/trail/commands.py",  # an export is in the trail before its first row is written, whatever becomes of the rest
+        "app/overview/commands.py",  # an export is in the trail before its first row is written, whatever becomes of the rest
         # the simulated study is a command in parts: it commits what a clinic would have committed
         "app/simulation/loop.py",
         "app/simulation/sessions.py",
@@ -217,9 +218,11 @@ def test_the_session_commits_and_nothing_else_but_what_must_in_the_middle() -> N
 
 def test_no_folder_outgrows_a_reader() -> None:
     allowed = {"benchmarks", "changes", "docs/results"}  # a file is one command, one change, one run
+    flat = {"app/analysis", "app/overview"}  # features of a phase are files, two of most
     folders = Counter(str(path.parent) for path in repository_files())
     assert {"app/templates", "benchmarks", "docs", "static", "tests/data"} <= set(folders)
-    assert {folder: n for folder, n in folders.items() if n > 15 and folder not in allowed} == {}
+    most = {folder: 30 if folder in flat else 15 for folder in folders}
+    assert {folder: n for folder, n in folders.items() if n > most[folder] and folder not in allowed} == {}
 
 
 def test_every_phase_and_feature_has_the_contract_of_its_layers() -> None:

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from app.accounts.permissions import SYSTEM
 from app.cli import app, main
-from app.overview.package.export import export_participant
+from app.overview.package import export_participant
 from app.platform.database import owner_url, transaction
 from app.study.repository import participant_by_code
 from app.tables.participants import Hemisphere

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 from fastapi.testclient import TestClient
 
-from app.overview.overview import SOON
+from app.overview.overview_web import SOON
 from tests.app.ingest.safety.planted import rcs_zip
 from tests.browser import tour
 from tests.browser.conftest import Watched

@@ -29,28 +29,28 @@ TRAIL: list[Promise] = [
          f"{LOOKS}::test_files_that_are_sent_for_leave_a_row_too"),
     ),
     *of(
-        "overview/trail/changes",
+        "overview/trail_changes",
         ("every table of the trail is told in a sentence", '    "device": lambda', '    "devices": lambda', SAID),
     ),
     *of(
-        "overview/trail/commands",
+        "overview/commands",
         ("an export that fails halfway is in the trail", "db.commit()  # rows that were written", "db.flush()  # rows that were written",
          f"{FOUND}::test_an_export_that_fails_halfway_is_a_row_of_the_trail"),
     ),
     *of(
-        "overview/trail/scope/repository",
+        "overview/trail_scope",
         ("a row that outlasts its visit is told to its study", "for side in (first, second))", "for side in (first, first))",
          "tests/app/overview/test_audit_scope.py::test_rows_of_a_visit_that_was_removed_stay_in_the_trail_of_its_study"),
     ),
     *of(
-        "overview/trail/export",
+        "overview/trail",
         ("who took the trail is in the trail", 'record(db, "export", "audit", "trail", {"filters": stated})', "pass",
          f"{FOUND}::test_taking_the_table_is_a_row_of_the_trail_that_keeps_no_words"),
         ("no name that somebody looked for stays in the trail", 'stated["words"] = "stated"', "pass",
          f"{FOUND}::test_taking_the_table_is_a_row_of_the_trail_that_keeps_no_words"),
     ),
     *of(
-        "overview/trail/repository",
+        "overview/trail_rows",
         ("no search tells what is hidden under a sealed key", "values if hidden is None else and_(not_(hidden), values)", "values",
          f"{KEY}::test_no_search_and_no_table_of_the_trail_tells_an_arm_of_a_sealed_plan"),
         ("the trail is found by the kind of act", "    if wanted.action:\n", "    if False:\n",
@@ -65,7 +65,7 @@ TRAIL: list[Promise] = [
          f"{QUERIES}::test_every_clinical_value_is_asked_about_and_keeps_its_old_value"),
     ),
     *of(
-        "overview/trail/acts",
+        "overview/trail",
         ("the trail tells no arm of a sealed plan", "    if sealed:\n        hidden", "    if False:\n        hidden",
          f"{KEY}::test_the_audit_trail_tells_no_arm_of_a_sealed_plan"),
     ),

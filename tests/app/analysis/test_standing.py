@@ -13,7 +13,7 @@ import pytest
 from fastapi.testclient import TestClient
 from pypdf import PdfReader
 
-from app.analysis.primary.verdict import VerdictResult, policy_verdicts
+from app.analysis.primary_verdict import VerdictResult, policy_verdicts
 from app.analysis.standing import Standing
 from app.evaluation.ranking.decisions import Decided
 from app.study.blinding import Arm

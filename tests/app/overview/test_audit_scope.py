@@ -12,9 +12,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
 from app.accounts.permissions import Caller, Grant
-from app.overview.trail.repository import audit_events
-from app.overview.trail.schemas import TrailFilter
-from app.overview.trail.scope.repository import of_reader
+from app.overview.trail_rows import audit_events
+from app.overview.trail_scope import TrailFilter, of_reader
 from app.platform.audit import AUDITED
 from app.tables.accounts import Membership, Role, Site, Study
 from app.tables.audit import AuditEvent

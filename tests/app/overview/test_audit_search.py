@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
 from app import cli
-from app.overview.trail import repository
+from app.overview import trail_rows
 from app.platform.database import new_session
 from tests.conftest import PASSWORD
 
@@ -164,15 +164,15 @@ def test_who_may_read_the_page_may_take_the_table_and_nobody_else(client_as: Cal
 
 def test_a_long_trail_is_sent_in_pieces(client: TestClient, db: Session, used: int, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[int] = []
-    real = repository.batches
+    real = trail_rows.batches
 
     def counted(*given: Any) -> Iterator[Any]:
         for rows in real(*given):
             read.append(len(rows))
             yield rows
 
-    monkeypatch.setattr(repository, "_BATCH", 7)
-    monkeypatch.setattr(repository, "batches", counted)
+    monkeypatch.setattr(trail_rows, "_BATCH", 7)
+    monkeypatch.setattr(trail_rows, "batches", counted)
     rows = table(client)
     numbers = [int(row["number"]) for row in rows]
     assert numbers == sorted(rows_of(db, "true"), reverse=True), "each once, the newest first, the export itself among them"

@@ -9,12 +9,10 @@ import pytest
 from sqlalchemy import true
 
 from app.accounts.permissions import SYSTEM
-from app.overview.trail.acts import lines
-from app.overview.trail.changes import ACCOMPANY, SAID
-from app.overview.trail.names import Names
-from app.overview.trail.repository import batches
-from app.overview.trail.schemas import TrailFilter
-from app.overview.trail.words import headline, sentence
+from app.overview.trail import headline, lines, sentence
+from app.overview.trail_changes import ACCOMPANY, SAID
+from app.overview.trail_rows import Names, batches
+from app.overview.trail_scope import TrailFilter
 from app.platform.audit import AUDITED
 from app.platform.database import new_session
 from app.tables.audit import AuditEvent
@@ -194,7 +192,7 @@ def test_a_change_is_said_in_words(changed: AuditEvent, said: str) -> None:
 
 
 def test_every_table_of_the_trail_has_its_sentence() -> None:
-    assert set(SAID) == set(AUDITED), "say in app/overview/trail/changes.py what a new row of the table means"
+    assert set(SAID) == set(AUDITED), "say in app/overview/trail_changes.py what a new row of the table means"
     assert set(SAID) > ACCOMPANY, "tables whose rows come with an act"
 
 

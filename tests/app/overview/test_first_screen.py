@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from app.overview.first_screen import offers
-from app.overview.state import State
-from app.overview.visit_progress import VisitProgress
+from app.overview.overview_web import offers
+from app.overview.state import State, VisitProgress
 from app.tables.participants import Participant
 
 

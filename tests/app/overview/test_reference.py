@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from fastapi.testclient import TestClient
 
-from app.overview.reference import operations, schemas, type_in_words
+from app.overview.reference_web import operations, schemas, type_in_words
 from app.settings import get_settings
 
 HTML = {"Accept": "text/html"}

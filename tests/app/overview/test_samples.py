@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from fastapi.testclient import TestClient
 
-from app.overview.samples import service
+from app.overview import samples
 from app.platform.database import transaction
 from app.tables.sessions import StudySession
 from ml.formats import DecodeOptions, decode
@@ -98,7 +98,7 @@ def test_a_table_of_steps_has_traces_alone(send: Any, client: TestClient) -> Non
 
 
 def test_an_installation_without_the_extra_says_what_it_lacks(client: TestClient, session: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "find_spec", lambda name: None)
+    monkeypatch.setattr(samples, "find_spec", lambda name: None)
     answer = client.get(f"/api/v1/sessions/{session}/samples", params={"format": "nwb"})
     assert answer.status_code == 409
     assert "pynwb is not installed" in answer.json()["detail"]

@@ -16,9 +16,9 @@ import pytest
 from fastapi.testclient import TestClient
 from PIL import Image
 
-from app.overview.signals import compute, service
-from app.overview.signals.figures import chart_figure
-from app.overview.signals.pages import POINTS
+from app.overview import samples_compute
+from app.overview import signals as signals_rules
+from app.overview.signals_web import POINTS, chart_figure
 from app.platform.web.png import palette, picture
 from ml.formats.recording import SampleLog
 from tests.app.ingest.conftest import send, steady  # noqa: F401 (fixture)
@@ -73,16 +73,16 @@ def test_its_files_are_read_once(client: TestClient, session: int, monkeypatch: 
     def never(*_: object, **__: object) -> None:
         raise AssertionError("the files were read again")
 
-    monkeypatch.setattr(service, "run_limited", never)
+    monkeypatch.setattr(signals_rules, "run_limited", never)
     assert asked(client, session) == first
 
 
 def test_what_nobody_looked_at_for_long_is_forgotten_first(session: int, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
-    old, young = service._cache() / "old", service._cache() / "young"
-    for folder, age in ((old, 3 * service.KEPT_S), (young, 60.0)):
+    old, young = signals_rules._cache() / "old", signals_rules._cache() / "young"
+    for folder, age in ((old, 3 * signals_rules.KEPT_S), (young, 60.0)):
         folder.mkdir()
         os.utime(folder, (time.time() - age, time.time() - age))
-    monkeypatch.setattr(service, "KEPT", 1)
+    monkeypatch.setattr(signals_rules, "KEPT", 1)
     asked(client, session)
     assert (old.exists(), young.exists()) == (False, True)
 
@@ -102,16 +102,16 @@ def test_a_chart_has_the_bounds_of_the_api_and_a_page_takes_any_number_for_a_cha
 
 
 def test_two_who_ask_at_once_leave_one_folder(client: TestClient, session: int, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
-    build = service.run_limited
+    build = signals_rules.run_limited
 
     def twice(*args: Any, **kwargs: Any) -> Any:
-        monkeypatch.setattr(service, "run_limited", build)
+        monkeypatch.setattr(signals_rules, "run_limited", build)
         asked(client, session)  # somebody else is done first
         return build(*args, **kwargs)
 
-    monkeypatch.setattr(service, "run_limited", twice)
+    monkeypatch.setattr(signals_rules, "run_limited", twice)
     found = asked(client, session)
-    (folder,) = service._cache().iterdir()
+    (folder,) = signals_rules._cache().iterdir()
     assert [p for p in folder.iterdir() if p.is_dir()] == []
     assert found == asked(client, session)
 
@@ -146,10 +146,10 @@ def test_a_stretch_of_a_million_samples_is_drawn_fluidly(tmp_path: Path) -> None
     values[600_123] = 50.0
     log = SampleLog.of("LFP", "uV", [(0.0, rate, values)])
     begun = time.process_time()
-    header = compute._written(log, tmp_path, 0)
+    header = samples_compute._written(log, tmp_path, 0)
     assert time.process_time() - begun < 2.0, "the pyramid and the spectrogram, once in a session's life"
-    channel = service.SignalChannel(0, 1, None, "LFP", "uV", (rate,), n, header["begin_s"], header["end_s"])
-    signals = service.Signals(tmp_path, (channel,), (json.loads(json.dumps(header)),))
+    channel = signals_rules.SignalChannel(0, 1, None, "LFP", "uV", (rate,), n, header["begin_s"], header["end_s"])
+    signals = signals_rules.Signals(tmp_path, (channel,), (json.loads(json.dumps(header)),))
     spike_s = 600_123 / rate
     for width in (4800.0, 600.0, 60.0, 8.0, 2.0):
         begin = max(0.0, spike_s - width / 2)

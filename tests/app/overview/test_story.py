@@ -8,7 +8,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.analysis.evidence.service import evidence
+from app.analysis.evidence import evidence
 from app.overview.story import story_chart
 from app.platform.web.charts import ACCENT, Chart, Link
 from app.study import repository

@@ -7,10 +7,7 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from app.overview.state import State, next_steps
-from app.overview.tasks import Actor, Task
-from app.overview.visit_progress import VisitProgress, visit_progress
-from app.overview.wording import progress, what
+from app.overview.state import Actor, State, Task, VisitProgress, next_steps, progress, visit_progress, what
 from app.tables.participants import Participant, SettingsVersion
 from tests.clinic_day import clinic_day
 from tests.conftest import PASSWORD

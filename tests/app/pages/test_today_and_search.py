@@ -12,10 +12,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.learning.policies.baselines import constant_onnx
-from app.overview.overview import SOON
-from app.overview.saved import Saved, overall
-from app.overview.state import states
-from app.overview.tasks import Actor, Task
+from app.overview.overview_web import SOON, Saved, overall
+from app.overview.state import Actor, Task, states
 from app.platform.jobs import service as jobs
 from app.settings import get_settings
 from app.study.enrolment.schemas import ParticipantIn

@@ -16,7 +16,7 @@ import pytest
 from sqlalchemy import func, select
 
 from app.accounts.permissions import SYSTEM
-from app.analysis.trial_time.service import trial_time
+from app.analysis.pooled import trial_time
 from app.evaluation.ranking.results import driven_sessions, results_by_policy
 from app.platform.database import new_session
 from app.platform.errors import Conflict

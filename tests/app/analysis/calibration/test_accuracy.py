@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.analysis.calibration.accuracy import Pair, accuracies, least_range, mean_interval, rank_correlations
+from app.analysis.calibration_accuracy import Pair, accuracies, least_range, mean_interval, rank_correlations
 from ml.ope.compare.metrics import spearman
 
 

@@ -10,11 +10,10 @@ from typing import Any
 
 import pytest
 
-from app.analysis.calibration.accuracy import Pair, accuracies
-from app.analysis.calibration.charts import over_visits
-from app.analysis.calibration.export import calibration_to_csv
-from app.analysis.calibration.schemas import CalibrationOut, PredictionOut, TestedPolicyOut
-from app.analysis.calibration.wording import in_sentences
+from app.analysis.calibration import in_sentences
+from app.analysis.calibration_accuracy import CalibrationOut, Pair, PredictionOut, TestedPolicyOut, accuracies
+from app.analysis.calibration_charts import over_visits
+from app.analysis.calibration_web import calibration_to_csv
 
 
 def at_visit(visit: int, policy: int, predicted: float, actual: float, **more: Any) -> TestedPolicyOut:

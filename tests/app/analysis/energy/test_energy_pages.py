@@ -16,8 +16,8 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.analysis.energy.measures import Measure, Pulses, pulses_of, taken
-from app.analysis.evidence.facts import Facts, Side
+from app.analysis.energy import Measure, Pulses, pulses_of, taken
+from app.analysis.facts import Facts, Side
 from app.study.blinding import Arm
 from app.tables.recordings import Recording, Trace
 from app.tables.sessions import Controller, SessionSegment

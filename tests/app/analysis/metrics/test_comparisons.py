@@ -6,7 +6,7 @@ from itertools import combinations
 
 import pytest
 
-from app.analysis.metrics.comparisons import ALPHA, Group, compare, group, sessions_needed, smallest_p
+from app.analysis.metrics import ALPHA, Group, compare, group, sessions_needed, smallest_p
 from app.tables.sessions import Controller
 from ml.statistics.ranksum import rank_sum
 

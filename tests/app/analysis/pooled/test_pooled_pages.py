@@ -17,9 +17,8 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
-from app.analysis.pooled.serializers import pooled_out
-from app.analysis.pooled.service import Pooled, PooledController, PooledMetric
-from app.analysis.trial_time.service import TrialTime
+from app.analysis.pooled import Pooled, PooledController, PooledMetric, TrialTime
+from app.analysis.pooled_web import pooled_out
 from app.tables.sessions import Controller
 from ml.statistics.within_visits.contrasts import Reason, Unavailable
 from tests.app.analysis.conftest import adder

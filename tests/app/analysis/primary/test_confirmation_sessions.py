@@ -6,8 +6,8 @@ from datetime import UTC, date, datetime, timedelta
 
 import pytest
 
-from app.analysis.evidence.facts import Facts
-from app.analysis.primary.results import Basis, results
+from app.analysis.facts import Facts
+from app.analysis.primary_results import Basis, results
 from app.study.blinding import Arm
 from app.tables.sessions import Controller
 

@@ -11,9 +11,9 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.analysis.evidence.measurements import choose, of_controller
-from app.analysis.evidence.service import evidence
-from app.analysis.primary.verdict import judged_outcome
+from app.analysis.evidence import evidence
+from app.analysis.facts import choose, of_controller
+from app.analysis.primary_verdict import judged_outcome
 from app.evaluation.ranking.results import driven_sessions
 from app.learning.gate.service import decide
 from app.learning.snapshots.service import collect, take_snapshot

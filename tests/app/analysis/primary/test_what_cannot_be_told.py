@@ -8,11 +8,10 @@ from datetime import UTC, datetime
 
 import pytest
 
-from app.analysis import wording
-from app.analysis.evidence.facts import Facts
-from app.analysis.evidence.measurements import RESOLUTION
-from app.analysis.primary.verdict import LockedMargins, NoVerdict, VerdictResult, verdicts
-from app.overview.package import recompute
+from app.analysis import primary_words
+from app.analysis.facts import RESOLUTION, Facts
+from app.analysis.primary_verdict import LockedMargins, NoVerdict, VerdictResult, verdicts
+from app.overview import recompute
 from app.study.blinding import Arm
 from app.tables.sessions import Controller
 from ml.qoc import Margins, failed_qoc
@@ -102,9 +101,9 @@ def test_an_outcome_of_two_visits_is_told_from_a_study_of_two_visits() -> None:
     some = [s if s.visit < 3 else replace(s, values={k: v for k, v in s.values.items() if k != "tremor"}) for s in varied(6)]
     found = open_verdict(some)
     assert found.untested == (("tremor", Reason.TOO_FEW_VISITS),)
-    sentence, short = wording.verdict(judged(some)), wording.verdict(judged(varied(2)))
-    assert wording.JUDGED["tremor"] in sentence.split(";", 1)[1]
-    assert wording.JUDGED["tremor"] not in short.split(";", 1)[1]
+    sentence, short = primary_words.verdict(judged(some)), primary_words.verdict(judged(varied(2)))
+    assert primary_words.JUDGED["tremor"] in sentence.split(";", 1)[1]
+    assert primary_words.JUDGED["tremor"] not in short.split(";", 1)[1]
 
 
 def test_no_grasp_frequency_to_take_a_share_of_gives_no_verdict() -> None:
@@ -121,15 +120,15 @@ def test_a_participant_who_never_trembles_gets_a_verdict() -> None:
 
 
 def test_each_reason_has_a_sentence_of_its_own() -> None:
-    assert len({wording.unavailable(Unavailable(r, 1, 2)) for r in Reason}) == len(Reason)
+    assert len({primary_words.unavailable(Unavailable(r, 1, 2)) for r in Reason}) == len(Reason)
     asked = [Inconclusive(("tremor",), None, ((("tremor", r),))) for r in Reason] + [Inconclusive(("tremor",), None)]
-    sentences = {wording.verdict_sentence("RL", found, 5, planned=True) for found in asked}
+    sentences = {primary_words.verdict_sentence("RL", found, 5, planned=True) for found in asked}
     assert len(sentences) == len(Reason) + 1
     assert all(s.endswith(".") and ".." not in s and ". " not in s for s in sentences)
     # nothing is said about further visits where it was not asked, but what could not be tested is
     beyond, tied = Inconclusive(("grasp",), None), Inconclusive(("grasp",), None, (("grasp", Reason.ALL_EQUAL),))
-    assert ";" not in wording.verdict_sentence("RL", beyond, 5, planned=False)
-    assert ";" in wording.verdict_sentence("RL", tied, 5, planned=False)
+    assert ";" not in primary_words.verdict_sentence("RL", beyond, 5, planned=False)
+    assert ";" in primary_words.verdict_sentence("RL", tied, 5, planned=False)
 
 
 def test_the_script_of_the_data_package_takes_the_step_of_energy_of_the_service() -> None:

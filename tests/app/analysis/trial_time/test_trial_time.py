@@ -6,8 +6,8 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.analysis.evidence.service import of_all
-from app.analysis.trial_time.service import of_evidence, trial_time
+from app.analysis.evidence import of_all
+from app.analysis.pooled import of_evidence, trial_time
 from app.study import repository as study
 from app.tables.sessions import Controller
 from tests.app.analysis.conftest import AddSession

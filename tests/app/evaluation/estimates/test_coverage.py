@@ -25,7 +25,7 @@ from app.evaluation.service import store_evaluation
 from app.learning.policies.baselines import constant_onnx, ensure_baselines
 from app.learning.snapshots.buffers import read_buffer
 from app.learning.snapshots.service import collect, take_snapshot
-from app.overview.package.export import export_participant
+from app.overview.package import export_participant
 from app.platform import files
 from app.platform.jobs import StepReport
 from app.study.repository import participant_by_code

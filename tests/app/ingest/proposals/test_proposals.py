@@ -13,7 +13,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.overview.package.export import export_participant
+from app.overview.package import export_participant
 from app.platform.errors import Invalid
 from app.study import repository as study
 from app.tables.audit import AuditEvent

@@ -7,7 +7,7 @@ import io
 
 import pytest
 
-from app.analysis.tables import csv_of
+from app.analysis.figures import csv_of
 from app.platform.web.csv_files import safe_cell
 
 

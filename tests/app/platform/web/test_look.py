@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from app.analysis.biomarker.charts import SCALE
+from app.analysis.biomarker_web import SCALE
 from app.analysis.figures import COLOURS
 from app.platform.web.charts import figure, written
 from app.platform.web.numbers import fixed, hover, number, place, rate, stated, typed, whole
@@ -16,7 +16,7 @@ OWN_FORMAT = re.compile(r"(?<!\{)%[-+0]*\d*(?:\.\d+)?[gfeGE]\b|\|\s*round\b")
 """A number that a template formats by itself: `"%.3g"|format(x)`, `x|round`."""
 
 OWN_DIGITS = re.compile(r":[-+,z]*\.\d+[geE]\}")
-OWN_PLACES = ("app/platform/web/numbers.py", "app/tablet/", "app/analysis/calibration/export.py")
+OWN_PLACES = ("app/platform/web/numbers.py", "app/tablet/", "app/analysis/calibration_web.py")
 """Where a format of digits stands: the one place of the pages, what the tablet writes to its wire and terminal, and a file of data."""
 ROUNDED = 'float(f"'
 """How a line begins to round numbers that stay numbers."""

@@ -1,1 +1,0 @@
-"""Is beta a biomarker in this participant, how things went over the months, and after a dose of medication."""

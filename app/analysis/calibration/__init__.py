@@ -1,1 +1,0 @@
-"""Calibration: estimates made before a visit against what the visit brought."""

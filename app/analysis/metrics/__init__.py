@@ -1,1 +1,0 @@
-"""The five metrics of every controller against cDBS."""

@@ -1,0 +1,223 @@
+"""All participants together: a result for each, a summary that claims nothing about a population, and the paper's tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import Row, func, select
+from sqlalchemy.orm import Session
+
+from app.accounts.permissions import Caller
+from app.analysis import metrics, primary
+from app.analysis.evidence import Evidence, of_all
+from app.analysis.facts import METRICS, LeftOut
+from app.analysis.metrics import FiveMetrics
+from app.analysis.primary import Primary
+from app.analysis.primary_results import PLANNED
+from app.platform.kept import kept
+from app.study import repository as study
+from app.study.blinding import CONTROLLER_NAMES, Arm, visible_arms
+from app.tables.jobs import Job, JobStatus, JobStep
+from app.tables.participants import Participant
+from app.tables.sessions import Controller, StudySession
+from ml.statistics.pooling import Summary, pool
+from ml.statistics.within_visits.contrasts import Average, Reason, Unavailable
+
+# Minutes that each controller was tested in each participant: the table of trial time (Gao et al. 2023, section 6.1).
+
+PAPER_ORDER = (Controller.CDBS, Controller.RL, Controller.DISTILLED, Controller.NO_DBS)
+"""The paper's columns; controllers that it does not list follow where some session has them."""
+
+
+@dataclass(frozen=True)
+class TimeTested:
+    """One controller in one participant: confirmed sessions that are not excluded, and their minutes."""
+
+    controller: Controller
+    sessions: int
+    minutes: float
+
+
+@dataclass(frozen=True)
+class TrialTimeRow:
+    """One participant.
+
+    Attributes:
+        tested: one entry for each of the table's controllers, with zeros where it was not tested.
+        excluded: sessions that are left out because somebody excluded them.
+    """
+
+    participant: str
+    tested: list[TimeTested]
+    excluded: int
+
+
+@dataclass(frozen=True)
+class TrialTime:
+    """The table; `totals` over all its participants."""
+
+    controllers: list[Controller]
+    labels: list[str]
+    rows: list[TrialTimeRow]
+    totals: list[TimeTested]
+
+
+def trial_time(db: Session, participants: Sequence[Participant], caller: Caller) -> TrialTime:
+    """The table over these participants, in their order. Proposed and excluded sessions do not count."""
+    by_participant: dict[int, list[StudySession]] = {p.id: [] for p in participants}
+    for session in study.sessions_without_data(db, list(by_participant)):
+        by_participant[session.visit.participant_id].append(session)
+    counted = []
+    for participant in participants:
+        held = by_participant[participant.id]
+        counting = [s for s in held if s.excluded_reason is None]
+        ran = [(arm, s.duration_s) for s, arm in zip(counting, visible_arms(counting, caller), strict=True)]
+        counted.append(_Counted(participant.code, ran, sum(s.excluded_reason is not None for s in held)))
+    return _table(counted)
+
+
+def of_evidence(held: Sequence[Evidence]) -> TrialTime:
+    """The same where the evidence of the participants is at hand."""
+    counted = []
+    for one in held:
+        ran = [(s.arm, s.duration_s) for s in one.sessions] + [(e.arm, e.duration_s) for e in one.excluded]
+        counted.append(_Counted(one.participant, ran, sum(e.why is LeftOut.EXCLUDED for e in one.excluded)))
+    return _table(counted)
+
+
+@dataclass(frozen=True)
+class _Counted:
+    """Sessions of one participant with their seconds, no arm where it is not known to the reader; and how many are excluded."""
+
+    participant: str
+    ran: Sequence[tuple[Arm | None, float]]
+    excluded: int
+
+
+def _table(counted: Sequence[_Counted]) -> TrialTime:
+    by_controller: list[dict[Controller, list[float]]] = []
+    for one in counted:
+        seconds: dict[Controller, list[float]] = {}
+        for arm, duration_s in one.ran:
+            if arm is not None:
+                seconds.setdefault(arm.controller, []).append(duration_s)
+        by_controller.append(seconds)
+    others = [c for c in Controller if c not in PAPER_ORDER and any(c in seconds for seconds in by_controller)]
+    controllers = [*PAPER_ORDER, *others]
+    rows = [
+        TrialTimeRow(one.participant, [_tested(c, seconds.get(c, [])) for c in controllers], one.excluded)
+        for one, seconds in zip(counted, by_controller, strict=True)
+    ]
+    totals = [_tested(c, [s for seconds in by_controller for s in seconds.get(c, [])]) for c in controllers]
+    return TrialTime(controllers, [CONTROLLER_NAMES[c] for c in controllers], rows, totals)
+
+
+def _tested(controller: Controller, seconds: Sequence[float]) -> TimeTested:
+    return TimeTested(controller, len(seconds), sum(seconds) / 60)
+
+
+# Queries of the study-wide tables.
+
+
+def step_seconds(db: Session, participant_ids: Sequence[int]) -> Sequence[Row[str, str, int, float, float]]:
+    """Finished compute steps of these participants' jobs: kind of job, of step (its key up to the number), n, median and longest, s."""
+    seconds = func.extract("epoch", JobStep.finished_at - JobStep.started_at)
+    name = func.regexp_replace(JobStep.key, "/[0-9]+$", "")
+    return db.execute(
+        select(Job.kind, name, func.count(), func.percentile_cont(0.5).within_group(seconds), func.max(seconds))
+        .join(JobStep, JobStep.job_id == Job.id)
+        .where(Job.participant_id.in_(participant_ids), JobStep.status == JobStatus.SUCCEEDED, JobStep.finished_at.is_not(None))
+        .group_by(Job.kind, name)
+        .order_by(Job.kind, func.min(JobStep.position))
+    ).all()
+
+
+# All participants of a caller: N-of-1 results, the random-effects summary, and the tables of the paper.
+
+MOST = 200
+"""Participants on one page."""
+
+
+@dataclass(frozen=True)
+class PooledMetric:
+    """One metric of one controller over participants.
+
+    Attributes:
+        each: participant and its own result. summary: random effects over those that have one. units: differing units are not pooled.
+    """
+
+    metric: str
+    each: tuple[tuple[str, Average | Unavailable], ...]
+    summary: Summary | Unavailable
+
+
+@dataclass(frozen=True)
+class PooledController:
+    """All metrics of a controller."""
+
+    controller: Controller
+    metrics: tuple[PooledMetric, ...]
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """Everything of the participants that a caller may read."""
+
+    participants: tuple[Primary, ...]
+    paper: tuple[FiveMetrics, ...]
+    controllers: tuple[PooledController, ...]
+    trial: TrialTime
+
+
+def readable(db: Session, caller: Caller) -> Sequence[Participant]:
+    """The participants that the caller may read, by code."""
+    return study.participants(db, caller, MOST, 0)[0]
+
+
+def pooled(db: Session, participants: Sequence[Participant], caller: Caller) -> Pooled:
+    """Results of each participant and over all of them."""
+    held = of_all(db, participants, caller)
+    found, paper = tuple(primary.of_all(db, participants, held)), tuple(metrics.of_all(db, participants, held))
+    key = ("pooled", tuple((p.evidence.key, p.locked) for p in found))
+    return Pooled(found, paper, kept(key, lambda: tuple(_controller(found, c) for c in PLANNED if _ran(found, c))), of_evidence(held))
+
+
+@dataclass(frozen=True)
+class StepTime:
+    """Time of one kind of compute step, s."""
+
+    job: str
+    step: str
+    n: int
+    median_s: float
+    longest_s: float
+
+
+def computation_times(db: Session, participants: Sequence[Participant]) -> list[StepTime]:
+    """How long the compute steps of these participants' jobs took."""
+    rows = step_seconds(db, [p.id for p in participants])
+    return [StepTime(kind, step, n, float(median), float(longest)) for kind, step, n, median, longest in rows]
+
+
+def _ran(found: Sequence[Primary], controller: Controller) -> bool:
+    return any(r.tested.controller is controller for p in found for r in p.controllers)
+
+
+def _controller(found: Sequence[Primary], controller: Controller) -> PooledController:
+    return PooledController(controller, tuple(_metric(found, controller, m) for m in METRICS))
+
+
+def _metric(found: Sequence[Primary], controller: Controller, metric: str) -> PooledMetric:
+    each: list[tuple[str, Average | Unavailable]] = []
+    units = set()
+    for p in found:
+        mine = next((r for r in p.controllers if r.tested.controller is controller), None)
+        if mine is None:
+            continue
+        comparison = mine.of(metric)
+        each.append((p.evidence.participant, comparison.result))
+        if isinstance(comparison.result, Average):
+            units.add(p.beta_kind if metric == "mean_beta" else None)
+    summary = pool([r for _, r in each]) if len(units) < 2 else Unavailable(Reason.NOT_IDENTIFIED)
+    return PooledMetric(metric, tuple(each), summary)

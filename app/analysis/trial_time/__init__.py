@@ -1,1 +1,0 @@
-"""Trial time: minutes that each controller was tested."""

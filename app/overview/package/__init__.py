@@ -1,1 +1,0 @@
-"""A participant's record as a Frictionless data package, with a script that recomputes the primary tables."""

@@ -1,0 +1,290 @@
+"""One signal of a session, as the writers of files take it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from app.ingest.uploads.compute import options_of
+from app.platform.jobs import StepReport
+from ml import formats
+from ml.formats import SampleLog, UndecodableFile
+from ml.sample_views import Stretch, pyramid, spectrogram
+
+if TYPE_CHECKING:
+    from pynwb import NWBFile
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One channel or trace of a session.
+
+    Attributes:
+        recording: its number. hemisphere: `left`, `right` or None. stream: `lfp`, or that of a trace. channel, unit: as stored.
+        t_s: seconds from the session's start, [n]: of a sample, or the end of a trace's row.
+        values: float32, [n]; NaN where a trace's row is invalid.
+        rates_hz: rates of the samples; empty for traces.
+    """
+
+    recording: int
+    hemisphere: str | None
+    stream: str
+    channel: str
+    unit: str
+    t_s: NDArray[np.float64]
+    values: NDArray[np.float32]
+    rates_hz: tuple[float, ...] = ()
+
+
+# A session's signals as one Parquet table: a row per sample, a row group per channel.
+
+_WORDS = pa.dictionary(pa.int32(), pa.string())
+SCHEMA = pa.schema(
+    [
+        pa.field("recording", pa.int64()),
+        pa.field("hemisphere", _WORDS),
+        pa.field("stream", _WORDS),
+        pa.field("channel", _WORDS),
+        pa.field("unit", _WORDS),
+        pa.field("t_s", pa.float64()),
+        pa.field("value", pa.float32()),
+    ]
+)
+
+
+def write_parquet(target: Path, signals: Sequence[Signal], about: Mapping[str, Any]) -> None:
+    """Write the table; `about` stands as JSON under the key `betaloop` of its schema. An invalid row of a trace is null."""
+    said = {**about, "rates_hz": {f"{s.recording} {s.channel}": s.rates_hz for s in signals if s.rates_hz}}
+    schema = SCHEMA.with_metadata({"betaloop": json.dumps(said)})
+    with pq.ParquetWriter(target, schema, compression="zstd") as out:
+        for s in signals:
+            n = s.values.size
+            words = [_repeated(word, n) for word in (s.hemisphere, s.stream, s.channel, s.unit)]
+            values = pa.array(s.values, type=pa.float32(), from_pandas=True)  # NaN becomes null
+            out.write_table(pa.table([pa.array([s.recording] * n, pa.int64()), *words, pa.array(s.t_s), values], schema=schema))
+
+
+def _repeated(word: str | None, n: int) -> pa.DictionaryArray:
+    indices = pa.nulls(n, pa.int32()) if word is None else pa.array(np.zeros(n, np.int32))
+    return pa.DictionaryArray.from_arrays(indices, pa.array([] if word is None else [word], pa.string()))
+
+
+# A session's signals as Neurodata Without Borders (NWB 2, HDF5). It needs the extra `nwb`.
+
+UNITS = {"uV": ("volts", 1e-6), "mA": ("amperes", 1e-3)}
+"""Unit and factor by which values become it, where NWB has an SI unit for them."""
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def write_nwb(target: Path, signals: Sequence[Signal], about: Mapping[str, Any]) -> None:
+    """Write the file: samples as electrical series, traces as time series in the processing module `steps`.
+
+    NWB wants a start time: it is the session's day since enrolment, counted from 1970-01-01, for no date leaves.
+    """
+    from pynwb import NWBHDF5IO, NWBFile  # an optional package, and half a second of imports: only where it is asked for
+    from pynwb.file import Subject
+
+    days = about["day"]
+    content = NWBFile(
+        session_description=f"Session {about['session']} of visit {about['visit']}: {about['controller'] or 'controller not stated'}. "
+        + ("Its day is not known." if days is None else "The date is the day since enrolment, counted from 1970-01-01."),
+        identifier=f"{about['participant']}-session-{about['session']}",
+        session_start_time=EPOCH + timedelta(days=days or 0.0),
+        session_id=str(about["session"]),
+        notes=json.dumps(about),
+        subject=Subject(subject_id=about["participant"], species="Homo sapiens"),
+    )
+    _samples(content, [s for s in signals if s.stream == "lfp"])
+    _traces(content, [s for s in signals if s.stream != "lfp"])
+    with NWBHDF5IO(target, "w") as out:
+        out.write(content)
+
+
+def _samples(content: NWBFile, signals: Sequence[Signal]) -> None:
+    from pynwb.ecephys import ElectricalSeries
+
+    if not signals:
+        return
+    device = content.create_device(name="implanted neurostimulator")
+    groups = {
+        side: content.create_electrode_group(
+            name=f"{side} lead", description=f"contacts of the {side} side", location=f"{side} side; target not stated", device=device
+        )
+        for side in dict.fromkeys(s.hemisphere or "unknown" for s in signals)
+    }
+    for i, s in enumerate(signals):
+        group = groups[s.hemisphere or "unknown"]
+        content.add_electrode(location=group.location, group=group, reference=f"bipolar: {s.channel}")
+        region = content.create_electrode_table_region([i], f"contacts of {s.channel}")
+        said = f"recording {s.recording}, {s.channel}, sampled at {' and '.join(f'{r:g}' for r in s.rates_hz)} Hz; lost samples are absent"
+        series = ElectricalSeries(
+            name=_name(s), data=_stored(s.values), electrodes=region, timestamps=_stored(s.t_s), conversion=1e-6, description=said
+        )
+        content.add_acquisition(series)
+
+
+def _traces(content: NWBFile, signals: Sequence[Signal]) -> None:
+    from pynwb import TimeSeries
+
+    if not signals:
+        return
+    steps = content.create_processing_module("steps", "Traces on the control grid; a time is the end of its step, NaN an invalid step.")
+    for s in signals:
+        unit, factor = UNITS.get(s.unit, (s.unit, 1.0))
+        said = f"recording {s.recording}, {s.stream} in {s.unit}"
+        steps.add(
+            TimeSeries(name=_name(s), data=_stored(s.values), unit=unit, conversion=factor, timestamps=_stored(s.t_s), description=said)
+        )
+
+
+def _stored(values: np.ndarray[Any, Any]) -> Any:
+    """Compressed as HDF5 holds it."""
+    from pynwb import H5DataIO
+
+    return H5DataIO(values, compression="gzip", shuffle=True) if values.size else values
+
+
+def _name(s: Signal) -> str:
+    """A name that no other signal of the session has; NWB takes neither slashes nor colons."""
+    return f"recording {s.recording} {s.stream} {s.channel}".strip().replace("/", "-").replace(":", "-")
+
+
+# A session's samples and traces as one file, written in a limited child: samples are decoded anew from the files that came.
+#
+# The child knows no settings and no database: what it needs stands in its params. `service` beside this is its caller's side.
+
+WRITERS = {"parquet": write_parquet, "nwb": write_nwb}
+
+
+def write(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Write the file.
+
+    Args:
+        params: `format` (of `WRITERS`), `target` and `traces` (paths; traces as `npz`), `headers` of the traces, `files` with their
+            `recordings`, and `session`, what the file says of the session.
+        workdir: not used.
+        report: takes the share that was read.
+
+    Returns:
+        `missing`: numbers of recordings that the present decoder does not find in their file; `samples`, how many were written.
+    """
+    signals: list[Signal] = []
+    missing: list[int] = []
+    for k, file in enumerate(params["files"]):
+        report.progress(k / len(params["files"]), "reading the samples")
+        found, lost = _samples_of(file)
+        signals += found
+        missing += lost
+    samples = sum(s.values.size for s in signals)
+    with np.load(params["traces"], allow_pickle=False) as arrays:
+        signals += [Signal(**header, t_s=arrays[f"t{i}"], values=arrays[f"v{i}"]) for i, header in enumerate(params["headers"])]
+    about = {**params["session"], "recordings_without_samples": missing}
+    WRITERS[params["format"]](Path(params["target"]), signals, about)
+    return {"missing": missing, "samples": samples}
+
+
+def _samples_of(file: Mapping[str, Any]) -> tuple[list[Signal], list[int]]:
+    """The samples of a file's recordings within the session as signals, and which recordings it no longer gives."""
+    logs, missing = samples_within(file)
+    return [
+        Signal(row["id"], row["hemisphere"], "lfp", log.channel, log.unit, log.t_s, log.values, log.rates_hz) for row, log in logs
+    ], missing
+
+
+def samples_within(file: Mapping[str, Any]) -> tuple[list[tuple[Mapping[str, Any], SampleLog]], list[int]]:
+    """The samples of a file's recordings within the session.
+
+    Args:
+        file: as `app.overview.samples.files_of` gives it.
+
+    Returns:
+        (recording, samples with times from the session's start) per channel, and numbers of the recordings that the present decoder does
+        not find in the file.
+    """
+    wanted: Sequence[Mapping[str, Any]] = file["recordings"]
+    try:
+        decoded = formats.decode(Path(file["source"]), file["kind"], options_of(file["options"]), name=file["name"]).recordings
+    except UndecodableFile:
+        return [], [r["id"] for r in wanted]
+    by_content = {r.fingerprint: r for r in decoded}
+    found = []
+    for row in wanted:
+        if row["fingerprint"] not in by_content:
+            continue
+        for log in by_content[row["fingerprint"]].samples:
+            here = log.between(row["begin_s"], row["end_s"])
+            if here.values.size:
+                found.append((row, replace(here, t_s=here.t_s - row["start_s"])))
+    return found, [r["id"] for r in wanted if r["fingerprint"] not in by_content]
+
+
+# What the screen needs of a session's samples, written once in a limited child: samples, their extremes per bin, the spectrogram.
+#
+# The child knows no settings and no database. `service` beside this is its caller's side, and reads the folder that is written here.
+
+HEADER = "channels.json"
+
+
+def build(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Write the folder `target`: `channels.json`, and for channel i `i-t.npy`, `i-v.npy`, `i-<level>.npy` ([2, bins]) and `i-density.npy`.
+
+    Args:
+        params: `target`, and `files` as `app.overview.samples.files_of` gives them.
+        workdir: not used.
+        report: takes the share that was read.
+
+    Returns:
+        `channels`, how many there are.
+    """
+    target = Path(params["target"])
+    channels: list[dict[str, Any]] = []
+    missing: list[int] = []
+    for k, file in enumerate(params["files"]):
+        report.progress(k / len(params["files"]), "reading the samples")
+        logs, lost = samples_within(file)
+        missing += lost
+        for row, log in logs:
+            channels.append({"recording": row["id"], "hemisphere": row["hemisphere"], **_written(log, target, len(channels))})
+    (target / HEADER).write_text(json.dumps({"channels": channels, "missing": missing}))
+    return {"channels": len(channels)}
+
+
+def _written(log: SampleLog, target: Path, number: int) -> dict[str, Any]:
+    """Write one channel's arrays; what the header says of it."""
+    np.save(target / f"{number}-t.npy", log.t_s)
+    np.save(target / f"{number}-v.npy", log.values)
+    levels = pyramid(log.t_s, log.values, max(log.rates_hz))
+    for k, level in enumerate(levels):
+        np.save(target / f"{number}-{k}.npy", np.stack([level.low, level.high]))
+    begin, end = float(log.t_s.min()), float(log.t_s.max())
+    power = spectrogram(_stretches(log), begin, end)
+    np.save(target / f"{number}-density.npy", power.density)
+    return {
+        "channel": log.channel,
+        "unit": log.unit,
+        "rates_hz": list(log.rates_hz),
+        "samples": int(log.values.size),
+        "begin_s": begin,
+        "end_s": end,
+        "widths_s": [level.width_s for level in levels],
+        "column_s": power.width_s,
+        "hz": power.hz.tolist(),
+    }
+
+
+def _stretches(log: SampleLog) -> Iterator[Stretch]:
+    """Gap-free pieces with the rate that their own times have."""
+    for first, stop in zip(log.starts, [*log.starts[1:], log.values.size], strict=True):
+        if stop - first > 1:
+            rate = (stop - first - 1) / (log.t_s[stop - 1] - log.t_s[first])
+            nominal = min(log.rates_hz, key=lambda r: abs(r - rate))
+            yield float(log.t_s[first]), float(nominal), log.values[first:stop]

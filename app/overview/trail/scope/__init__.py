@@ -1,1 +1,0 @@
-"""Conditions that leave a part of the audit trail: of a reader, or of participants."""
