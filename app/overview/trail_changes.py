@@ -319,6 +319,7 @@ SAID: dict[str, Callable[[Row, Row, Names], str]] = {
     "bundle_release": lambda b, a, n: (
         f"took the bundle of {n.policy(a['policy_id'])}" if a["policy_id"] is not None else "took the bundle of a session without a policy"
     ),
+    "port_check": lambda b, a, n: f"checked a port of {n.policy(a['policy_id'])}, {a['target']}: {a['verdict']}",
     "buffer_gate_decision": _decided,
     "participant": _participant,
     "settings_version": _version("settings"),

@@ -153,6 +153,30 @@ class BundleRelease(Base):
     created_by: Mapped[str] = mapped_column(String(254))
 
 
+class PortCheck(Base):
+    """Check of a converted copy of a policy against a bundle, by the answers that it gave (`ml.deploy.ports`). Insert only.
+
+    `bundle_sha256` is the bundle whose vectors were answered, `answers_sha256` the table of answers. `target` is what was converted, by
+    what. `result` is `ml.deploy.ports.check.PortCheck` as JSON.
+    """
+
+    __tablename__ = "port_check"
+    __table_args__ = (
+        CheckConstraint("verdict in ('same', 'within', 'not this policy')", name="verdict"),
+        CheckConstraint("target <> ''", name="target"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    policy_id: Mapped[int] = mapped_column(ForeignKey("policy.id"), index=True)
+    bundle_sha256: Mapped[str] = mapped_column(ForeignKey("stored_file.sha256"))
+    answers_sha256: Mapped[str] = mapped_column(ForeignKey("stored_file.sha256"))
+    target: Mapped[str] = mapped_column(String(100))
+    verdict: Mapped[str] = mapped_column(String(20))
+    result: Mapped[dict[str, Any]] = mapped_column(JSONB(none_as_null=True))
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+
+
 KINDS = (
     "start", "stop", "stop_cause", "rating", "grasp", "dyskinesia", "speech", "gait", "note", "adverse_event", "skip", "repeat",
     "session_end", "clinical_settings", "dose",

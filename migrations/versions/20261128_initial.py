@@ -173,6 +173,7 @@ AUDITED = (
     ("plan", "id", ""),
     ("plan_item", "id", ""),
     ("policy", "id", ""),
+    ("port_check", "id", "result"),
     ("qoc", "id", ""),
     ("recording", "id", "details"),
     ("second_factor", "user_id", "sealed_secret,recovery,last_used_at"),
@@ -215,6 +216,7 @@ NEVER_CHANGED = (
     "estimate",
     "margins_lock",
     "margins_version",
+    "port_check",
     "qoc",
     "session_conditions",
     "settings_version",
@@ -1429,6 +1431,25 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("snapshot_id", "session_id", name=op.f("pk_snapshot_session")),
     )
     op.create_index(op.f("ix_snapshot_session_session_id"), "snapshot_session", ["session_id"], unique=False)
+    op.create_table(
+        "port_check",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("policy_id", sa.Integer(), nullable=False),
+        sa.Column("bundle_sha256", sa.String(length=64), nullable=False),
+        sa.Column("answers_sha256", sa.String(length=64), nullable=False),
+        sa.Column("target", sa.String(length=100), nullable=False),
+        sa.Column("verdict", sa.String(length=20), nullable=False),
+        sa.Column("result", postgresql.JSONB(none_as_null=True, astext_type=sa.Text()), nullable=False),
+        sa.Column("created_at", sa.DateTime(timezone=True), server_default=sa.text("now()"), nullable=False),
+        sa.Column("created_by", sa.String(length=254), nullable=False),
+        sa.CheckConstraint("target <> ''", name=op.f("ck_port_check_target")),
+        sa.CheckConstraint("verdict in ('same', 'within', 'not this policy')", name=op.f("ck_port_check_verdict")),
+        sa.ForeignKeyConstraint(["answers_sha256"], ["stored_file.sha256"], name=op.f("fk_port_check_answers_sha256_stored_file")),
+        sa.ForeignKeyConstraint(["bundle_sha256"], ["stored_file.sha256"], name=op.f("fk_port_check_bundle_sha256_stored_file")),
+        sa.ForeignKeyConstraint(["policy_id"], ["policy.id"], name=op.f("fk_port_check_policy_id_policy")),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_port_check")),
+    )
+    op.create_index(op.f("ix_port_check_policy_id"), "port_check", ["policy_id"], unique=False)
 
     for function in (AUDIT_ROW, AUDIT_NOTE, REFUSE_CHANGE, AUDIT_FIELD, AUDIT_DIGEST, AUDIT_CHAIN, *COUNT_TIME):
         op.execute(function)

@@ -18,6 +18,7 @@ from app.platform.database import transaction
 from app.tables.accounts import Role
 from tests.app.filled_study import FilledStudy
 from tests.app.ingest.test_clocks import report as percept_report
+from tests.app.planning.bundles.port_answers import port_answers
 
 MAPPING = {
     "name": "two columns",
@@ -119,6 +120,7 @@ class World:
             "upload_id": 1,
             "policy_id": small,
             "position": 1,
+            "check_id": self.send(f"/policies/{small}/port-checks", **self.port_form(small))["id"],
             "study_code": "main",
             "site_code": "main",
             "snapshot_id": 1,
@@ -201,6 +203,7 @@ class World:
                 "json": {"reason": "the program changed"},
             },
             ("post", "/participants/{code}/policies"): {"data": {"name": "x"}, "files": {"file": ("x.onnx", constant_onnx(0.5, 10))}},
+            ("post", "/policies/{policy_id}/port-checks"): self.port_form(small),
             ("post", "/policies/{policy_id}/release"): {"json": {"password": PASSWORD}},
             ("patch", "/policies/{policy_id}"): {"policy_id": retired, "json": {"retired_reason": "worn out"}},
             ("post", "/participants/{code}/jobs"): {"code": "P4", "json": {"kind": "evaluate", "preset": "quick", "methods": ["linear"]}},
@@ -246,6 +249,12 @@ class World:
         """Upload files of P4."""
         given = [("file", file) for file in [(name, content), *(more or [])]]
         return dict(self.send("/uploads", data={"participant": "P4", **stated}, files=given))
+
+    def port_form(self, policy: int) -> Json:
+        """Make the form of a check of a copy of a policy, and take its bundle for it."""
+        answer = self.admin.get(f"/api/v1/policies/{policy}/bundle")
+        assert answer.status_code == 200, answer.text
+        return {"data": {"target": "TFLite"}, "files": {"file": ("answers.csv", port_answers(answer.content, 0.25))}}
 
     def replayed(self, policy: int) -> Json:
         """A session of P1 and a policy to run over it."""

@@ -22,9 +22,11 @@ from app.study.repository import participant_by_code
 from app.tables.jobs import Job
 from app.tables.learning import Policy
 from ml.rl import MlpPolicy
+from tests.app.planning.bundles.port_answers import port_answers
 from tests.conftest import PASSWORD
 
 BUNDLE_FORM = {"data": {"min_ma": "0", "max_ma": "3", "ramp_ma_per_s": "1.5"}}
+PORTS = "/participants/{code}/policies/{policy_id}/ports"
 RELEASE = "/participants/{code}/policies/{policy_id}/release"
 PAIRS: dict[tuple[str, str], dict[str, Any]] = {
     # every route with two or more ids in its path, and what makes the call of a matched pair succeed
@@ -32,6 +34,8 @@ PAIRS: dict[tuple[str, str], dict[str, Any]] = {
     ("POST", RELEASE): {"data": BUNDLE_FORM["data"] | {"password": PASSWORD}},
     ("POST", "/participants/{code}/policies/{policy_id}/retire"): {"data": {"reason": "worn out"}},
     ("GET", "/participants/{code}/policies/{policy_id}/bundle"): {},
+    ("GET", "/api/v1/policies/{policy_id}/port-checks/{check_id}/page"): {},
+    ("POST", PORTS): {"data": {"target": "TFLite"}},  # and the answers of a copy of the policy
     ("POST", "/participants/{code}/policies/{policy_id}/bundle"): BUNDLE_FORM,
     ("PATCH", "/api/v1/studies/{study_code}/sites/{site_code}"): {"json": {"name": "Moved", "reason": "new house"}},
     ("POST", "/api/v1/studies/{study_code}/sites/{site_code}/end"): {"json": {"reason": "closed"}},
@@ -79,6 +83,9 @@ def study_world(client: TestClient, code: str, seed: int, sign_plan: Callable[..
     ).json()["files"][0]["id"]  # fmt: skip
     plan = client.post(f"{api}/visits/{visits[1]}/plan", json={"policy_ids": [policy]})
     assert sign_plan(visits[1], plan_id=plan.json()["id"]).status_code == 200
+    answers = port_answers(client.get(f"{api}/policies/{policy}/bundle").content)
+    checked = client.post(f"{api}/policies/{policy}/port-checks", data={"target": "C"}, files={"file": ("a.csv", answers)})
+    assert checked.status_code == 201, checked.text
     job = client.post(f"{home}/jobs", json={"kind": "evaluate", "preset": "quick"})
     assert job.status_code == 202, job.text
     return {
@@ -95,6 +102,8 @@ def study_world(client: TestClient, code: str, seed: int, sign_plan: Callable[..
         "plan_id": plan.json()["id"],
         "snapshot_id": client.post(f"{home}/snapshots").json()["id"],
         "job_id": job.json()["id"],
+        "check_id": checked.json()["id"],
+        "answers": answers,
     }
 
 
@@ -125,6 +134,8 @@ def test_every_route_with_two_ids_refuses_another_participants(
         names = [part.split("}")[0] for part in path.split("{")[1:]]
         for owners in product((0, 1), repeat=len(names)):
             chosen = {name: both[owner][name] for name, owner in zip(names, owners, strict=True)}
+            if path == PORTS:
+                call = call | {"files": {"file": ("a.csv", both[owners[names.index("policy_id")]]["answers"])}}
             before = _written(db)
             caller = others.get(path, client)
             answer = caller.request(method, path.format(**chosen), headers={"Accept": "text/html"}, follow_redirects=False, **call)

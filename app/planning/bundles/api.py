@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Response
-from fastapi.responses import PlainTextResponse
+from fastapi import APIRouter, File, Form, Path, Query, Response, UploadFile
+from fastapi.responses import HTMLResponse, PlainTextResponse
+from pydantic import Field
 
 from app.accounts.deps import CurrentCaller
 from app.learning.deps import CurrentPolicy
+from app.planning.bundles import ports, slots
 from app.planning.bundles import service as bundles
-from app.planning.bundles import slots
 from app.platform.database import Db
-from app.platform.web.schemas import problems
+from app.platform.web.schemas import Model, RowId, Text, problems
 from app.study.deps import CurrentVisit
 from app.tables.participants import Hemisphere, Participant
+from app.tables.plans import PortCheck
+from ml.deploy.ports.answers import MAX_BYTES
+from ml.deploy.ports.report import fault_words
+from ml.deploy.ports.report import page as printed_check
 
 router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
 
@@ -44,6 +50,77 @@ def read_bundle(
     content = bundles.bundle(db, participant, policy, bundles.Limits(min_ma, max_ma, ramp_ma_per_s), hemisphere, caller)
     name = f"{participant.code}-policy-{policy.id}.zip"
     return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+class PortFaultOut(Model):
+    """One fault of a converted copy."""
+
+    code: str = Field(description="`lost_sample`, `full_dose`, `order`, `wrap`, `rounded` and others: docs/deployment.md.")
+    text: str
+
+
+class PortCheckOut(Model):
+    """Check of a converted copy by its answers to the port vectors of a bundle."""
+
+    id: int
+    policy_id: int
+    target: str = Field(description="What was converted, by what.")
+    verdict: str = Field(description="`same`, `within` or `not this policy`.")
+    headline: str
+    worst_ma: float | None = Field(description="Largest difference, mA; null where nothing could be compared.")
+    faults: list[PortFaultOut]
+    bundle_sha256: str
+    answers_sha256: str
+    created_at: datetime
+    created_by: str
+
+
+@router.get("/policies/{policy_id}/port-checks")
+def list_port_checks(policy: CurrentPolicy, db: Db) -> list[PortCheckOut]:
+    """List the checks of converted copies of a policy, newest first."""
+    return [_port_check_out(row) for row, _ in ports.checks_of(db, policy)]
+
+
+@router.post("/policies/{policy_id}/port-checks", status_code=201, responses=problems(409, 413))
+def add_port_check(
+    policy: CurrentPolicy,
+    db: Db,
+    caller: CurrentCaller,
+    file: Annotated[UploadFile, File(description="CSV: `row` and `hash` of port-vectors.csv, and `answer`, `answer_ma` or both.")],
+    target: Annotated[Text, Form(max_length=100, description="What was converted, by what, as 'TFLite, onnx2tf 1.29.24'.")],
+    bundle: Annotated[str | None, Form(pattern="^[0-9a-f]{64}$", description="SHA-256 of the bundle; the newest one if missing.")] = None,
+) -> PortCheckOut:
+    """Check a converted copy of a policy by its answers to the port vectors of a bundle that was taken."""
+    participant = db.get_one(Participant, policy.participant_id)
+    return _port_check_out(ports.add_check(db, participant, policy, file.file.read(MAX_BYTES + 1), target, bundle, caller))
+
+
+@router.get(
+    "/policies/{policy_id}/port-checks/{check_id}/page",
+    response_class=HTMLResponse,
+    responses={200: {"content": {"text/html": {}}, "description": "The page."}},
+)
+def print_port_check(policy: CurrentPolicy, check_id: RowId, db: Db) -> HTMLResponse:
+    """Show one page about a check of a converted copy, for the study's file."""
+    row = ports.find_check(db, policy, check_id)
+    return HTMLResponse(printed_check(ports.result_of(row), row.target, f"{row.created_at:%d %B %Y}, {row.created_by}"))
+
+
+def _port_check_out(row: PortCheck) -> PortCheckOut:
+    found = ports.result_of(row)
+    return PortCheckOut(
+        id=row.id,
+        policy_id=row.policy_id,
+        target=row.target,
+        verdict=row.verdict,
+        headline=ports.line_of(row),
+        worst_ma=found.worst_ma,
+        faults=[PortFaultOut(code=fault.code, text=fault_words(fault, found)) for fault in found.faults],
+        bundle_sha256=row.bundle_sha256,
+        answers_sha256=row.answers_sha256,
+        created_at=row.created_at,
+        created_by=row.created_by,
+    )
 
 
 @router.get(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, File, Form, Request, UploadFile
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
@@ -16,7 +16,7 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning.deps import CurrentOwnPolicy
 from app.planning import wording
-from app.planning.bundles import repository, slots
+from app.planning.bundles import ports, repository, slots
 from app.planning.bundles import service as bundles
 from app.planning.plans.key import common_limits
 from app.planning.plans.limits import device_limits
@@ -32,6 +32,7 @@ from app.study.deps import CurrentParticipant, CurrentVisit, ResultsViewed
 from app.study.service import may
 from app.tables.learning import Policy
 from app.tables.participants import Hemisphere, Participant
+from ml.deploy.ports.answers import MAX_BYTES
 from ml.deploy.wording import battery_life_words, energy_words, warning_sentences
 
 router = APIRouter()
@@ -72,6 +73,27 @@ def take_bundle(
     return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
 
+@router.post("/participants/{code}/policies/{policy_id}/ports")
+def check_port(
+    request: Request,
+    participant: CurrentParticipant,
+    policy: CurrentOwnPolicy,
+    db: Db,
+    caller: CurrentCaller,
+    target: Annotated[str, Form(max_length=100)] = "",
+    file: Annotated[UploadFile | None, File()] = None,
+) -> Response:
+    """Check a converted copy by the table of its answers."""
+    try:
+        if file is None or not file.filename:
+            raise Invalid("No file was chosen.", "Choose the CSV with the answers of the copy.", field="file")
+        ports.add_check(db, participant, policy, file.file.read(MAX_BYTES + 1), target, None, caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _page(request, participant, policy, db, caller, error, {"target": target}, form="port")
+    return RedirectResponse(f"/participants/{participant.code}/policies/{policy.id}/bundle?done=checked#ports", 303)
+
+
 @router.post("/participants/{code}/policies/{policy_id}/release")
 def release_policy(
     request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller, values: FormValues
@@ -84,7 +106,7 @@ def release_policy(
         releases.release(db, participant, policy, limits, hemisphere, caller, password, code)
     except BetaloopError as error:
         db.rollback()
-        return _page(request, participant, policy, db, caller, error, typed, releasing=True)
+        return _page(request, participant, policy, db, caller, error, typed, form="release")
     return RedirectResponse(f"/participants/{participant.code}/policies/{policy.id}/bundle?done=released#release", 303)
 
 
@@ -128,7 +150,7 @@ def _page(
     error: BetaloopError | None = None,
     typed: Mapping[str, str] | None = None,
     *,
-    releasing: bool = False,
+    form: str = "",
 ) -> HTMLResponse:
     facts: dict[str, Any] = {"manifest": None, "warnings": [], "energy": None, "unmade": None, "stopped": None}
     if error is None:
@@ -168,7 +190,9 @@ def _page(
         may_release=may(caller, can.RELEASE, participant),
         key=bundles.public_key(),
         remarks=field_notes(error, typed or {}),
-        releasing=releasing,
+        releasing=form == "release",
+        porting=form == "port",
+        ports=[(row, ports.line_of(row), check) for row, check in ports.checks_of(db, policy)],
         problem=error.problem(request.url.path) if error else None,
         **facts,
     )

@@ -8,7 +8,7 @@ from sqlalchemy import or_, select, text
 from sqlalchemy.orm import Session, selectinload
 
 from app.tables.learning import Policy
-from app.tables.plans import SEALED, BundleRelease, Plan, PlanItem
+from app.tables.plans import SEALED, BundleRelease, Plan, PlanItem, PortCheck
 from app.tables.visits import Visit
 
 
@@ -22,6 +22,11 @@ def releases(db: Session, policy_id: int) -> Sequence[BundleRelease]:
 def releases_of_slots(db: Session, item_ids: Sequence[int]) -> Sequence[BundleRelease]:
     """Bundles that left for sessions of plans, newest first."""
     return db.scalars(select(BundleRelease).where(BundleRelease.plan_item_id.in_(item_ids)).order_by(BundleRelease.id.desc())).all()
+
+
+def port_checks(db: Session, policy_ids: Sequence[int]) -> Sequence[PortCheck]:
+    """List the checks of ports of some policies, newest first."""
+    return db.scalars(select(PortCheck).where(PortCheck.policy_id.in_(policy_ids)).order_by(PortCheck.id.desc())).all()
 
 
 def lock_content(db: Session, content_sha256: str) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -39,6 +39,7 @@ from app.tables.plans import BundleRelease
 from ml.deploy.appraisal import plausible_beta
 from ml.deploy.bundle import build_bundle, describe, sign
 from ml.deploy.manifest import Approval, BundleError, BundleManifest
+from ml.deploy.ports.windows import COUNT, Recorded
 from ml.policies.onnx_policy import PolicyFileError
 
 KEY = "bundle-signing"
@@ -64,6 +65,27 @@ class Limits:
     def stated(self) -> bool:
         """Whether anything was stated."""
         return any(v is not None for v in (self.min_ma, self.max_ma, self.ramp_ma_per_s))
+
+
+class Tried(NamedTuple):
+    """Beta windows that a bundle's policy is tried on: `probe`, [M, W], for the test vectors, and the snapshot with all of them."""
+
+    probe: NDArray[np.float64]
+    snapshot_sha256: str | None
+
+    def by_visit(self) -> list[Recorded]:
+        """Read the recorded windows of each visit, as many as port vectors can hold; none where no snapshot has any."""
+        if self.snapshot_sha256 is None:
+            return []
+        buffer = read_buffer(self.snapshot_sha256)
+        rows = buffer.transitions()
+        visits = np.array([session.visit for session in buffer.sessions])[rows.session]
+        found = []
+        for visit in np.unique(visits):
+            states = rows.states[visits == visit]
+            places = np.unique(np.linspace(0, len(states) - 1, min(len(states), COUNT)).astype(int))
+            found.append(Recorded(f"visit {visit}", np.asarray(states[places], dtype=np.float64)))
+        return found
 
 
 def signing_key() -> Ed25519PrivateKey:
@@ -100,7 +122,7 @@ def refuse_after_events(db: Session, participant: Participant, policy: Policy) -
         raise Conflict(f"No bundle of the policy leaves: {what}.", wording.ANSWER_EVENT)
 
 
-def policy_bundle(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64]) -> bytes:
+def policy_bundle(policy: Policy, manifest: BundleManifest, windows: Tried) -> bytes:
     """The signed bundle of a policy. Raises Invalid where it cannot be made."""
     try:
         return _signed(policy, manifest, windows)
@@ -108,7 +130,7 @@ def policy_bundle(policy: Policy, manifest: BundleManifest, windows: NDArray[np.
         raise _unmade(policy, error) from error
 
 
-def content_of(manifest: BundleManifest, windows: NDArray[np.float64] | None, policy: Policy | None, stated_by: str | None) -> str:
+def content_of(manifest: BundleManifest, windows: Tried | None, policy: Policy | None, stated_by: str | None) -> str:
     """The SHA-256 of what a bundle holds, but who takes it and when.
 
     Args:
@@ -120,7 +142,8 @@ def content_of(manifest: BundleManifest, windows: NDArray[np.float64] | None, po
     if policy is not None:
         digest.update(policy.onnx_sha256.encode())
     if windows is not None:
-        digest.update(np.ascontiguousarray(windows).tobytes())
+        digest.update(np.ascontiguousarray(windows.probe).tobytes())
+        digest.update(f"port vectors 1, {windows.snapshot_sha256}".encode())
     return digest.hexdigest()
 
 
@@ -175,29 +198,30 @@ def preview(
         raise _unmade(policy, error) from error
 
 
-def _signed(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64]) -> bytes:
+def _signed(policy: Policy, manifest: BundleManifest, windows: Tried) -> bytes:
     """The signed bundle. A policy made elsewhere is run in a child, one of ours here. Raises BundleError, PolicyFileError."""
     content = onnx_of(policy)
     if policy.kind != FOREIGN:
-        return sign(build_bundle(content, manifest, windows), signing_key())
+        return sign(build_bundle(content, manifest, windows.probe, windows.by_visit()), signing_key())
     with files.draft_folder() as folder:
         _in_child(policy, manifest, windows, folder / "bundle.zip")
         return (folder / "bundle.zip").read_bytes()
 
 
-def _described(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64]) -> BundleManifest:
+def _described(policy: Policy, manifest: BundleManifest, windows: Tried) -> BundleManifest:
     """The manifest alone, as `_signed`."""
     content = onnx_of(policy)
     if policy.kind != FOREIGN:
-        return describe(content, manifest, windows)
+        return describe(content, manifest, windows.probe)
     return BundleManifest.from_bytes(_in_child(policy, manifest, windows, None)["manifest"].encode())
 
 
-def _in_child(policy: Policy, manifest: BundleManifest, windows: NDArray[np.float64], target: Path | None) -> dict[str, Any]:
+def _in_child(policy: Policy, manifest: BundleManifest, windows: Tried, target: Path | None) -> dict[str, Any]:
     params = {
         "file": str(files.path_of(policy.onnx_sha256).resolve()),
         "manifest": manifest.to_bytes().decode(),
-        "windows": windows.tolist(),
+        "windows": windows.probe.tolist(),
+        "visits": [] if target is None else [(part.kind, part.windows.tolist()) for part in windows.by_visit()],
         "target": None if target is None else str(target),
         "secrets": str(get_settings().data_dir.resolve() / "secrets"),
         "key": KEY,
@@ -229,8 +253,8 @@ def approvals(db: Session, participant_id: int, policy_id: int) -> tuple[Approva
 
 def manifest_of(
     db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
-) -> tuple[BundleManifest, NDArray[np.float64]]:
-    """What the bundle says about itself, and beta windows for its test vectors: logged ones, where there are any of its length."""
+) -> tuple[BundleManifest, Tried]:
+    """What the bundle says about itself, and the beta windows that it is tried on: logged ones, where there are any of its length."""
     study.require_own(participant, policy, f"policy {policy.id}")
     version = study_repository.settings_version(db, policy.settings_version_id)
     snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id else None
@@ -281,7 +305,7 @@ def manifest_of(
         )
     except BundleError as error:
         raise _unmade(policy, error, _at_fault(limits, device, cdbs)) from error
-    return manifest, probe_windows(usable, version)
+    return manifest, Tried(probe_windows(usable, version), usable.file_sha256 if usable else None)
 
 
 def _at_fault(limits: Limits, device: DeviceLimits | None, cdbs_ma: float) -> dict[str, str]:

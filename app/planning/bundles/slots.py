@@ -13,7 +13,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import repository as learning
 from app.planning import wording
-from app.planning.bundles import repository, service
+from app.planning.bundles import ports, repository, service
 from app.planning.grounds import events_against, unanswered
 from app.planning.plans.designs import Planned, seed_of
 from app.planning.plans.key import common_limits
@@ -62,7 +62,7 @@ def bundle(db: Session, visit: Visit, position: int, caller: Caller, at: datetim
         side = Hemisphere(line.item.hemisphere) if line.item.hemisphere else None
         manifest, windows = service.manifest_of(db, visit.participant, line.policy, limits, side, caller)
         manifest = replace(
-            manifest, slot=slot, card=_card(view, line), approvals=_approvals(view, signature), limits_stated_by=_stated_by(signature)
+            manifest, slot=slot, card=_card(db, view, line), approvals=_approvals(view, signature), limits_stated_by=_stated_by(signature)
         )
     else:
         manifest = _scheduled(db, view, line, slot, signature, caller)
@@ -138,11 +138,11 @@ def _slot(view: PlanView, item: PlanItem, signature: Signature, at: datetime) ->
     )
 
 
-def _card(view: PlanView, line: PlanLine) -> PlanCard:
+def _card(db: Session, view: PlanView, line: PlanLine) -> PlanCard:
     """What the plan's sheet says of a session; while the key is sealed no more than is shown there."""
     seen = shown(view)
     one = next(other for other in seen.lines if other.item.position == line.item.position)
-    card = card_of(one, seen, None)
+    card = card_of(one, seen, None, {} if view.sealed or line.policy is None else ports.lines_of(db, [line.policy.id]))
     told = tuple((label, text) for label, text in card.lines if label != BUNDLE)
     return PlanCard(
         head=card.head, minutes=card.minutes, lines=told, warnings=card.warnings, stop_rules=wording.STOP_RULES, blinded=view.sealed
@@ -196,7 +196,7 @@ def _scheduled(db: Session, view: PlanView, line: PlanLine, slot: Slot, signatur
             public_key=service.public_key(),
             approvals=_approvals(view, signature),
             slot=slot,
-            card=_card(view, line),
+            card=_card(db, view, line),
             schedule=schedule,
             **service.beta_limits(data),
         )

@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 from app.accounts.deps import CurrentCaller
 from app.evaluation.shown import estimate_out
 from app.planning import wording
+from app.planning.bundles.ports import lines_of
 from app.planning.bundles.repository import releases_of_slots
 from app.planning.plans import key, service, visits
 from app.planning.plans.schemas import (
@@ -76,7 +77,8 @@ def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
     name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
     from app.planning.sheet import pdf  # what writes PDF takes long to load: a service that was killed is back sooner without it
 
-    content = pdf.render(view, _bundles(db, view), caller.label, now(), standings_of(db, view, caller))
+    copies = lines_of(db, [line.policy.id for line in view.lines if line.policy is not None])
+    content = pdf.render(view, _bundles(db, view), copies, caller.label, now(), standings_of(db, view, caller))
     return Response(content, media_type="application/pdf", headers={"Content-Disposition": f'inline; filename="{name}"'})
 
 

@@ -8,8 +8,7 @@ from fpdf import FPDF
 
 from app.planning.plans.view import PlanView
 from app.planning.sheet.content import Card, card_of
-from app.planning.sheet.ink import INK, LINE, MUTED
-from app.planning.sheet.latin1_text import latin
+from app.planning.sheet.ink import INK, LINE, MUTED, latin
 from ml.outcomes import OUTCOMES
 
 WIDTH = 277.0
@@ -21,9 +20,9 @@ _FIELDS = (
 )  # fmt: skip
 
 
-def draw_cards(pdf: FPDF, view: PlanView, bundles: Mapping[int, str]) -> None:
+def draw_cards(pdf: FPDF, view: PlanView, bundles: Mapping[int, str], ports: Mapping[int, str]) -> None:
     """All cards, two beside each other in the order of the day; no card is cut by the end of a page."""
-    cards = [card_of(line, view, bundles.get(line.item.id)) for line in view.lines]
+    cards = [card_of(line, view, bundles.get(line.item.id), ports) for line in view.lines]
     for pair in (cards[i : i + 2] for i in range(0, len(cards), 2)):
         height = max(_height(pdf, card) for card in pair)
         if pdf.will_page_break(height):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from app.evaluation.verdict_wording import STANDING_NAMES, effect, likely, plainly
@@ -31,8 +32,12 @@ class Card:
     fill: tuple[int, int, int]
 
 
-def card_of(line: PlanLine, view: PlanView, bundle: str | None) -> Card:
-    """A session's card; of a sealed plan's session, which has lost its controller, letters and common limits alone."""
+def card_of(line: PlanLine, view: PlanView, bundle: str | None, ports: Mapping[int, str] = {}) -> Card:
+    """A session's card; of a sealed plan's session, which has lost its controller, letters and common limits alone.
+
+    Args:
+        bundle: SHA-256 of the newest one taken for the session. ports: checks of converted copies, by the number of the policy.
+    """
     item = line.item
     length = f"{item.minutes:g} min"
     for minutes, what in ((item.washout_minutes, "washout"), (item.break_minutes, "break")):
@@ -45,6 +50,7 @@ def card_of(line: PlanLine, view: PlanView, bundle: str | None) -> Card:
         "Limits": limits,
         "Design": wording.design_name(line.design) if line.design else "",
         BUNDLE: "" if view.sealed else _bundle(line, bundle),
+        "Copies": ports.get(line.policy.id, "") if line.policy and not view.sealed else "",
         "Verdict": _verdict(line),
         "Expected": _expected(line),
         "Against cDBS": effect(line.row.differences) if line.row and line.row.differences else "",

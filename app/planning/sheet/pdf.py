@@ -16,8 +16,7 @@ from app.planning import wording
 from app.planning.plans.view import PlanView, shown
 from app.planning.sheet.cards import WIDTH, draw_cards
 from app.planning.sheet.content import HASH
-from app.planning.sheet.ink import INK, LINE, MUTED, clock, shade
-from app.planning.sheet.latin1_text import latin
+from app.planning.sheet.ink import INK, LINE, MUTED, clock, latin, shade
 from app.platform.signatures.service import SignatureState
 from app.study.cdbs_amplitude import held_settings
 from app.study.characteristics.service import fields_of
@@ -91,11 +90,19 @@ def _approval(view: PlanView) -> str:
     return f"{by}, signature {view.signature.sha256[:12]}" if view.signature else by
 
 
-def render(view: PlanView, bundles: Mapping[int, str], printed_by: str, printed_at: datetime, standings: Sequence[str] = ()) -> bytes:
+def render(
+    view: PlanView,
+    bundles: Mapping[int, str],
+    ports: Mapping[int, str],
+    printed_by: str,
+    printed_at: datetime,
+    standings: Sequence[str] = (),
+) -> bytes:
     """The sheet of a plan as PDF bytes.
 
     Args:
         view: the plan. bundles: SHA-256 of the newest bundle that was taken for a session, by the number of its plan item.
+        ports: checks of converted copies, by the number of the policy.
         printed_by: who printed it. printed_at: when; stands on the page and in the document's metadata.
         standings: sentences on the policies.
     """
@@ -108,7 +115,7 @@ def render(view: PlanView, bundles: Mapping[int, str], printed_by: str, printed_
         _paragraph(pdf, "Note", view.plan.note)
     for text in standings:
         _paragraph(pdf, "Standing", text)
-    draw_cards(pdf, view, bundles)
+    draw_cards(pdf, view, bundles, ports)
     _designs(pdf, view)
     _reading(pdf, view)
     _closing(pdf, view)

@@ -62,6 +62,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "plan": (),
     "plan_item": (),
     "bundle_release": (),
+    "port_check": ("result",),
     "signature": ("content",),
     "day_entry": (),
     "job": ("progress", "message", "updated_at"),

@@ -137,6 +137,8 @@ def _of_learning(world: World) -> dict[str, Call]:
     return {
         "/participants/{code}/policies": {"data": {"name": "y"}, "files": {"file": ("y.onnx", constant_onnx(0.6, 10))}},
         f"{policy}/bundle": {"data": LIMITS},
+        f"{policy}/ports": of_api(world, "post", "/policies/{policy_id}/port-checks")
+        | {name: world.forms["post", "/policies/{policy_id}/port-checks"][name] for name in ("data", "files")},
         f"{policy}/release": {"data": LIMITS | {"password": PASSWORD}},
         f"{policy}/retire": of_api(world, "patch", "/policies/{policy_id}") | {"data": {"reason": "worn out"}},
         "/participants/{code}/buffer-gate": {"data": {"choice": "open", "reason": "agreed in the trial meeting"}},

@@ -42,6 +42,7 @@ FORMS = {
     "/column-mappings/{mapping_id}/remove": can.UPLOAD,
     "/participants/{code}/policies": can.WRITE_POLICIES,
     "/participants/{code}/policies/{policy_id}/bundle": can.TAKE_BUNDLES,
+    "/participants/{code}/policies/{policy_id}/ports": can.TAKE_BUNDLES,
     "/participants/{code}/policies/{policy_id}/release": can.RELEASE,
     "/participants/{code}/policies/{policy_id}/retire": can.WRITE_POLICIES,
     "/participants/{code}/buffer-gate": can.DECIDE_GATE,

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
 
-from app.planning.sheet.latin1_text import latin
+from app.planning.sheet.ink import latin
 from tests.app.words import methods_named
 
 
