@@ -3,7 +3,7 @@
 The timeline runs with the implant's ticks (`packets/ticks.py`). PacketGenTime gives its place on the PC's clock, the drift between both,
 and where a clock was set (`packets/clock.py`). It moves no packet against another. Samples are equidistant as far as no signal is missing.
 
-Differences from the public toolbox, which places every stretch without loss by its own PacketGenTimes, are in `docs/ingest.md`.
+Differences from the public toolbox, which places every stretch without loss by its own PacketGenTimes, are in `docs/ingest/formats.md`.
 """
 
 from __future__ import annotations
