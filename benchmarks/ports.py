@@ -10,6 +10,7 @@ betaloop's own C headers alone, which need no environment. A converter that cann
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import subprocess
 import sys
@@ -34,7 +35,8 @@ from ml.deploy.ports.vectors import PortVectors
 from ml.deploy.ports.windows import Recorded
 from ml.rl import MlpPolicy
 
-PROGRAM = Path(__file__).parent / "support" / "converters.py"
+PROGRAM = "import converters; converters.main()"
+SUPPORT = Path(__file__).parent / "support"
 MAKE_S, CONVERT_S = 3600, 900
 
 
@@ -145,7 +147,8 @@ def answers_of(python: Path, function: str, model: Path, case: Case) -> np.ndarr
     target = case.folder / f"{function}.npy"
     target.unlink(missing_ok=True)
     arguments = [function, model, case.folder / "windows.npy", case.folder / "calibration.npy", target]
-    ran = subprocess.run([python, PROGRAM, *map(str, arguments)], capture_output=True, text=True, timeout=CONVERT_S)
+    env = os.environ | {"PYTHONPATH": str(SUPPORT)}
+    ran = subprocess.run([python, "-c", PROGRAM, *map(str, arguments)], capture_output=True, text=True, timeout=CONVERT_S, env=env)
     if ran.returncode:
         raise RuntimeError(_last_line(ran.stderr))
     return np.asarray(np.load(target))

@@ -214,7 +214,8 @@ def convert_executorch(model: Path, windows: Array, _calibration: Array, folder:
 CONVERTERS: dict[str, Convert] = {name.removeprefix("convert_"): value for name, value in globals().items() if name.startswith("convert_")}
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Convert a policy and store the copy's answers: name of the converter, model, arrays of windows, file of the answers."""
     chosen, model_path, *arrays, target = sys.argv[1:]
     with tempfile.TemporaryDirectory() as made_in:
         answers = CONVERTERS[chosen](Path(model_path).resolve(), *(np.load(path) for path in arrays), Path(made_in))

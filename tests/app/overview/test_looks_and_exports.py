@@ -47,7 +47,8 @@ SHOWS_NO_RESULTS = {
     "/uploaded-files/{file_id}/mapping", "/api/v1/uploaded-files/{file_id}/preview",
     # what policies are and learned from, and jobs
     "/participants/{code}/policies", "/api/v1/participants/{code}/policies", "/api/v1/policies/{policy_id}",
-    "/api/v1/policies/{policy_id}/release", "/snapshots/{snapshot_id}", "/api/v1/snapshots/{snapshot_id}",
+    "/api/v1/policies/{policy_id}/release", "/api/v1/policies/{policy_id}/port-checks",
+    "/api/v1/policies/{policy_id}/port-checks/{check_id}/page", "/snapshots/{snapshot_id}", "/api/v1/snapshots/{snapshot_id}",
     "/api/v1/participants/{code}/snapshots", "/participants/{code}/jobs", "/jobs", "/jobs/{job_id}", "/api/v1/participants/{code}/jobs",
     "/api/v1/jobs/{job_id}", "/api/v1/jobs/{job_id}/events",
     # what shall run
