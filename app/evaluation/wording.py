@@ -29,8 +29,8 @@ def count_stops(flag: Flag) -> str:
 
 
 def amplitude(fraction: float, ma: float | None) -> str:
-    """An amplitude in mA; as a share of cDBS where that is not known in mA."""
-    return f"{ma:.1f} mA" if ma is not None else f"{percent(fraction)} of the cDBS amplitude"
+    """Format an amplitude in mA, to hundredths so that it contradicts no limit; as a share of cDBS where that is not known in mA."""
+    return f"{f'{ma:.2f}'.removesuffix('0')} mA" if ma is not None else f"{percent(fraction)} of the cDBS amplitude"
 
 
 def chance(share: float) -> str:

@@ -28,7 +28,7 @@ def test_the_best_fixed_amplitude_stands_beside_the_answer_where_it_is_not_that_
     drawn = {"energy": [0.5] * N, "grasp_hz": [1.7] * 250 + [1.9] * 750}
     judge({policies[0]: judged(50.0), low.id: judged(60.0, outcome_draws=drawn)})
     assert (
-        f"For comparison, {3 * low.config['amplitude']:.1f} mA all the time, the best fixed amplitude by the same scores: energy "
+        "For comparison, 2.55 mA all the time, the best fixed amplitude by the same scores: energy "
         "\N{MINUS SIGN}50 %, grasp \N{MINUS SIGN}0.2 Hz, rating unchanged, tremor unchanged; 75 % likely no worse than cDBS by "
         "more than the margins."
     ) in above_fold(client.get(PAGE).text)
@@ -69,8 +69,10 @@ def test_a_first_answer_tells_of_fixed_amplitudes_until_the_policies_of_its_job_
     text = above_fold(page)
     assert "First answer, until the new policies are trained" in text
     assert "No policy has been trained yet." in text
-    assert f"For comparison, {3 * low.config['amplitude']:.1f} mA all the time, the best fixed amplitude" in text
+    assert "For comparison, 1.2 mA all the time, the best fixed amplitude" in text
     assert "no policy is barred" not in text, "there is none"
+    assert "No candidate yet." in text
+    assert 'id="ranking" class="stack" data-refresh=' in page, "the ranking follows by itself"
     last = judge({policies[0]: judged(50.0)}, job_id=job)
     assert last != first
     ranking = client.get("/api/v1/participants/P1/ranking").json()
