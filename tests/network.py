@@ -21,8 +21,8 @@ def copy(a, b):
             s.shutdown(socket.SHUT_RDWR)
         except OSError:
             pass
-place = sys.argv[2]
-server = socket.create_server(("127.0.0.1", int(sys.argv[1])))
+host, port, place = sys.argv[1:]
+server = socket.create_server((host, int(port)))
 print("ready", flush=True)
 while True:
     client, _ = server.accept()
@@ -34,6 +34,7 @@ while True:
     for pair in ((client, to), (to, client)):
         threading.Thread(target=copy, args=pair, daemon=True).start()
 """
+"""Program that passes connections on: address and port to listen at, and the port or the path of a socket that they lead to."""
 
 
 class Line:
@@ -50,7 +51,9 @@ class Line:
 
     def restore(self) -> None:
         """Pass connections on, again."""
-        self.process = subprocess.Popen([sys.executable, "-c", FORWARD, str(self.port), self._place], stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", FORWARD, "127.0.0.1", str(self.port), self._place], stdout=subprocess.PIPE, text=True
+        )
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == "ready\n"
 

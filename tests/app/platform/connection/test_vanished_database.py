@@ -20,31 +20,9 @@ from app.platform import database
 from app.platform.connection import connection_url
 from app.platform.jobs.ledger import persist
 from app.settings import get_settings
+from tests.network import FORWARD
 
 LONGEST_S = 15.0
-
-FORWARD = """
-import socket, sys, threading
-def copy(a, b):
-    try:
-        while data := a.recv(65536):
-            b.sendall(data)
-    except OSError:
-        pass
-    for s in (a, b):
-        try:
-            s.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            pass
-server = socket.create_server((sys.argv[1], 5432))
-print("ready", flush=True)
-while True:
-    client, _ = server.accept()
-    to = socket.socket(socket.AF_UNIX)
-    to.connect(sys.argv[2])
-    for pair in ((client, to), (to, client)):
-        threading.Thread(target=copy, args=pair, daemon=True).start()
-"""
 
 
 def ran(*command: str) -> None:
@@ -65,7 +43,9 @@ class Machine:
         for words in (("addr", "add", f"{self.address}/30", "dev", "inside"), ("link", "set", "inside", "up"), ("link", "set", "lo", "up")):
             ran("ip", "-n", self.space, *words)
         self.process = subprocess.Popen(
-            ["ip", "netns", "exec", self.space, sys.executable, "-c", FORWARD, self.address, path], stdout=subprocess.PIPE, text=True
+            ["ip", "netns", "exec", self.space, sys.executable, "-c", FORWARD, self.address, "5432", path],
+            stdout=subprocess.PIPE,
+            text=True,
         )
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == "ready\n"
