@@ -6,7 +6,7 @@ import sqlalchemy as sa
 from alembic import op
 from sqlalchemy.dialects import postgresql
 
-revision = "initial"
+revision = "first_0ab072eb"
 down_revision = None
 branch_labels = None
 depends_on = None

@@ -50,7 +50,10 @@ def run_demo(host: str, port: int) -> None:
     started = time.monotonic()
     with _only_demo(settings.data_dir, url):
         with console.status("Starting the database …"):
-            migrate()
+            try:
+                migrate()
+            except RuntimeError as error:
+                raise DemoFailed(f"{error}; or start a new demo in another folder: BETALOOP_DATA_DIR=FOLDER") from error
             password = add_accounts(settings.data_dir)
         os.environ["BETALOOP_DEMO"] = "true"
         with _children(settings.data_dir / "log", host, port) as children:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +51,15 @@ def test_a_database_of_another_version_is_refused_and_left_as_it_is(fresh_databa
     with pytest.raises(RuntimeError, match=r"does not know the schema .*0040.*restore a backup"):
         migrate()
     assert owner_db.scalar(text("select version_num from alembic_version")) == "0040"
+
+
+def test_the_first_schema_changes_its_name_with_its_content_so_that_databases_of_before_are_refused() -> None:
+    """Until a version is released it is changed in place. No name may begin with another: alembic takes the short one for both."""
+    (path,) = (ROOT / "migrations" / "versions").glob("*.py")
+    content, known = re.subn(r'^revision = "first_(\w+)"\n', "", path.read_text(), flags=re.MULTILINE)
+    assert known == 1
+    digest = hashlib.sha256(content.encode()).hexdigest()[:8]
+    assert f'revision = "first_{digest}"' in path.read_text(), f'write revision = "first_{digest}"'
 
 
 def test_nothing_comes_before_the_first_schema(owner_db: Session) -> None:

@@ -11,8 +11,12 @@ from pathlib import Path
 
 import psutil
 import pytest
+from sqlalchemy import text
+from sqlalchemy.orm import Session
 
+from app.simulation.demo import command
 from app.simulation.demo.keeper import MODULE, READY
+from tests.ports import free_port
 
 SERVICE = """
 import signal, sys, time
@@ -112,3 +116,10 @@ def test_a_signal_stops_the_loader_too(demo: psutil.Popen) -> None:
     demo.send_signal(signal.SIGINT)
     assert demo.wait(300) == 0
     assert not [one for one in children if one.is_running()]
+
+
+def test_a_demo_of_another_version_says_how_to_start_a_new_one(fresh_database: str, owner_db: Session) -> None:
+    owner_db.execute(text("update alembic_version set version_num = 'initial'"))
+    owner_db.commit()
+    with pytest.raises(command.DemoFailed, match=r"does not know the schema .*initial.*another folder: BETALOOP_DATA_DIR=FOLDER"):
+        command.run_demo("127.0.0.1", free_port())
