@@ -77,6 +77,7 @@ class Watched:
 
     def charts_drawn(self) -> int:
         """Scroll every chart into view and wait until it is drawn; how many there are, less those in a closed fold, which are not drawn."""
+        self.page.wait_for_load_state()  # after a click the page may be there in part
         found = self.page.query_selector_all("figure[data-chart]")
         charts = [chart for chart in found if chart.evaluate("(e) => !e.closest('details:not([open])')")]
         for chart in charts:
