@@ -146,21 +146,20 @@ class Watchdog:
 
     def __init__(self, stop: threading.Event, overdue_s: float = OVERDUE_S) -> None:
         self._stop, self._overdue_s = stop, overdue_s
-        self._beat_at: float | None = None
+        self._silent_s: float | None = None
         threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
 
     def beat(self) -> None:
         """Say that the process goes on."""
-        self._beat_at = time.monotonic()
+        self._silent_s = 0.0
 
     def _watch(self) -> None:
-        looked = time.monotonic()
+        # Looks are counted and not the clock: while the whole process stands still, as on a machine that sleeps, nothing is overdue.
         while not self._stop.wait(_LOOK_S):
-            present = time.monotonic()
-            if present - looked > 5 * _LOOK_S and self._beat_at is not None:
-                self._beat_at = present  # the whole process stood still, as on a machine that slept
-            looked = present
-            if self._beat_at is not None and present - self._beat_at > self._overdue_s:
+            if self._silent_s is None:
+                continue
+            self._silent_s += _LOOK_S
+            if self._silent_s > self._overdue_s:
                 _end(1, f"nothing went on for {self._overdue_s:.0f} s, most likely because the database neither answers nor refuses")
         time.sleep(STOP_S if get_settings().database_url else STOP_WITH_DATABASE_S)
         _end(0, "the stop takes too long; what is unfinished is taken up again later")

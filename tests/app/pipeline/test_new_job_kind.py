@@ -66,7 +66,7 @@ def test_a_new_kind_is_one_registration(
     assert service.returncode == 0
     assert seen["early"]["status"] == 422, "what the kind requires is asked for before it is queued"
     assert seen["by_api"][0] == 422, "its schema holds"
-    assert set(seen["described"]) == {"kind", "newest", "again"}
+    assert set(seen["described"]) == {"kind", "newest", "again", "bulk"}
     assert '<option value="mean_beta">Mean beta amplitude</option>' in seen["page"]
     assert seen["torch"] is False
     status, location = seen["by_form"]
