@@ -34,7 +34,6 @@ from ml.ope.posterior.estimator import build
 from ml.ope.posterior.verdict import Levels, verdict
 from ml.outcomes import PREDICTED
 from ml.population.virtual import WORLDS_PER_PART, DataDesign, World, world
-from ml.population.virtual.sessions import Days
 from ml.population.virtual.world import MARGINS, STEPS, VISITS, visit_plan
 from ml.qoc import Margins, Qoc
 from ml.trajectories import ReplayBuffer
@@ -49,7 +48,7 @@ def without_answer(w: World, design: DataDesign) -> ReplayBuffer:
     buffer, rows = w.data(design), visit_plan(w.settings, design, 0, VISITS)
     days, sessions = w.data_days(rows, 0), []
     for i, (session, row) in enumerate(zip(buffer.sessions, rows, strict=True)):
-        own, cdbs = Days(days.effects[i : i + 1], days.hours[i : i + 1]), np.ones((1, row.amplitudes.size))
+        own, cdbs = days.select(slice(i, i + 1)), np.ones((1, row.amplitudes.size))
         run = w.run(cdbs, own, UNANSWERED + i, row.amplitudes.size)
         qoc = Qoc(float(run.grasp_hz[0]), int(run.rating[0]), float(run.tremor_percent[0]))
         sessions.append(replace(session, beta=run.beta[0], lead_beta=run.lead[0], qoc=qoc))

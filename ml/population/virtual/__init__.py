@@ -1,6 +1,7 @@
 """A virtual population: a distribution over patients at beta level (steps of 2 s), in three parts, with data, policies and true returns."""
 
-from ml.population.virtual.candidates import RelayPolicy, SmoothPolicy, draw_candidates
+from ml.population.virtual.candidates import InversePolicy, RelayPolicy, SmoothPolicy, draw_candidates
+from ml.population.virtual.following import FollowingWorth, Worth, closed_loops, worth_of_following
 from ml.population.virtual.patient import MECHANISMS, RATINGS, SHAPES, TREMORS, Patient, draw_patient
 from ml.population.virtual.sessions import Days, Sessions, new_days, simulate, visit_days
 from ml.population.virtual.traits import TRAITS, with_trait
@@ -10,6 +11,7 @@ from ml.population.virtual.world import (
     DataDesign,
     Mean,
     Part,
+    Population,
     Truth,
     World,
     is_responder,
@@ -28,14 +30,19 @@ __all__ = [
     "WORLDS_PER_PART",
     "DataDesign",
     "Days",
+    "FollowingWorth",
+    "InversePolicy",
     "Mean",
     "Part",
     "Patient",
+    "Population",
     "RelayPolicy",
     "Sessions",
     "SmoothPolicy",
     "Truth",
     "World",
+    "Worth",
+    "closed_loops",
     "draw_candidates",
     "draw_patient",
     "is_responder",
@@ -46,4 +53,5 @@ __all__ = [
     "with_trait",
     "within_margins",
     "world",
+    "worth_of_following",
 ]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ml.population.virtual.equations import (
     ACT,
+    BOUT,
     BURDEN,
     BURDEN_RATE,
     BURST_OUT_GAIN,
@@ -33,8 +34,10 @@ from ml.population.virtual.equations import (
     S_FAST,
     S_SLOW,
     TREMOR,
+    U_BOUT,
     U_EPISODE,
     U_MODE,
+    UNANSWERED_RELIEF,
     Z_ACT,
     Z_DRIFT,
     Z_NOISE,
@@ -107,12 +110,15 @@ def advance(
         ring = ring_1 * s[RING] - ring_2 * s[RING_BEFORE] + p.ring_gain * (a - before)
         s[RING_BEFORE] = s[RING]
         s[RING] = ring
+        if p.bout_in > 0 and z[U_BOUT] < (p.bout_out if s[BOUT] > 0.5 else p.bout_in):
+            s[BOUT] = 1.0 - s[BOUT]
         x = c[LEVEL] + p.act_beta * s[ACT] + s[DRIFT] - p.med_beta * m + ring
+        x += p.bout_beta * s[BOUT]
         reached = amplitude[i, max(k - p.delay, 0)]
         if p.kind == HYSTERESIS:
             s[MECHANISM] = min(max(s[MECHANISM], a - p.play), a + p.play)
             reached = min(max(s[MECHANISM], 0.0), 1.0)
-        moved = c[HALF] * math.exp(p.act_half * s[ACT])
+        moved = c[HALF] * math.exp(p.act_half * s[ACT] + p.bout_half * s[BOUT])
         d = _dose(p.shape, reached, p.half * moved, p.steep)
         s[E_FAST] = _towards(s[E_FAST], d, p.fast_up, p.fast_down)
         s[E_SLOW] = _towards(s[E_SLOW], d, p.slow_up, p.slow_down)
@@ -153,12 +159,13 @@ def advance(
         sym = _dose(p.sym_shape, a, p.sym_half * moved, p.sym_steep)
         s[S_FAST] = _towards(s[S_FAST], sym, p.sym_fast_up, p.sym_fast_down)
         s[S_SLOW] = _towards(s[S_SLOW], sym, p.sym_slow_up, p.sym_slow_down)
-        relief = p.sym_fast * s[S_FAST] + (1 - p.sym_fast) * s[S_SLOW]
-        need = c[NEED] + p.act_need * s[ACT] - p.med_need * m
+        constant = (1 - p.answers) * UNANSWERED_RELIEF
+        relief = p.answers * (p.sym_fast * s[S_FAST] + (1 - p.sym_fast) * s[S_SLOW]) + constant
+        need = c[NEED] + p.act_need * s[ACT] - p.med_need * m + p.bout_need * s[BOUT]
         s[BURDEN] += BURDEN_RATE * (beta / xi - s[BURDEN])
         burden = min(max((s[BURDEN] - 0.6) / 0.8, -0.5), 1.5)
         if p.tremor == GRADED_TREMOR:
-            share = min(max((p.tremor_theta + need - 0.95 * s[S_FAST]) / p.tremor_theta, 0.0), 1.3)
+            share = min(max((p.tremor_theta + need - 0.95 * (p.answers * s[S_FAST] + constant)) / p.tremor_theta, 0.0), 1.3)
             s[TREMOR] = _towards(s[TREMOR], p.tremor_max * share, p.tremor_up, p.tremor_down)
             s[TREMOR] = max(s[TREMOR] + p.tremor_noise * z[Z_TREMOR], 0.0)
         elif p.tremor == EPISODIC_TREMOR:
@@ -169,4 +176,5 @@ def advance(
         out_beta[i, k] = beta * (1 + p.leak * a)
         out_brady[i, k] = p.burden_share * burden + (1 - p.burden_share) * (1 - relief) + 0.5 * need
         out_tremor[i, k] = s[TREMOR]
-        out_overload[i, k] = max(a**2 * (1 + 0.3 * m) - p.tolerance - p.act_tolerance * s[ACT], 0.0)
+        tolerated = p.tolerance + p.act_tolerance * s[ACT] + p.bout_tolerance * s[BOUT]
+        out_overload[i, k] = max(a**2 * (1 + 0.3 * m) - tolerated, 0.0)

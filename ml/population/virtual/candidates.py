@@ -45,6 +45,20 @@ class RelayPolicy:
         return np.where(side >= 0, self.above, self.below)
 
 
+class InversePolicy:
+    """Controller that gives most where another gives least, within the range of that one.
+
+    Args:
+        policy: a proportional controller.
+    """
+
+    def __init__(self, policy: ProportionalPolicy) -> None:
+        self.policy = policy
+
+    def act(self, states: NDArray[Any]) -> Floats:
+        return self.policy.floor + 1.0 - self.policy.act(states)
+
+
 @dataclass(frozen=True)
 class SmoothPolicy:
     """A random smooth function of the window, of the form that an actor network has: tanh units, a sigmoid at the end.
@@ -123,3 +137,44 @@ def draw_candidates(rng: np.random.Generator, xi: float, spread: float, window: 
     }
     taken = {name: policy for name, (share, policy) in optional.items() if rng.random() < share}
     return found | dict(list(taken.items())[: MOST - len(found)])
+
+
+def draw_following(rng: np.random.Generator, xi: float, spread: float, window: int = 10) -> dict[str, Policy]:
+    """Draw the twelve candidates of the second population, by name: half of them follow beta.
+
+    Three are constants, two proportional and two dual-threshold controllers. Four have the form that training leaves. The inverse one gives
+    least when beta is high.
+
+    Args:
+        rng: what they are drawn with. xi: beta threshold. spread: standard deviation of beta, both in the unit of beta.
+        window: W.
+    """
+
+    def uniform(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    def smooth(bias: float, gain: float, follows: bool) -> SmoothPolicy:
+        return SmoothPolicy.draw(rng, xi, spread, bias=bias, gain=gain, follows=follows, window=window)
+
+    def proportional(newest: int) -> ProportionalPolicy:
+        centre, half = xi + uniform(-0.8, 0.8) * spread, uniform(0.3, 1.0) * spread
+        return ProportionalPolicy(centre - half, centre + half, uniform(0.25, 0.7), newest)
+
+    def dual() -> RelayPolicy:
+        centre = xi + uniform(-0.8, 0.8) * spread
+        return RelayPolicy(centre - 0.2 * spread, centre + 0.2 * spread, uniform(0.25, 0.7), uniform(0.85, 1.0))
+
+    return {
+        "constant low": ConstantPolicy(uniform(0.4, 0.55)),
+        "constant middle": ConstantPolicy(uniform(0.55, 0.75)),
+        "constant high": ConstantPolicy(uniform(0.75, 0.95)),
+        "proportional slow": proportional(window),
+        "proportional fast": proportional(int(rng.integers(1, 4))),
+        "dual 1": dual(),
+        "dual 2": dual(),
+        "near cDBS 1": smooth(uniform(1.2, 3.0), uniform(0.5, 2.0), True),
+        "near cDBS 2": smooth(uniform(1.2, 3.0), uniform(0.5, 2.0), bool(rng.random() < 0.7)),
+        "smooth following": smooth(uniform(-0.5, 1.5), uniform(2.0, 4.0), True),
+        "smooth any": smooth(uniform(-1.0, 2.0), uniform(0.5, 3.0), False),
+        "inverse": InversePolicy(proportional(3)),
+    }

@@ -16,12 +16,15 @@ D's half-effect amplitude is half exp(day + act_half act): active, more stimulat
 Noise is an autoregression whose size is noise exp(noise_slope (a - 0.65)). Ringing is a damped second-order answer to changes of a.
 Sensed beta is beta (1 + leak a): an artefact, which symptoms do not feel.
 
-Symptoms have their own dose response S (fast and slow) and a need n = day + act_need act - med_need m:
+In a bout of need (a two-state Markov chain q, `following`) bout_beta is added to x, bout_half to log half, bout_need to n, bout_tolerance
+to the tolerance. Where symptoms do not answer, S is constant.
+
+Symptoms have their own dose response S (fast and slow) and a need n = day + act_need act - med_need m + bout_need q:
 
     bradykinesia = burden_share b + (1 - burden_share)(1 - S) + 0.5 n,   b from beta's low-pass of 60 s over the threshold
     tremor, graded: T to tremor_max clip((theta + n - 0.95 S_fast) / theta, 0, 1.3)
     tremor, episodic: begins with p = onset clip(1.3 - S + n), ends at 1/45 s
-    over-stimulation = max(0, a^2 (1 + 0.3 m) - tolerance - act_tolerance act)
+    over-stimulation = max(0, a^2 (1 + 0.3 m) - tolerance - act_tolerance act - bout_tolerance q)
 """
 
 from __future__ import annotations
@@ -55,17 +58,19 @@ Floats = NDArray[np.float64]
 LEVEL, GAIN, HALF, NEED, HOUR = range(5)
 CONSTANTS = 5
 # columns of the state of a session
-E_FAST, E_SLOW, DRIFT, ACT, NOISE, RING, RING_BEFORE, MODE, MECHANISM, S_FAST, S_SLOW, TREMOR, BURDEN, EPISODE = range(14)
-STATES = 14
+E_FAST, E_SLOW, DRIFT, ACT, NOISE, RING, RING_BEFORE, MODE, MECHANISM, S_FAST, S_SLOW, TREMOR, BURDEN, EPISODE, BOUT = range(15)
+STATES = 15
 # columns of the noise of a step
-Z_NOISE, Z_DRIFT, Z_ACT, Z_OTHER, Z_TREMOR, U_MODE, U_EPISODE = range(7)
-NOISES, NORMALS = 7, 5
+Z_NOISE, Z_DRIFT, Z_ACT, Z_OTHER, Z_TREMOR, U_MODE, U_EPISODE, U_BOUT = range(8)
+NOISES, NORMALS, UNIFORMS = 8, 5, 2
 
 BURDEN_RATE = 1.0 - np.exp(-PERIOD_S / 60.0)
 EPISODE_END = PERIOD_S / 45.0
 EPISODE_SEVERITY = 2.0
 BURST_OUT_GAIN = 0.45
 MEDICATION_WIDTH_H = 0.25
+UNANSWERED_RELIEF = 0.5
+"""Relief of symptoms that do not answer."""
 
 
 def dose(shape: int, a: Floats, half: Floats, steep: float) -> Floats:
@@ -89,7 +94,7 @@ def medication(p: Patient, constants: Floats, step: int) -> Floats:
 
 def moved_half(p: Patient, constants: Floats, state: Floats) -> Floats:
     """Compute the factor on the half-effect amplitudes of the day and the moment's activity, [n]."""
-    return np.asarray(constants[:, HALF] * np.exp(p.act_half * state[:, ACT]))
+    return np.asarray(constants[:, HALF] * np.exp(p.act_half * state[:, ACT] + p.bout_half * state[:, BOUT]))
 
 
 def step(
@@ -107,7 +112,11 @@ def step(
     m = medication(p, constants, k)
     state[:, DRIFT] += -p.drift_rate * state[:, DRIFT] + p.drift_sd * np.sqrt(2 * p.drift_rate) * z[:, Z_DRIFT]
     state[:, ACT] += -p.act_rate * state[:, ACT] + np.sqrt(2 * p.act_rate) * z[:, Z_ACT]
+    if p.bout_in > 0:
+        in_bout = state[:, BOUT] > 0.5
+        state[:, BOUT] = np.where(z[:, U_BOUT] < np.where(in_bout, p.bout_out, p.bout_in), 1.0 - state[:, BOUT], state[:, BOUT])
     x = constants[:, LEVEL] + p.act_beta * state[:, ACT] + state[:, DRIFT] - p.med_beta * m + _ringing(p, state, a - before)
+    x += p.bout_beta * state[:, BOUT]
 
     reached = _reaching_dose(p, state, amplitude, k)
     d = dose(p.shape, reached, p.half * moved_half(p, constants, state), p.steep)
@@ -182,12 +191,14 @@ def _symptoms(
     s = dose(p.sym_shape, a, p.sym_half * moved_half(p, constants, state), p.sym_steep)
     _towards(state, S_FAST, s, p.sym_fast_up, p.sym_fast_down)
     _towards(state, S_SLOW, s, p.sym_slow_up, p.sym_slow_down)
-    effect = p.sym_fast * state[:, S_FAST] + (1 - p.sym_fast) * state[:, S_SLOW]
-    need = constants[:, NEED] + p.act_need * state[:, ACT] - p.med_need * m
+    constant = (1 - p.answers) * UNANSWERED_RELIEF
+    fast = p.answers * state[:, S_FAST] + constant
+    effect = p.answers * (p.sym_fast * state[:, S_FAST] + (1 - p.sym_fast) * state[:, S_SLOW]) + constant
+    need = constants[:, NEED] + p.act_need * state[:, ACT] - p.med_need * m + p.bout_need * state[:, BOUT]
     state[:, BURDEN] += BURDEN_RATE * (beta / xi - state[:, BURDEN])
     burden = np.clip((state[:, BURDEN] - 0.6) / 0.8, -0.5, 1.5)
     if p.tremor == GRADED_TREMOR:
-        target = p.tremor_max * np.clip((p.tremor_theta + need - 0.95 * state[:, S_FAST]) / p.tremor_theta, 0.0, 1.3)
+        target = p.tremor_max * np.clip((p.tremor_theta + need - 0.95 * fast) / p.tremor_theta, 0.0, 1.3)
         _towards(state, TREMOR, target, p.tremor_up, p.tremor_down)
         state[:, TREMOR] = np.maximum(state[:, TREMOR] + p.tremor_noise * z[:, Z_TREMOR], 0.0)
     elif p.tremor == EPISODIC_TREMOR:
@@ -198,7 +209,8 @@ def _symptoms(
         assert p.tremor == NO_TREMOR
     out[1][:, k] = p.burden_share * burden + (1 - p.burden_share) * (1 - effect) + 0.5 * need
     out[2][:, k] = state[:, TREMOR]
-    out[3][:, k] = np.maximum(a**2 * (1 + 0.3 * m) - p.tolerance - p.act_tolerance * state[:, ACT], 0.0)
+    tolerated = p.tolerance + p.act_tolerance * state[:, ACT] + p.bout_tolerance * state[:, BOUT]
+    out[3][:, k] = np.maximum(a**2 * (1 + 0.3 * m) - tolerated, 0.0)
 
 
 def _towards(state: Floats, column: int, target: Any, up: float, down: float) -> None:

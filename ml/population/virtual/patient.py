@@ -53,6 +53,10 @@ class Patient(NamedTuple):
         leak: share by which stimulation at full amplitude raises the beta that is sensed, not the beta that there is (artefact).
         grasp_low, grasp_high, grasp_noise: Hz at most and least bradykinesia, error of a test. side, tolerance: over-stimulation.
         rating_form: `RATINGS`. rating_top, rating_scale, rating_noise: rating without symptoms, how far symptoms lower it, its error.
+        bout_in, bout_out: chance per step that a bout of need (movement, a burst of symptoms) begins or ends. bout_beta, bout_half,
+        bout_need, bout_tolerance: what a bout adds to x, log half, need and tolerance (`following`).
+        answers: share of the symptoms' relief that follows stimulation; the rest is constant.
+        change_visit: first visit of a lasting change, 0 for none. change_gain, change_half: what it adds to log depth and log half.
     """
 
     kind: int
@@ -132,6 +136,16 @@ class Patient(NamedTuple):
     rating_top: float
     rating_scale: float
     rating_noise: float
+    bout_in: float = 0.0
+    bout_out: float = 1.0
+    bout_beta: float = 0.0
+    bout_half: float = 0.0
+    bout_need: float = 0.0
+    bout_tolerance: float = 0.0
+    answers: float = 1.0
+    change_visit: int = 0
+    change_gain: float = 0.0
+    change_half: float = 0.0
 
     @property
     def mechanism(self) -> str:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.policies.policy import Policy
 from ml.population.virtual import _kernel, equations
-from ml.population.virtual.equations import CONSTANTS, GAIN, HALF, HOUR, LEVEL, NEED, NOISES, NORMALS, STATES
+from ml.population.virtual.equations import CONSTANTS, GAIN, HALF, HOUR, LEVEL, NEED, NOISES, NORMALS, STATES, U_BOUT, UNIFORMS
 from ml.population.virtual.patient import (
     HYSTERESIS,
     LATE_RATING,
@@ -26,6 +26,7 @@ from ml.population.virtual.patient import (
 )  # fmt: skip
 
 Floats = NDArray[np.float64]
+Symptom = Literal["brady", "tremor", "overload"]
 
 WARM_STEPS: Final = 30
 """Steps under cDBS before step 0; the last of them are the session's lead."""
@@ -37,7 +38,7 @@ OWN_NORMALS: Final = 5
 MILD = 1.0
 """Mean severity of a minute from which its tremor counts as mild."""
 
-_DAY_STREAM, _NORMAL_STREAM, _OWN_STREAM, _UNIFORM_STREAM = 1, 2, 3, 4
+_DAY_STREAM, _NORMAL_STREAM, _OWN_STREAM, _UNIFORM_STREAM, _BOUT_STREAM = 1, 2, 3, 4, 5
 
 
 @dataclass(frozen=True)
@@ -46,22 +47,29 @@ class Days:
 
     Attributes:
         effects: standard normals of the day of each session (level, gain, half, need), [n, 4]. hours: of the visit, [n].
+        change: 1 from a patient's lasting change on, 0 before it, [n].
     """
 
     effects: Floats
     hours: Floats
+    change: Floats
+
+    def select(self, sessions: slice | NDArray[np.int64]) -> Days:
+        """Return the days of some of the sessions."""
+        return Days(self.effects[sessions], self.hours[sessions], self.change[sessions])
 
 
 def new_days(key: int, first: int, n: int) -> Days:
-    """Draw a day of its own for each of the sessions first ... first + n - 1, at a uniform hour of a visit."""
+    """Draw a day of its own for each of the sessions first ... first + n - 1, at a uniform hour of a visit, after any change."""
     drawn = [_stream(key, _DAY_STREAM, i) for i in range(first, first + n)]
-    return Days(np.stack([g.standard_normal(4) for g in drawn]), np.array([g.uniform(0, HOURS_OF_A_VISIT) for g in drawn]))
+    return Days(np.stack([g.standard_normal(4) for g in drawn]), np.array([g.uniform(0, HOURS_OF_A_VISIT) for g in drawn]), np.ones(n))
 
 
-def visit_days(key: int, visits: NDArray[np.int64], hours: Floats) -> Days:
-    """Draw the days of numbered visits, [n]; sessions of one visit share its day."""
+def visit_days(key: int, visits: NDArray[np.int64], hours: Floats, change: Floats | None = None) -> Days:
+    """Draw the days of numbered visits, [n]; sessions of one visit share its day. All are after any change where `change` is None."""
     effects = {int(v): _stream(key, _DAY_STREAM, -int(v)).standard_normal(4) for v in np.unique(visits)}
-    return Days(np.stack([effects[int(v)] for v in visits]), np.asarray(hours, dtype=np.float64))
+    after = np.ones(len(visits)) if change is None else change
+    return Days(np.stack([effects[int(v)] for v in visits]), np.asarray(hours, dtype=np.float64), after)
 
 
 @dataclass(frozen=True)
@@ -82,6 +90,17 @@ class Sessions:
     grasp_hz: Floats
     rating: Floats
     tremor_percent: Floats
+
+    def by_minute(self, symptom: Symptom) -> Floats:
+        """Average a symptom over each minute, [n, M]; the last minute may be shorter. The QoCs of the session follow from these."""
+        return minute_means({"brady": self.brady, "tremor": self.tremor, "overload": self.overload}[symptom])[0]
+
+
+def minute_means(values: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Average values of every step [n, T] over minutes, [n, M], and count the steps of each minute, [M]."""
+    starts = np.arange(0, values.shape[1], STEPS_PER_MINUTE)
+    lengths = np.diff(np.append(starts, values.shape[1]))
+    return np.asarray(np.add.reduceat(values, starts, axis=1) / lengths), lengths
 
 
 def simulate(
@@ -114,8 +133,10 @@ def simulate(
     if isinstance(controller, np.ndarray) and controller.shape != (n, steps):
         raise ValueError(f"{n} sessions of {steps} steps need amplitudes of shape {(n, steps)}, not {controller.shape}")
     noise, own = _noise(key, first, n, length)
+    beginning = _draw_bouts(patient, key, first, noise)
     constants = session_constants(patient, days, own)
     state = _start(patient, constants, own)
+    state[:, equations.BOUT] = beginning * (patient.bout_in + patient.bout_out) < patient.bout_in
     amplitude = np.ones((n, length))
     beta, brady, tremor, overload = (np.empty((n, length)) for _ in range(4))
     for k in range(length):
@@ -135,8 +156,8 @@ def session_constants(patient: Patient, days: Days, own: Floats) -> Floats:
     """Compute the constants of each session, [n, CONSTANTS], from the day's normals and the session's own, [n, >= 1]."""
     result = np.empty((len(own), CONSTANTS))
     result[:, LEVEL] = patient.day_level * days.effects[:, 0] + patient.session_level * own[:, 0]
-    result[:, GAIN] = np.exp(patient.day_gain * days.effects[:, 1])
-    result[:, HALF] = np.exp(patient.day_half * days.effects[:, 2])
+    result[:, GAIN] = np.exp(patient.day_gain * days.effects[:, 1] + patient.change_gain * days.change)
+    result[:, HALF] = np.exp(patient.day_half * days.effects[:, 2] + patient.change_half * days.change)
     result[:, NEED] = patient.day_need * days.effects[:, 3]
     result[:, HOUR] = days.hours
     return result
@@ -147,13 +168,12 @@ def quality(patient: Patient, noise: Floats, amplitude: Floats, brady: Floats, t
     normals."""
     late = brady[:, -GRASP_STEPS:].mean(axis=1)
     grasp = patient.grasp_high - (patient.grasp_high - patient.grasp_low) * late + patient.grasp_noise * noise[:, 0]
-    minutes = np.arange(0, tremor.shape[1], STEPS_PER_MINUTE)
-    lengths = np.diff(np.append(minutes, tremor.shape[1]))
     complaint = 3.0 * brady + 4.0 * np.minimum(tremor / 2.5, 1.0) + 3.0 * patient.side * overload
-    felt = _rated_complaint(patient.rating_form, complaint, np.add.reduceat(complaint, minutes, axis=1) / lengths)
+    felt = _rated_complaint(patient.rating_form, complaint, minute_means(complaint)[0])
     felt += np.abs(np.diff(amplitude, axis=1)).mean(axis=1)
     score = patient.rating_top - patient.rating_scale * felt + patient.rating_noise * noise[:, 1]
-    counted = np.add.reduceat(tremor, minutes, axis=1) / lengths >= MILD
+    of_minute, lengths = minute_means(tremor)
+    counted = of_minute >= MILD
     return np.clip(grasp, 0.1, 4.5), np.clip(np.round(score), 1, 10), 100 * (counted @ lengths) / tremor.shape[1]
 
 
@@ -178,8 +198,17 @@ def _noise(key: int, first: int, n: int, length: int) -> tuple[Floats, Floats]:
     for i in range(n):
         noise[i, :, :NORMALS] = _stream(key, _NORMAL_STREAM, first + i).standard_normal((length, NORMALS))
         own[i] = _stream(key, _OWN_STREAM, first + i).standard_normal(OWN_NORMALS)
-        noise[i, :, NORMALS:] = _stream(key, _UNIFORM_STREAM, first + i).random((length, NOISES - NORMALS))
+        noise[i, :, NORMALS : NORMALS + UNIFORMS] = _stream(key, _UNIFORM_STREAM, first + i).random((length, UNIFORMS))
     return noise, own
+
+
+def _draw_bouts(patient: Patient, key: int, first: int, noise: Floats) -> Floats:
+    """Fill in the uniform numbers by which bouts begin and end, and return those of the state before step 0, [n]; 1 without bouts."""
+    drawn = np.ones((len(noise), noise.shape[1] + 1))
+    for i in range(len(noise) if patient.bout_in > 0 else 0):
+        drawn[i] = _stream(key, _BOUT_STREAM, first + i).random(drawn.shape[1])
+    noise[:, :, U_BOUT] = drawn[:, 1:]
+    return np.asarray(drawn[:, 0])
 
 
 def _start(patient: Patient, constants: Floats, own: Floats) -> Floats:

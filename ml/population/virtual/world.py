@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import cycle
 from typing import Any, Final, Literal, NamedTuple
@@ -20,7 +20,8 @@ from ml.designs import DesignSettings, Hold, lay_out
 from ml.mdp import MdpSettings, step_reward
 from ml.outcomes import PREDICTED
 from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
-from ml.population.virtual.candidates import draw_candidates
+from ml.population.virtual.candidates import draw_candidates, draw_following
+from ml.population.virtual.following import Worth, deal, with_change, with_worth, without_answer
 from ml.population.virtual.patient import MECHANISMS, Patient, draw_patient
 from ml.population.virtual.sessions import Days, Sessions, new_days, simulate, visit_days
 from ml.population.virtual.traits import TRAITS, with_trait
@@ -31,7 +32,11 @@ Floats = NDArray[np.float64]
 Part = Literal["A", "B", "C"]
 DataDesign = Literal["paper", "stratified", "ladder"]
 
+Population = Literal[1, 2]
+
 PARTS: Final[dict[str, int]] = {"A": 11, "B": 23, "C": 37}
+FOLLOWING_PARTS: Final[dict[str, int]] = {"A": 41, "B": 53, "C": 67}
+"""Seeds of the parts of the second population."""
 WORLDS_PER_PART: Final = 60
 PER_OTHER_MECHANISM: Final = 4
 """Worlds of a part with each mechanism but the graded one: one ordinary, the others with traits in rotation."""
@@ -40,8 +45,8 @@ SILENT_BETA: Final = 7
 """Graded worlds of a part whose beta hardly answers while symptoms do."""
 PER_TRAIT: Final = 3
 """Graded worlds of a part with each of the other traits; the rest are ordinary."""
-WITHOUT_END: Final = 0.25
-"""Share of worlds without an end-of-session reward: C2 to C4 are 0."""
+WITHOUT_END: Final = {1: 0.25, 2: 0.15}
+"""Share of worlds without an end-of-session reward, by population: C2 to C4 are 0. Without it nothing rewards a dose that meets a need."""
 
 STEPS, NO_DBS_STEPS, PAUSE_H = 300, 150, 10 / 60
 VISITS, RANDOM_SESSIONS = 3, 4
@@ -99,6 +104,7 @@ class World:
     Attributes:
         part, index: number of the world. patient: its constants. trait: what makes it difficult, `traits.TRAITS`; None for an ordinary one.
             settings: of its MDP. xi_beta is midway between beta under cDBS and under 0.3.
+        worth: of following beta, as drawn (`following.Worth`); None in the first population.
         spread: standard deviation of beta, its unit. key: of its random streams.
     """
 
@@ -109,11 +115,12 @@ class World:
     settings: MdpSettings
     spread: float
     key: int
+    worth: Worth | None = None
 
     @property
     def name(self) -> str:
-        """Such as `A07-bursts`."""
-        return f"{self.part}{self.index:02d}-{self.patient.mechanism}"
+        """Such as `A07-bursts`, in the second population `A07-bursts-pays`."""
+        return f"{self.part}{self.index:02d}-{self.patient.mechanism}{'' if self.worth is None else f'-{self.worth}'}"
 
     @property
     def modelled(self) -> bool:
@@ -134,7 +141,7 @@ class World:
         days = self.data_days(rows, seed)
         sessions = []
         for i, row in enumerate(rows):
-            own = Days(days.effects[i : i + 1], days.hours[i : i + 1])
+            own = days.select(slice(i, i + 1))
             run = self.run(row.amplitudes[None, :], own, _DATA + 4096 * seed + i, row.amplitudes.size)
             qoc = Qoc(float(run.grasp_hz[0]), int(run.rating[0]), float(run.tremor_percent[0]))
             bound = self.settings.bound if row.controller == "random" else None
@@ -164,8 +171,8 @@ class World:
 
     def data_days(self, rows: list[DataSession], seed: int) -> Days:
         """Draw the days of planned sessions."""
-        visits = np.array([row.visit for row in rows]) + 64 * seed
-        return visit_days(self.key, visits, np.array([row.hour for row in rows]))
+        visits, first = np.array([row.visit for row in rows]), self.patient.change_visit
+        return visit_days(self.key, visits + 64 * seed, np.array([row.hour for row in rows]), (visits >= first).astype(np.float64))
 
     def truth(self, policy: Policy, sessions: int = 300) -> Truth:
         """Estimate the true return on new days, each session on a day of its own."""
@@ -175,12 +182,13 @@ class World:
         """Estimate what the policy would have returned on the very days of `data(.., seed, visits)`, with other noise."""
         days = self.data_days(visit_plan(self.settings, "paper", seed, visits), seed)
         of = np.arange(sessions) % len(days.hours)
-        return _truth(self.settings, self.run(policy, Days(days.effects[of], days.hours[of]), _DATA_DAYS))
+        return _truth(self.settings, self.run(policy, days.select(of), _DATA_DAYS))
 
     def candidates(self) -> dict[str, Policy]:
         """Draw the policies to be evaluated, the same ones whatever the data are."""
         rng = np.random.default_rng([self.key, 0xCA4D])
-        return draw_candidates(rng, self.settings.xi_beta, self.spread, self.settings.window)
+        draw = draw_candidates if self.worth is None else draw_following
+        return draw(rng, self.settings.xi_beta, self.spread, self.settings.window)
 
 
 @dataclass(frozen=True)
@@ -220,27 +228,33 @@ def visit_plan(settings: MdpSettings, design: DataDesign, seed: int, visits: int
 
 
 @lru_cache(maxsize=256)
-def world(part: Part, index: int) -> World:
-    """Build world `index` of a part.
+def world(part: Part, index: int, population: Population = 1) -> World:
+    """Build world `index` of a part; the second population has the axis *worth of following beta* (`following`).
 
     Raises:
         ValueError: no such part, or an index outside it.
     """
     if part not in PARTS or not 0 <= index < WORLDS_PER_PART:
         raise ValueError(f"there is no world {index} in part {part!r}: parts are A, B and C, indices 0 to {WORLDS_PER_PART - 1}")
-    kind, trait = make_up(part)[index]
-    rng = np.random.default_rng([PARTS[part], index, 0x776F])
-    patient = with_trait(draw_patient(kind, rng), trait, rng)
+    seed = (PARTS if population == 1 else FOLLOWING_PARTS)[part]
+    kind, trait = make_up(part, population)[index]
+    rng = np.random.default_rng([seed, index, 0x776F])
+    patient, worth = with_trait(draw_patient(kind, rng), trait, rng), None
+    if population == 2:
+        dealt = deal(seed, WORLDS_PER_PART)[index]
+        patient, worth = with_worth(patient, dealt.worth, rng), dealt.worth
+        patient = with_change(patient, rng) if dealt.changes else patient
+        patient = patient if dealt.answers else without_answer(patient)
     bound = float(rng.choice((0.3, 0.3, 0.3, 0.4)))
-    weight = 0.0 if rng.random() < WITHOUT_END else 10.0
-    key = PARTS[part] * 1000 + index
-    days = new_days(key, _CALIBRATION, 100)
+    weight = 0.0 if rng.random() < WITHOUT_END[population] else 10.0
+    key = seed * 1000 + index
+    days = replace(new_days(key, _CALIBRATION, 100), change=np.zeros(100))
     full, low = (simulate(patient, 1.0, ConstantPolicy(a), days=days, key=key, first=_CALIBRATION).beta for a in (1.0, 0.3))
     settings = MdpSettings(xi_beta=float(full.mean() + low.mean()) / 2, c2=weight, c3=weight, c4=weight, lower_bound=bound)
-    return World(part, index, patient, trait, settings, float(np.concatenate([full, low]).std()), key)
+    return World(part, index, patient, trait, settings, float(np.concatenate([full, low]).std()), key, worth)
 
 
-def make_up(part: str) -> list[tuple[int, str | None]]:
+def make_up(part: str, population: Population = 1) -> list[tuple[int, str | None]]:
     """List mechanism and trait of every world of a part: the same numbers of each in every part, in an order of its own."""
     traits = [t for t in TRAITS if t != SILENT]
     rotation = cycle(traits)
@@ -251,7 +265,7 @@ def make_up(part: str) -> list[tuple[int, str | None]]:
     difficult: list[tuple[int, str | None]] = [(0, t) for t in repeated]
     ordinary: list[tuple[int, str | None]] = [(0, None)] * (WORLDS_PER_PART - len(others) - len(difficult))
     both = others + difficult + ordinary
-    return [both[i] for i in np.random.default_rng([PARTS[part], 0x6D65]).permutation(len(both))]
+    return [both[i] for i in np.random.default_rng([(PARTS if population == 1 else FOLLOWING_PARTS)[part], 0x6D65]).permutation(len(both))]
 
 
 def _truth(settings: MdpSettings, run: Sessions) -> Truth:
