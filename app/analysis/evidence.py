@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,6 +83,12 @@ READ_AT_ONCE = 8
 """Participants whose traces are in memory together."""
 
 
+def some_at_once(places: Sequence[int]) -> Iterator[Sequence[int]]:
+    """Yield places in a list of participants, READ_AT_ONCE at a time: evidence of all of a large study is too much for the memory."""
+    for start in range(0, len(places), READ_AT_ONCE):
+        yield places[start : start + READ_AT_ONCE]
+
+
 @dataclass(frozen=True)
 class Evidence:
     """What a caller may know of a participant's sessions.
@@ -108,15 +114,19 @@ def evidence(db: Session, participant: Participant, caller: Caller) -> Evidence:
     return of_all(db, [participant], caller)[0]
 
 
-def of_all(db: Session, participants: Sequence[Participant], caller: Caller) -> list[Evidence]:
-    """The evidence of several participants; what is not kept is read for some of them at once."""
+def keys_of(db: Session, participants: Sequence[Participant], caller: Caller) -> list[Hashable]:
+    """The keys of the participants' evidence: they change with whatever it depends on."""
     versions = fingerprints(db, [p.id for p in participants])
     sights = blinding.sights(db, participants, caller)
-    keys = [("evidence", p.id, versions[p.id], sight) for p, sight in zip(participants, sights, strict=True)]
+    return [("evidence", p.id, versions[p.id], sight) for p, sight in zip(participants, sights, strict=True)]
+
+
+def of_all(db: Session, participants: Sequence[Participant], caller: Caller, keys: Sequence[Hashable] | None = None) -> list[Evidence]:
+    """The evidence of several participants; what is not kept is read for some of them at once. `keys`: theirs, where at hand."""
+    keys = keys_of(db, participants, caller) if keys is None else keys
     found: list[Evidence | None] = [recalled(key) for key in keys]
     lacking = [i for i, known in enumerate(found) if known is None]
-    for start in range(0, len(lacking), READ_AT_ONCE):
-        some = lacking[start : start + READ_AT_ONCE]
+    for some in some_at_once(lacking):
         sessions = sessions_of(db, [participants[i].id for i in some])
         everything = [session for held in sessions.values() for session in held]
         late = late_stops(db, [participants[i].id for i in some])

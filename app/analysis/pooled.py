@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Row, func, select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.analysis import metrics, primary
-from app.analysis.evidence import Evidence, of_all
-from app.analysis.facts import METRICS, LeftOut
+from app.analysis import evidence, metrics, primary
+from app.analysis.evidence import Evidence
+from app.analysis.facts import METRICS, BetaKind, LeftOut, comparable_beta, with_comparable_beta
 from app.analysis.metrics import FiveMetrics
-from app.analysis.primary import Primary
-from app.analysis.primary_results import PLANNED
-from app.platform.kept import kept
+from app.analysis.primary_results import PLANNED, planned_results
+from app.analysis.primary_verdict import VerdictResult
+from app.platform.kept import kept, summaries
 from app.study import repository as study
 from app.study.blinding import CONTROLLER_NAMES, Arm, visible_arms
 from app.tables.jobs import Job, JobStatus, JobStep
@@ -55,12 +55,13 @@ class TrialTimeRow:
 
 @dataclass(frozen=True)
 class TrialTime:
-    """The table; `totals` over all its participants."""
+    """The table; `totals` and `excluded` over all participants, also where `rows` are some of them."""
 
     controllers: list[Controller]
     labels: list[str]
     rows: list[TrialTimeRow]
     totals: list[TimeTested]
+    excluded: int
 
 
 def trial_time(db: Session, participants: Sequence[Participant], caller: Caller) -> TrialTime:
@@ -77,13 +78,9 @@ def trial_time(db: Session, participants: Sequence[Participant], caller: Caller)
     return _table(counted)
 
 
-def of_evidence(held: Sequence[Evidence]) -> TrialTime:
-    """The same where the evidence of the participants is at hand."""
-    counted = []
-    for one in held:
-        ran = [(s.arm, s.duration_s) for s in one.sessions] + [(e.arm, e.duration_s) for e in one.excluded]
-        counted.append(_Counted(one.participant, ran, sum(e.why is LeftOut.EXCLUDED for e in one.excluded)))
-    return _table(counted)
+def _count(one: Evidence) -> _Counted:
+    ran = [(s.arm, s.duration_s) for s in one.sessions] + [(e.arm, e.duration_s) for e in one.excluded]
+    return _Counted(one.participant, ran, sum(e.why is LeftOut.EXCLUDED for e in one.excluded))
 
 
 @dataclass(frozen=True)
@@ -110,11 +107,47 @@ def _table(counted: Sequence[_Counted]) -> TrialTime:
         for one, seconds in zip(counted, by_controller, strict=True)
     ]
     totals = [_tested(c, [s for seconds in by_controller for s in seconds.get(c, [])]) for c in controllers]
-    return TrialTime(controllers, [CONTROLLER_NAMES[c] for c in controllers], rows, totals)
+    return TrialTime(controllers, [CONTROLLER_NAMES[c] for c in controllers], rows, totals, sum(one.excluded for one in counted))
 
 
 def _tested(controller: Controller, seconds: Sequence[float]) -> TimeTested:
     return TimeTested(controller, len(seconds), sum(seconds) / 60)
+
+
+# Energy that learned controllers have saved so far against the cDBS amplitude, over the minutes that they ran; description, no test.
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What learned controllers saved in one participant.
+
+    Attributes:
+        share: 1 less the mean of a^2 over the sessions' minutes, a being the fraction of the cDBS amplitude of the controlled side; below 0
+            where they spent more. minutes, sessions: of theirs with a known energy.
+    """
+
+    participant: str
+    share: float
+    minutes: float
+    sessions: int
+
+
+def _saving(held: Evidence) -> Saved | None:
+    """Energy saved in one participant; None without a session of a learned controller that the caller may know of and that counts."""
+    ran = [s for s in held.sessions if s.controller in PLANNED and "energy" in s.values]
+    seconds = sum(s.duration_s for s in ran)
+    if not seconds:
+        return None
+    spent = sum(s.values["energy"] * s.duration_s for s in ran) / seconds
+    return Saved(held.participant, 1 - spent, seconds / 60, len(ran))
+
+
+def overall(saved: Sequence[Saved]) -> Saved | None:
+    """All participants together, weighted by minutes; None without any."""
+    minutes = sum(s.minutes for s in saved)
+    if not minutes:
+        return None
+    return Saved("", sum(s.share * s.minutes for s in saved) / minutes, minutes, sum(s.sessions for s in saved))
 
 
 # Queries of the study-wide tables.
@@ -135,8 +168,23 @@ def step_seconds(db: Session, participant_ids: Sequence[int]) -> Sequence[Row[st
 
 # All participants of a caller: N-of-1 results, the random-effects summary, and the tables of the paper.
 
-MOST = 200
-"""Participants on one page."""
+
+@dataclass(frozen=True)
+class Outline:
+    """Results of one participant that pages of all participants need.
+
+    Attributes:
+        key: changes with whatever they depend on. verdicts: of the learned controllers.
+        results: of the planned controllers that ran, by metric. beta_kind: which beta that is. time: tested. saved: energy.
+    """
+
+    key: Hashable
+    participant: str
+    verdicts: tuple[VerdictResult, ...]
+    results: Mapping[Controller, Mapping[str, Average | Unavailable]]
+    beta_kind: BetaKind | None
+    time: _Counted
+    saved: Saved | None
 
 
 @dataclass(frozen=True)
@@ -164,23 +212,47 @@ class PooledController:
 class Pooled:
     """Everything of the participants that a caller may read."""
 
-    participants: tuple[Primary, ...]
-    paper: tuple[FiveMetrics, ...]
+    participants: tuple[Outline, ...]
     controllers: tuple[PooledController, ...]
     trial: TrialTime
 
 
 def readable(db: Session, caller: Caller) -> Sequence[Participant]:
-    """The participants that the caller may read, by code."""
-    return study.participants(db, caller, MOST, 0)[0]
+    """All participants that the caller may read, by code."""
+    return study.participants(db, caller, None, 0)[0]
 
 
 def pooled(db: Session, participants: Sequence[Participant], caller: Caller) -> Pooled:
     """Results of each participant and over all of them."""
-    held = of_all(db, participants, caller)
-    found, paper = tuple(primary.of_all(db, participants, held)), tuple(metrics.of_all(db, participants, held))
-    key = ("pooled", tuple((p.evidence.key, p.locked) for p in found))
-    return Pooled(found, paper, kept(key, lambda: tuple(_controller(found, c) for c in PLANNED if _ran(found, c))), of_evidence(held))
+    found = outlines(db, participants, caller)
+    controllers = kept(("pooled", tuple(o.key for o in found)), lambda: tuple(_controller(found, c) for c in PLANNED if _ran(found, c)))
+    return Pooled(tuple(found), controllers, _table([o.time for o in found]))
+
+
+def outlines(db: Session, participants: Sequence[Participant], caller: Caller) -> list[Outline]:
+    """Outlines of the participants; those that nothing changed are kept."""
+    of_evidence = evidence.keys_of(db, participants, caller)
+    keys = [("outline", key, primary.locked_margins(p)[-1]) for key, p in zip(of_evidence, participants, strict=True)]
+
+    def compute(lacking: Sequence[int]) -> Iterator[Outline]:
+        for some in evidence.some_at_once(lacking):
+            held = evidence.of_all(db, [participants[i] for i in some], caller, [of_evidence[i] for i in some])
+            for i, one in zip(some, held, strict=True):
+                yield _outline(keys[i], one, participants[i])
+
+    return summaries(keys, compute)
+
+
+def _outline(key: Hashable, held: Evidence, participant: Participant) -> Outline:
+    kind = comparable_beta(held.sessions, held.beta_unit, held.beta_source)
+    found = planned_results(with_comparable_beta(held.sessions, kind))
+    by_metric = {r.tested.controller: {c.metric: c.result for c in r.comparisons} for r in found}
+    return Outline(key, held.participant, primary.verdicts_on(held, participant), by_metric, kind, _count(held), _saving(held))
+
+
+def paper(db: Session, participants: Sequence[Participant], caller: Caller) -> list[FiveMetrics]:
+    """The paper's comparisons of each participant."""
+    return metrics.of_all(db, participants, evidence.of_all(db, participants, caller))
 
 
 @dataclass(frozen=True)
@@ -200,24 +272,17 @@ def computation_times(db: Session, participants: Sequence[Participant]) -> list[
     return [StepTime(kind, step, n, float(median), float(longest)) for kind, step, n, median, longest in rows]
 
 
-def _ran(found: Sequence[Primary], controller: Controller) -> bool:
-    return any(r.tested.controller is controller for p in found for r in p.controllers)
+def _ran(found: Sequence[Outline], controller: Controller) -> bool:
+    return any(controller in o.results for o in found)
 
 
-def _controller(found: Sequence[Primary], controller: Controller) -> PooledController:
+def _controller(found: Sequence[Outline], controller: Controller) -> PooledController:
     return PooledController(controller, tuple(_metric(found, controller, m) for m in METRICS))
 
 
-def _metric(found: Sequence[Primary], controller: Controller, metric: str) -> PooledMetric:
-    each: list[tuple[str, Average | Unavailable]] = []
-    units = set()
-    for p in found:
-        mine = next((r for r in p.controllers if r.tested.controller is controller), None)
-        if mine is None:
-            continue
-        comparison = mine.of(metric)
-        each.append((p.evidence.participant, comparison.result))
-        if isinstance(comparison.result, Average):
-            units.add(p.beta_kind if metric == "mean_beta" else None)
+def _metric(found: Sequence[Outline], controller: Controller, metric: str) -> PooledMetric:
+    mine = [o for o in found if controller in o.results]
+    each = tuple((o.participant, o.results[controller][metric]) for o in mine)
+    units = {o.beta_kind if metric == "mean_beta" else None for o in mine if isinstance(o.results[controller][metric], Average)}
     summary = pool([r for _, r in each]) if len(units) < 2 else Unavailable(Reason.NOT_IDENTIFIED)
-    return PooledMetric(metric, tuple(each), summary)
+    return PooledMetric(metric, each, summary)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import Field
+from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
-from app.analysis import metrics_charts, pooled, primary_words
+from app.accounts.permissions import Caller
+from app.analysis import metrics, metrics_charts, pooled, primary_words
+from app.analysis.evidence import of_all
 from app.analysis.facts import METRICS
 from app.analysis.figures import csv_of
 from app.analysis.metrics import FiveMetrics
@@ -24,9 +27,11 @@ from app.platform.kept import kept
 from app.platform.web.charts import TEXT, Cell, Chart, axis, counted, figure
 from app.platform.web.charts import figure as empty
 from app.platform.web.csv_files import download
-from app.platform.web.schemas import Model, problems
+from app.platform.web.schemas import Model, PagingQuery, problems
 from app.platform.web.templates import render
+from app.study import repository as study
 from app.study.service import withdrawn_codes
+from app.tables.participants import Participant
 from app.tables.sessions import Controller
 from ml.statistics.pooling import Summary
 from ml.statistics.within_visits.contrasts import Unavailable
@@ -109,8 +114,7 @@ def pooled_out(found: Pooled, times: Sequence[StepTime]) -> PooledOut:
     """Everything of the page."""
     return PooledOut(
         verdicts=[
-            ParticipantVerdictsOut(participant=p.evidence.participant, verdicts=[verdict_out(v) for v in p.verdicts])
-            for p in found.participants
+            ParticipantVerdictsOut(participant=p.participant, verdicts=[verdict_out(v) for v in p.verdicts]) for p in found.participants
         ],
         metrics=[
             PooledMetricOut(
@@ -157,13 +161,13 @@ MOST_WIDE = 8
 """Boxes whose names stand side by side on a tablet in letters of full size."""
 
 
-def results(found: Sequence[FiveMetrics]) -> list[Chart]:
-    """A chart per metric that some session has."""
+def results(found: Sequence[FiveMetrics], which: str = "") -> list[Chart]:
+    """Make a chart per metric that some session has; `which`: the end of their addresses, for some participants of all."""
     shown = [for_readers(one) for one in found]
-    return [c for c in (_chart(shown, metric) for metric in METRICS) if c.rows]
+    return [c for c in (_chart(shown, metric, which) for metric in METRICS) if c.rows]
 
 
-def _chart(found: Sequence[FiveMetrics], metric: str) -> Chart:
+def _chart(found: Sequence[FiveMetrics], metric: str, which: str) -> Chart:
     data: list[dict[str, Any]] = []
     names: list[str] = []
     notes: list[dict[str, Any]] = []
@@ -211,7 +215,7 @@ def _chart(found: Sequence[FiveMetrics], metric: str) -> Chart:
         columns,
         rows,
         height=280,
-        src=f"/analyses/figure?metric={metric}",
+        src=f"/analyses/figure?metric={metric}{which}",
     )
 
 
@@ -240,11 +244,11 @@ def read_pooled(
     participants = pooled.readable(db, caller)
     if format == "csv" and table == "computation_time":
         return download(csv_of(*computation_table(pooled.computation_times(db, participants))), "computation-time.csv")
+    if format != "json" and not (format == "csv" and table == "trial_time"):
+        return (metrics_charts.table if format == "csv" else metrics_charts.svg)(pooled.paper(db, participants, caller), "all")
     found = pooled.pooled(db, participants, caller)
-    if format == "csv" and table == "trial_time":
+    if format == "csv":
         return download(csv_of(*trial_table(found.trial)), "trial-time.csv")
-    if format != "json":
-        return (metrics_charts.table if format == "csv" else metrics_charts.svg)(found.paper, "all")
     return pooled_out(found, pooled.computation_times(db, participants))
 
 
@@ -252,16 +256,20 @@ pages = APIRouter()
 
 
 @pages.get("/analyses")
-def pooled_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """What the visits of all participants have shown."""
+def pooled_page(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
+    """Show what the visits of all participants have shown: together, and each on its page of the list."""
     participants = pooled.readable(db, caller)
     found = pooled.pooled(db, participants, caller)
+    shown = slice(paging.offset, paging.offset + paging.limit)
     page = render(
         request,
         "analysis/pooled.html",
         found=found,
-        charts=_charts(found),
-        trial=found.trial,
+        shown=found.participants[shown],
+        codes={o.participant for o in found.participants[shown]},
+        charts=_charts(db, participants[shown], caller, f"&limit={paging.limit}&offset={paging.offset}"),
+        trial=replace(found.trial, rows=found.trial.rows[shown]),
+        paging=paging,
         withdrawn=withdrawn_codes(participants),
         times=pooled.computation_times(db, participants),
         wording=primary_words,
@@ -270,29 +278,32 @@ def pooled_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse
 
 
 @pages.get("/analyses/figure")
-def figure_page(db: Db, caller: CurrentCaller, metric: str = METRICS[0]) -> JSONResponse:
-    """The results figure's chart of one metric, which its page draws when it comes into view."""
+def figure_page(db: Db, caller: CurrentCaller, paging: PagingQuery, metric: str = METRICS[0]) -> JSONResponse:
+    """Send the results figure's chart of one metric, which its page draws when it comes into view."""
     if metric not in METRICS:
         raise NotFound(f"There is no metric '{metric[:40]}'.", f"The metrics are {', '.join(METRICS)}.")
-    charts = {c.id: c.figure for c in _charts(pooled.pooled(db, pooled.readable(db, caller), caller))}
+    shown, _ = study.participants(db, caller, paging.limit, paging.offset)
+    charts = {c.id: c.figure for c in _charts(db, shown, caller)}
     return JSONResponse(charts.get(f"all-{metric}") or empty([]))
 
 
-def _charts(found: pooled.Pooled) -> list[Chart]:
-    """Made once for what the visits have shown."""
-    return kept(("results figure", tuple(p.evidence.key for p in found.participants)), lambda: results(found.paper))
+def _charts(db: Session, participants: Sequence[Participant], caller: Caller, which: str = "") -> list[Chart]:
+    """Make the charts once for what the visits have shown; `which`: the end of their addresses."""
+    held = of_all(db, participants, caller)
+    key = ("results figure", which, tuple(one.key for one in held))
+    return kept(key, lambda: results(metrics.of_all(db, participants, held), which))
 
 
 @pages.get("/analyses/results.csv")
 def results_table(db: Db, caller: CurrentCaller) -> Response:
     """The paper's comparisons of all participants as a table."""
-    return metrics_charts.table(pooled.pooled(db, pooled.readable(db, caller), caller).paper, "all")
+    return metrics_charts.table(pooled.paper(db, pooled.readable(db, caller), caller), "all")
 
 
 @pages.get("/analyses/results.svg")
 def results_figure(db: Db, caller: CurrentCaller) -> Response:
     """The results figure of all participants."""
-    return metrics_charts.svg(pooled.pooled(db, pooled.readable(db, caller), caller).paper, "all")
+    return metrics_charts.svg(pooled.paper(db, pooled.readable(db, caller), caller), "all")
 
 
 @pages.get("/trial-time")

@@ -112,7 +112,12 @@ def _of(held: Evidence, locks: Sequence[LockedMargins], names: Mapping[int, str]
 
 def verdicts_of(db: Session, participant: Participant, caller: Caller) -> tuple[VerdictResult, ...]:
     """The verdicts of `primary` alone, for pages that show no comparison: those of forty policies take many times as long."""
-    return _verdicts(evidence.of_all(db, [participant], caller)[0], locked_margins(participant)[-1])
+    return verdicts_on(evidence.of_all(db, [participant], caller)[0], participant)
+
+
+def verdicts_on(facts: Evidence, participant: Participant) -> tuple[VerdictResult, ...]:
+    """The same of evidence that is at hand."""
+    return _verdicts(facts, locked_margins(participant)[-1])
 
 
 def policy_verdicts_of(facts: Evidence, participant: Participant) -> dict[int, VerdictResult]:

@@ -156,6 +156,11 @@ def results(sessions: Sequence[Facts], names: Mapping[int, str], picked_at: Mapp
     return tuple(_adjusted(found))
 
 
+def planned_results(sessions: Sequence[Facts]) -> tuple[ControllerResult, ...]:
+    """The controllers of the planned family that ran, without policies and adjusted p-values."""
+    return tuple(_of_controller(sessions, c) for c in PLANNED if any(s.controller is c for s in sessions))
+
+
 def _of_controller(sessions: Sequence[Facts], controller: Controller) -> ControllerResult:
     mine = tuple(s.session_id for s in sessions if s.controller is controller)
     role = Role.PLANNED if controller in PLANNED else Role.EXPLORATION

@@ -18,9 +18,9 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.accounts.repository import studies
 from app.analysis import metrics as analysis
-from app.analysis.evidence import Evidence, evidence, of_all
+from app.analysis.evidence import Evidence, evidence
 from app.analysis.metrics_charts import view
-from app.analysis.pooled import readable
+from app.analysis.pooled import outlines, overall, readable
 from app.analysis.standing import standing_sentences
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.staleness import stale_reasons
@@ -45,7 +45,6 @@ from app.study.service import may, withdrawn_codes
 from app.study.visits.service import days_of
 from app.study.wording import characteristics_words
 from app.tables.participants import Participant, SettingsVersion
-from app.tables.sessions import Controller
 from app.tables.visits import Visit
 
 # The first screen of the demo: questions to begin with, each with the page that answers it. No other installation shows it.
@@ -187,51 +186,14 @@ def _story(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsV
     return kept((*key, today), lambda: story_chart(held, visits, versions, today))
 
 
-# Energy that learned controllers have saved so far against the cDBS amplitude, over the minutes that they ran; description, no test.
-
-LEARNED = (Controller.RL, Controller.DISTILLED)
-
-
-@dataclass(frozen=True)
-class Saved:
-    """What learned controllers saved in one participant.
-
-    Attributes:
-        share: 1 less the mean of a^2 over the sessions' minutes, a being the fraction of the cDBS amplitude of the controlled side; below 0
-            where they spent more. minutes, sessions: of theirs with a known energy.
-    """
-
-    participant: str
-    share: float
-    minutes: float
-    sessions: int
-
-
-def energy_saved(db: Session, participants: Sequence[Participant], caller: Caller) -> list[Saved]:
-    """Participants with sessions of learned controllers that the caller may know of and that count."""
-    found = []
-    for held in of_all(db, participants, caller):
-        ran = [s for s in held.sessions if s.controller in LEARNED and "energy" in s.values]
-        seconds = sum(s.duration_s for s in ran)
-        if seconds > 0:
-            spent = sum(s.values["energy"] * s.duration_s for s in ran) / seconds
-            found.append(Saved(held.participant, 1 - spent, seconds / 60, len(ran)))
-    return found
-
-
-def overall(saved: Sequence[Saved]) -> Saved | None:
-    """All participants together, weighted by minutes; None without any."""
-    minutes = sum(s.minutes for s in saved)
-    if not minutes:
-        return None
-    return Saved("", sum(s.share * s.minutes for s in saved) / minutes, minutes, sum(s.sessions for s in saved))
+# Energy that learned controllers have saved so far.
 
 
 @pages.get("/energy-saved", dependencies=[ResultsViewed])
 def energy_saved_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Energy saved so far; the home page takes its numbers from here once it stands."""
     participants = readable(db, caller)
-    saved = energy_saved(db, participants, caller)
+    saved = [outline.saved for outline in outlines(db, participants, caller) if outline.saved is not None]
     page = render(request, "overview/energy_saved.html", saved=saved, overall=overall(saved), withdrawn=withdrawn_codes(participants))
     return HTMLResponse(page)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from threading import Lock
 from typing import Any, TypeVar, cast
 
@@ -12,7 +12,11 @@ T = TypeVar("T")
 KEPT = 512
 """Results that a process keeps; the oldest goes first."""
 
+KEPT_SUMMARIES = 20_000
+"""Small results, of some kilobytes, that it keeps apart from them: a page of all participants needs several of each."""
+
 _kept: OrderedDict[Hashable, Any] = OrderedDict()
+_summaries: OrderedDict[Hashable, Any] = OrderedDict()
 _lock = Lock()
 
 
@@ -39,7 +43,28 @@ def recalled(key: Hashable) -> Any:
         return _kept.get(key)
 
 
+def summaries(keys: Sequence[Hashable], compute: Callable[[Sequence[int]], Iterable[T]]) -> list[T]:
+    """Return small results under keys that name everything they depend on.
+
+    Args:
+        compute: gives those that this process has not cached, in order, for their places in `keys`.
+    """
+    with _lock:
+        found = {i: _summaries[key] for i, key in enumerate(keys) if key in _summaries}
+        for i in found:
+            _summaries.move_to_end(keys[i])
+    lacking = [i for i in range(len(keys)) if i not in found]
+    for i, result in zip(lacking, compute(lacking) if lacking else (), strict=True):
+        found[i] = result
+        with _lock:
+            _summaries[keys[i]] = result
+            while len(_summaries) > KEPT_SUMMARIES:
+                _summaries.popitem(last=False)
+    return [found[i] for i in range(len(keys))]
+
+
 def forget() -> None:
     """Drop everything that is kept: for measuring."""
     with _lock:
         _kept.clear()
+        _summaries.clear()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date, datetime
@@ -70,8 +70,12 @@ def participants_of_study(db: Session, study_id: int) -> Sequence[int]:
     return db.scalars(select(Participant.id).join(Participant.site).where(Site.study_id == study_id).order_by(Participant.id)).all()
 
 
-def participants(db: Session, caller: Caller, limit: int, offset: int, withdrawn: bool = True) -> tuple[Sequence[Participant], int]:
-    """A page of participants by code, and how many there are; who has withdrawn, and whose study has ended, only with `withdrawn`."""
+def participants(db: Session, caller: Caller, limit: int | None, offset: int, withdrawn: bool = True) -> tuple[Sequence[Participant], int]:
+    """Load a page of participants by code, and count them all; those withdrawn or of an ended study only with `withdrawn`.
+
+    Args:
+        limit: None for all from `offset` on.
+    """
     query = _participants(caller, withdrawn)
     rows = db.scalars(query.order_by(Participant.code).limit(limit).offset(offset).options(*_WHOLE)).all()
     return rows, count(db, query)
@@ -115,17 +119,17 @@ def visit_by_number(db: Session, participant_id: int, number: int) -> Visit | No
 
 
 class HiddenVisits(NamedTuple):
-    """Visits that hide what ran from somebody, of several participants: (participant, visit, key is sealed, locked)."""
+    """Visits that hide what ran from a caller, by participant: (visit, key is sealed, locked)."""
 
-    rows: Sequence[tuple[int, int, bool, bool]]
+    rows: Mapping[int, Sequence[tuple[int, bool, bool]]]
 
     def sealed(self, participant_id: int) -> frozenset[int]:
         """A participant's visits under a blinded plan whose key is sealed."""
-        return frozenset(visit for owner, visit, sealed, _ in self.rows if owner == participant_id and sealed)
+        return frozenset(visit for visit, sealed, _ in self.rows.get(participant_id, ()) if sealed)
 
     def unlocked(self, participant_id: int) -> frozenset[int]:
         """A participant's visits that are not locked now."""
-        return frozenset(visit for owner, visit, _, locked in self.rows if owner == participant_id and not locked)
+        return frozenset(visit for visit, _, locked in self.rows.get(participant_id, ()) if not locked)
 
 
 def hidden_visits(db: Session, participant_ids: Collection[int]) -> HiddenVisits:
@@ -133,7 +137,10 @@ def hidden_visits(db: Session, participant_ids: Collection[int]) -> HiddenVisits
     newest = select(VisitLock.locked).where(VisitLock.visit_id == Visit.id).order_by(VisitLock.id.desc()).limit(1)
     locked = func.coalesce(newest.correlate(Visit).scalar_subquery(), false())
     query = select(Visit.participant_id, Visit.id, Visit.sealed, locked).where(Visit.participant_id.in_(participant_ids))
-    return HiddenVisits([(row[0], row[1], row[2], row[3]) for row in db.execute(query)])
+    found: dict[int, list[tuple[int, bool, bool]]] = {}
+    for owner, visit, sealed, is_locked in db.execute(query):
+        found.setdefault(owner, []).append((visit, sealed, is_locked))
+    return HiddenVisits(found)
 
 
 def tells_some_arm(db: Session, caller: Caller, code: str | None) -> bool:

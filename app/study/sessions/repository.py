@@ -9,9 +9,12 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 from sqlalchemy import (
+    ARRAY,
     BindParameter,
+    Integer,
     Select,
     String,
+    any_,
     bindparam,
     cast,
     func,
@@ -71,8 +74,9 @@ def _row_versions() -> Select[Any]:
         _versions("trace", Trace.id, recording, Trace.recording),
         _versions("adverse_event_revision", AdverseEventRevision.id, AdverseEvent.participant_id, of_event),
     ]
-    asked: BindParameter[Any] = bindparam("participants", expanding=True)
-    rows = union_all(*(part.where(owner.in_(asked)) for part, owner in parts)).subquery()
+    # one array: PostgreSQL takes 65 535 parameters at most
+    asked: BindParameter[Any] = bindparam("participants", type_=ARRAY(Integer))
+    rows = union_all(*(part.where(owner == any_(asked)) for part, owner in parts)).subquery()
     return select(rows).order_by(rows.c.name)
 
 

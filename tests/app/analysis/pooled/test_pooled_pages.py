@@ -17,8 +17,11 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
+from app.analysis import pooled
 from app.analysis.pooled import Pooled, PooledController, PooledMetric, TrialTime
+from app.analysis.pooled import _outline as outline
 from app.analysis.pooled_web import pooled_out
+from app.platform import kept
 from app.tables.sessions import Controller
 from ml.statistics.within_visits.contrasts import Reason, Unavailable
 from tests.app.analysis.conftest import adder
@@ -61,6 +64,36 @@ def test_the_page_is_reached_from_the_navigation_and_leads_to_each_participant(c
         assert f'href="/participants/{code}/analyses"' in page
         assert '<a href="/participants/P1/analyses" >Analyses</a>' in client.get("/participants/P1").text
     assert "Trial time" in page
+
+
+def test_one_page_of_the_list_is_pooled_with_all_the_others(client: TestClient, four: dict[str, float]) -> None:
+    whole, part = (client.get(f"/analyses{query}").text for query in ("", "?limit=2&offset=1"))
+    assert "of all 4 participants" in part
+    assert "of all 4 participants" not in whole
+    assert [f"/participants/{code}/analyses/visits" in part for code in ("P1", "P2", "P3", "P4")] == [False, True, True, False]
+    totals = r'<tr><th scope="row">All</th>.*?</tr>'
+    together = "[^>]*claims nothing about other people[^<]*"
+    for pattern in (totals, together):
+        (mine,), (all_of_them,) = (set(re.findall(pattern, text, re.DOTALL)) for text in (part, whole))
+        assert mine == all_of_them
+    source = re.findall(r'data-src="([^"]+)"', part)[0]
+    data = client.get(html.unescape(source)).json()["data"]
+    assert sum(len(t["y"]) for t in data if t["type"] == "scatter") == 2 * 12
+
+
+def test_nothing_is_computed_again_of_participants_whom_nothing_changed(
+    client: TestClient, four: dict[str, float], statements: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kept, "KEPT", 3)  # a study larger than what is kept whole
+    client.get("/api/v1/analyses")
+    statements.clear()
+    client.get("/api/v1/analyses")
+    assert not any("trace.values_f32" in s for s in statements)
+    assert client.patch("/api/v1/sessions/13", json={"excluded_reason": "tablet froze"}).status_code == 200, "P2's first"
+    read: list[str] = []
+    monkeypatch.setattr(pooled, "_outline", lambda key, held, of: read.append(held.participant) or outline(key, held, of))
+    client.get("/api/v1/analyses")
+    assert read == ["P2"]
 
 
 def test_the_charts_of_many_sessions_come_by_themselves_and_not_with_the_page(client: TestClient, four: dict[str, float]) -> None:
@@ -152,5 +185,5 @@ def test_without_anything_the_pages_say_so(client: TestClient) -> None:
 
 def test_beta_that_is_not_pooled_has_the_same_reason_on_the_page_and_over_rest() -> None:
     beta = PooledMetric("mean_beta", (), Unavailable(Reason.NOT_IDENTIFIED))
-    answer = pooled_out(Pooled((), (), (PooledController(Controller.RL, (beta,)),), TrialTime([], [], [], [])), [])
+    answer = pooled_out(Pooled((), (PooledController(Controller.RL, (beta,)),), TrialTime([], [], [], [], 0)), [])
     assert answer.metrics[0].together.text == "Beta of different unit or source is not pooled."

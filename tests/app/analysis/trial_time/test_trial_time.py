@@ -6,8 +6,7 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.analysis.evidence import of_all
-from app.analysis.pooled import of_evidence, trial_time
+from app.analysis.pooled import pooled, trial_time
 from app.study import repository as study
 from app.tables.sessions import Controller
 from tests.app.analysis.conftest import AddSession
@@ -43,7 +42,7 @@ def test_the_evidence_at_hand_gives_the_same_table(add_session: AddSession, db: 
     db.rollback()
     people = [study.participant_by_code(db, participant_code, SYSTEM)]
     table = trial_time(db, people, SYSTEM)
-    assert of_evidence(of_all(db, people, SYSTEM)) == table
+    assert pooled(db, people, SYSTEM).trial == table
     assert [t.sessions for t in table.totals] == [1, 1, 0, 1]
     assert table.rows[0].excluded == 1
 
