@@ -147,8 +147,14 @@ class SessionTrajectory:
         imputed[missing[inside & (gap <= self.most_imputed)]] = True
         level = float(beta[known].mean())
         line = np.interp(np.flatnonzero(imputed), known, beta[known])
-        beta[imputed] = level + _carried_over(beta - level) * (line - level)
+        beta[imputed] = level + self.carried_over * (line - level)
         return beta, imputed
+
+    @property
+    def carried_over(self) -> float:
+        """Weight, 0 to 1, of the line between both neighbours in an imputed value; the rest is the session's mean."""
+        beta = self.measured_beta
+        return 0.0 if np.isnan(beta).all() else _carried_over(beta - float(np.nanmean(beta)))
 
     def states(self) -> Floats:
         """Return s_0 ... s_T, shape [T + 1, W], oldest beta first; NaN where a window has an invalid beta that may not be imputed in it."""

@@ -7,7 +7,7 @@ import math
 import re
 import sys
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -189,7 +189,6 @@ def drive(
         sink: gets the log, row by row, so that a crash loses none. wait: sleeps for so many seconds.
     """
     controller = opened.controller()
-    window: deque[float] = deque(maxlen=opened.manifest.window)
     rows = source.rows
     row = next(rows, None)
     began_s = time.perf_counter() - (row.now_s if row else 0.0)
@@ -213,11 +212,9 @@ def drive(
         if missed:
             sys.stderr.write(f"deadline missed: the decision of {row.now_s:.3f} s came {1000.0 * late_s:.0f} ms after its window's end\n")
         run.worst_late_ms = max(run.worst_late_ms, 1000.0 * late_s)
-        if row.sample is not None and not decision.reasons & Reason.LATE_SAMPLE:
-            window.append(row.sample.beta)
         if sink:
             drawn = None if decision.fallback else controller.drawn()
-            sink(Row(row.now_s, row.sample, decision, list(window), latency_us, row.signal_us, late_s, missed, drawn))
+            sink(Row(row.now_s, row.sample, decision, list(controller.window), latency_us, row.signal_us, late_s, missed, drawn))
         try:
             row = rows.send(decision.amplitude_ma)
         except StopIteration:

@@ -108,11 +108,12 @@ HAZARDS: tuple[Hazard, ...] = (
         "H07", "Beta is stale or missing", (_U, _O), _S2, _P4,
         "The runner keeps its own clock and decides in every period. Beta that is late by a fifth of a period, or older than 0.9 of a "
         "period, gives cDBS.",
-        _P1, "One lost value costs a whole window of cDBS.",
+        _P1, "A lost value costs one decision; more than learning imputes cost a window.",
     ),
     Hazard(
         "H08", "Beta is no number, or the network fails", (_U, _O), _S2, _P3,
-        "A value that is no amplitude empties the window. An answer outside [0, 1] and an error of the network give cDBS.",
+        "A value that is no amplitude gives cDBS, and a wrong one a new window. "
+        "An answer outside [0, 1] and an error of the network give cDBS.",
         _P1, "None known.",
     ),
     Hazard(

@@ -12,6 +12,7 @@ amplitude (an output stage without loss) and the mean amplitude (a fixed supply 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from ml.deploy.manifest import BundleManifest
 from ml.energy import Range
+from ml.trajectories import SessionTrajectory
 
 MANY = 0.05
 """Share of windows from which a sheet warns."""
@@ -73,6 +75,16 @@ def plausible_beta(windows: NDArray[np.float64] | None) -> dict[str, Any]:
         "level_low": float(means.min()) / LEVEL_SPREAD,
         "level_high": float(means.max()) * LEVEL_SPREAD,
     }
+
+
+def imputation(sessions: Sequence[SessionTrajectory], window: int) -> dict[str, Any]:
+    """Derive the imputation of lost beta as learning has it, as entries of the manifest; none where nothing was logged.
+
+    Args:
+        sessions: of the snapshot. window: W of the policy.
+    """
+    most = min(max((s.most_imputed for s in sessions), default=0), window - 1)
+    return {"most_imputed": most, "carried_over": float(np.mean([s.carried_over for s in sessions]))} if most else {}
 
 
 class WarningCode(StrEnum):

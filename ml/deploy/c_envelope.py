@@ -21,7 +21,8 @@ enum {
     BETALOOP_RAMP = 2048,
     BETALOOP_SATURATED_BETA = 4096,
     BETALOOP_FROZEN_BETA = 8192,
-    BETALOOP_BETA_LEVEL = 16384
+    BETALOOP_BETA_LEVEL = 16384,
+    BETALOOP_IMPUTED_BETA = 65536
 };
 
 /* One beta amplitude: the end of its window, its value (NaN where the device gave none), and what it says it is. */
@@ -35,22 +36,25 @@ typedef struct {
 /* What the next decision depends on. Set up by betaloop_start. */
 typedef struct {
     int64_t last_sample_ms;
+    int64_t last_valid_ms;
     int64_t last_decision_ms;
     int32_t has_sample;
     int32_t has_decision;
     int32_t streak;
+    int32_t imputed; /* of the window */
     int32_t equal;
     float last_beta;
     float level;
     float amplitude_ma;
     betaloop_score scores[BETALOOP_WINDOW];
+    uint8_t made[BETALOOP_WINDOW]; /* 1 where the score is of an imputed beta amplitude */
 } betaloop_state;
 
 typedef struct {
     float amplitude_ma; /* to deliver */
     float fraction;     /* the network's answer; -1 where it was not asked */
     int32_t fallback;   /* 1: the cDBS amplitude stands in for the network */
-    int32_t valid;      /* valid beta amplitudes in the window */
+    int32_t valid;      /* beta amplitudes in the window, imputed ones too */
     uint32_t reasons;
 } betaloop_decision;
 """
@@ -100,31 +104,55 @@ betaloop_linkage int betaloop_same(const char *a, const char *b) {
     return *a == *b;
 }
 
+/* Start a new window. */
+betaloop_linkage void betaloop_forget(betaloop_state *s) {
+    int i;
+    s->streak = 0;
+    s->imputed = 0;
+    for (i = 0; i < BETALOOP_WINDOW; ++i) s->made[i] = 0;
+}
+
 /* The start of a session: cDBS in force, no beta yet. */
 betaloop_linkage void betaloop_start(betaloop_state *s) {
     int i;
     s->last_sample_ms = 0;
+    s->last_valid_ms = 0;
     s->last_decision_ms = 0;
     s->has_sample = 0;
     s->has_decision = 0;
-    s->streak = 0;
     s->equal = 0;
     s->last_beta = -1.0f;
     s->level = 0.0f;
     s->amplitude_ma = BETALOOP_CDBS_MA;
     for (i = 0; i < BETALOOP_WINDOW; ++i) s->scores[i] = 0;
+    betaloop_forget(s);
 }
 
-/* Judge a new beta amplitude; a valid one enters the window. Returns the reasons against it. */
+/* Move the window on by one beta amplitude. */
+betaloop_linkage void betaloop_push(betaloop_state *s, float beta, uint8_t made) {
+    int i;
+    if (s->streak < BETALOOP_WINDOW) ++s->streak;
+    s->level = s->streak == 1 ? beta : s->level + (beta - s->level) / (float)s->streak;
+    s->imputed += made - s->made[0];
+    for (i = 0; i + 1 < BETALOOP_WINDOW; ++i) {
+        s->scores[i] = s->scores[i + 1];
+        s->made[i] = s->made[i + 1];
+    }
+    s->scores[BETALOOP_WINDOW - 1] = betaloop_score_of(beta);
+    s->made[BETALOOP_WINDOW - 1] = made;
+}
+
+/* Judge a new beta amplitude; a valid one enters the window, after what was lost before it. Returns the reasons against it. */
 betaloop_linkage uint32_t betaloop_admit(betaloop_state *s, int64_t now_ms, const betaloop_sample *sample) {
     uint32_t reasons = 0;
-    uint64_t spacing = 0;
-    int had = s->has_sample, i;
+    uint64_t spacing;
+    float before = s->last_beta, level = s->level, line;
+    int had = s->has_sample, lost = 0, i;
     if (sample->t_ms > now_ms || (had && sample->t_ms <= s->last_sample_ms)) return BETALOOP_LATE_SAMPLE;
-    if (had) spacing = (uint64_t)sample->t_ms - (uint64_t)s->last_sample_ms;
     s->last_sample_ms = sample->t_ms;
     s->has_sample = 1;
     if (!betaloop_same(sample->unit, BETALOOP_UNIT) || !betaloop_same(sample->source, BETALOOP_SOURCE)) reasons = BETALOOP_WRONG_SIGNAL;
+    if (BETALOOP_MOST_IMPUTED > 0 && !reasons && sample->beta != sample->beta) return BETALOOP_INVALID_BETA; /* lost: may be imputed */
     if (!(sample->beta >= 0.0f && sample->beta <= 3.4028234663852886e38f)) {
         reasons |= BETALOOP_INVALID_BETA;
         s->equal = 0;
@@ -135,17 +163,23 @@ betaloop_linkage uint32_t betaloop_admit(betaloop_state *s, int64_t now_ms, cons
         if (s->equal >= BETALOOP_FROZEN_AFTER) reasons |= BETALOOP_FROZEN_BETA;
     }
     if (reasons) {
-        s->streak = 0;
+        betaloop_forget(s);
         return reasons;
     }
-    if (had && s->streak && (spacing < BETALOOP_CLOSEST_MS || spacing > BETALOOP_FARTHEST_MS)) {
-        s->streak = 0;
-        reasons = BETALOOP_WINDOW_GAP;
+    if (s->streak) {
+        spacing = (uint64_t)sample->t_ms - (uint64_t)s->last_valid_ms;
+        if (spacing < BETALOOP_CLOSEST_MS || spacing > BETALOOP_FARTHEST_MS + (uint64_t)BETALOOP_MOST_IMPUTED * BETALOOP_PERIOD_MS) {
+            betaloop_forget(s);
+            reasons = BETALOOP_WINDOW_GAP;
+        } else if (spacing > BETALOOP_FARTHEST_MS)
+            lost = (int)((spacing - BETALOOP_FARTHEST_MS + BETALOOP_PERIOD_MS - 1) / BETALOOP_PERIOD_MS);
     }
-    if (s->streak < BETALOOP_WINDOW) ++s->streak;
-    s->level = s->streak == 1 ? sample->beta : s->level + (sample->beta - s->level) / (float)s->streak;
-    for (i = 0; i + 1 < BETALOOP_WINDOW; ++i) s->scores[i] = s->scores[i + 1];
-    s->scores[BETALOOP_WINDOW - 1] = betaloop_score_of(sample->beta);
+    for (i = 1; i <= lost; ++i) {
+        line = before + (sample->beta - before) * (float)i / (float)(lost + 1);
+        betaloop_push(s, level + BETALOOP_CARRIED_OVER * (line - level), 1);
+    }
+    betaloop_push(s, sample->beta, 0);
+    s->last_valid_ms = sample->t_ms;
     return reasons;
 }
 
@@ -157,7 +191,7 @@ betaloop_linkage betaloop_decision betaloop_decide(betaloop_state *s, int64_t no
     float most, wanted, requested, amplitude, before = s->amplitude_ma;
     if (s->has_sample && now_ms < s->last_sample_ms) { /* the clock has run back: what came before is forgotten */
         s->has_sample = 0;
-        s->streak = 0;
+        betaloop_forget(s);
     }
     if (s->has_decision && now_ms < s->last_decision_ms) s->last_decision_ms = now_ms;
     if (sample) reasons = betaloop_admit(s, now_ms, sample);
@@ -167,7 +201,7 @@ betaloop_linkage betaloop_decision betaloop_decide(betaloop_state *s, int64_t no
     if (!s->has_sample) trouble |= BETALOOP_NO_BETA;
     else if ((uint64_t)now_ms - (uint64_t)s->last_sample_ms > BETALOOP_STALE_AFTER_MS)
         trouble |= BETALOOP_STALE_BETA;
-    if (s->streak < BETALOOP_WINDOW) trouble |= BETALOOP_WINDOW_INCOMPLETE;
+    if (s->streak < BETALOOP_WINDOW || s->imputed > BETALOOP_MOST_IMPUTED) trouble |= BETALOOP_WINDOW_INCOMPLETE;
     else if (!(s->level >= BETALOOP_LEVEL_LOW && s->level <= BETALOOP_LEVEL_HIGH))
         trouble |= BETALOOP_BETA_LEVEL;
     if (!trouble) {
@@ -186,6 +220,7 @@ betaloop_linkage betaloop_decision betaloop_decide(betaloop_state *s, int64_t no
         s->amplitude_ma = d.amplitude_ma = BETALOOP_CDBS_MA; /* at once, in this decision: not ramped */
         return d;
     }
+    if (s->imputed) d.reasons |= BETALOOP_IMPUTED_BETA;
     most = BETALOOP_RAMP_MA_PER_S * 0.001f * (float)elapsed;
     requested = (d.fraction < 0.0f ? 0.0f : d.fraction > 1.0f ? 1.0f : d.fraction) * BETALOOP_CDBS_MA;
     wanted = requested < BETALOOP_MIN_MA ? BETALOOP_MIN_MA : requested > BETALOOP_MAX_MA ? BETALOOP_MAX_MA : requested;

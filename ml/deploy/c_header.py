@@ -237,6 +237,8 @@ def _preamble(manifest: BundleManifest, kind: str) -> str:
 #define BETALOOP_LEVEL_LOW {_float(limits.level_low or 0.0)}
 #define BETALOOP_LEVEL_HIGH {_float(LARGEST_BETA if limits.level_high is None else limits.level_high)}
 #define BETALOOP_FROZEN_AFTER {INT32_MAX if limits.frozen_after is None else limits.frozen_after}
+#define BETALOOP_MOST_IMPUTED {limits.most_imputed}
+#define BETALOOP_CARRIED_OVER {_float(limits.carried_over)}
 """
 
 

@@ -77,7 +77,7 @@ class BundleManifest:
         beta_low_hz, beta_high_hz, min_valid_fraction: how they are made from local field potentials.
         normalisation_mean, normalisation_std: z-scoring constants inside the network; None where the file does not show them.
         min_ma, max_ma, cdbs_ma, ramp_ma_per_s: the clinician's limits, as in `EnvelopeLimits`.
-        max_beta_age_s, beta_max, level_low, level_high, frozen_after: as in `EnvelopeLimits`.
+        max_beta_age_s, beta_max, level_low, level_high, frozen_after, most_imputed, carried_over: as in `EnvelopeLimits`.
         limits_stated_by: who stated the limits, and when; None where they are defaults.
         device_min_ma, device_max_ma: amplitude limits read from the participant's stimulator; None where no recording has them.
         snapshot_sha256: of the buffer snapshot that the policy was trained on; None for a policy made elsewhere.
@@ -134,6 +134,8 @@ class BundleManifest:
     level_low: float | None = None
     level_high: float | None = None
     frozen_after: int | None = None
+    most_imputed: int = 0
+    carried_over: float = 1.0
     limits_stated_by: str | None = None
     device_min_ma: float | None = None
     device_max_ma: float | None = None

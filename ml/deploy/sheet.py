@@ -82,10 +82,10 @@ def render(manifest: BundleManifest, model_sha256: str | None) -> str:
 <h2>When the controller gives way</h2>
 <p style="margin:2px 0">Every {manifest.period_s:g} s it decides anew. In the same decision, and without a ramp, it returns to the cDBS
 amplitude of <b>{manifest.cdbs_ma:g}&nbsp;mA</b> when beta has not come when it was due (older than {manifest.limits().stale_after_s:g} s),
-is not a number, negative, {_implausible(manifest)}or of another unit or source, when the window has a gap, or when the
-network fails. It takes over again after
-{manifest.window} valid beta amplitudes in a row ({manifest.window * manifest.period_s:g} s), moving at most
-{manifest.ramp_ma_per_s * manifest.period_s:.3g} mA per period.</p>
+is not a number, negative, {_implausible(manifest)}or of another unit or source, when the window is not
+whole, or when the network fails. A window has {manifest.window} beta amplitudes in a row
+({manifest.window * manifest.period_s:g} s){_imputation(manifest)}.
+From cDBS the amplitude moves at most {manifest.ramp_ma_per_s * manifest.period_s:.3g} mA per period.</p>
 {_before_use(code)}
 <h2>Where it comes from</h2><table class="wide">{_rows(_origin(manifest, model_sha256))}</table>
 {_SIGNED_BY}
@@ -156,6 +156,11 @@ def _session(m: BundleManifest) -> str:
         f'<div class="signed">Session {slot.position} of visit {slot.visit_number}{label}{repeat} · {slot.minutes:g} min · '
         f"<b>{escape(slot.visit_date)}</b> only, once. Plan {slot.plan_id}, signed as <code>{escape(slot.plan_sha256[:12])}</code>.</div>"
     )
+
+
+def _imputation(m: BundleManifest) -> str:
+    """Say how many lost ones a window may have, as the end of a sentence."""
+    return f"; up to {m.most_imputed} lost ones are predicted, never the newest" if m.most_imputed else ""
 
 
 def _implausible(m: BundleManifest) -> str:

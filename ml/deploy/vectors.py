@@ -58,7 +58,7 @@ def session(manifest: BundleManifest, controller: BoundedController, windows: ND
 
 def _script(manifest: BundleManifest, signal: Signal, betas: NDArray[np.float64]) -> Iterator[tuple[float, BetaSample | None]]:
     """Yield times and samples: start, NaN, negative, silence, wrong unit, wrong source, late, huge, zero, gap. Then, where limits define
-    them, frozen, saturated and another level; an early decision."""
+    them, lost ones that may be imputed and one too many, frozen, saturated and another level; an early decision."""
     period, w = manifest.period_s, manifest.window
     level = float(betas.mean()) or 1.0
     values = iter(np.resize(betas, 60 * (w + 8)).tolist())
@@ -92,6 +92,13 @@ def _script(manifest: BundleManifest, signal: Signal, betas: NDArray[np.float64]
     yield from take(w + 2, 1e6 * level)
     yield from take(w + 2, 0.0)
     yield from take(w + 2)
+    for lost in (manifest.most_imputed, manifest.most_imputed + 1) if manifest.most_imputed else ():
+        yield from take(1, math.nan)  # one, with a measured one before the others: together one too many
+        yield from take(1)
+        for _ in range(lost):
+            yield k * period, None
+            k += 1
+        yield from take(w + 2)
     if manifest.frozen_after is not None:
         yield from take(manifest.frozen_after + 1, level)
         yield from take(w + 1)

@@ -36,7 +36,7 @@ from app.study import service as study
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.participants import Hemisphere, Participant
 from app.tables.plans import BundleRelease
-from ml.deploy.appraisal import plausible_beta
+from ml.deploy.appraisal import imputation, plausible_beta
 from ml.deploy.bundle import build_bundle, describe, sign
 from ml.deploy.manifest import Approval, BundleError, BundleManifest
 from ml.deploy.ports.windows import COUNT, Recorded
@@ -297,7 +297,7 @@ def manifest_of(
             agreement_p99=agreement.get("p99"),
             agreement_worst=agreement.get("worst"),
             logged_lower_bound=version.lower_bound,
-            **beta_limits(data),
+            **beta_limits(data, version.window),
             test_windows_from=f"snapshot {usable.id}" if usable else None,
             taken_by=f"{caller.label}, {datetime.now(UTC):%Y-%m-%d %H:%M:%S.%f} UTC",
             public_key=public_key(),
@@ -317,9 +317,13 @@ def _at_fault(limits: Limits, device: DeviceLimits | None, cdbs_ma: float) -> di
     return {}
 
 
-def beta_limits(snapshot: BufferSnapshot | None) -> dict[str, Any]:
-    """Which beta is plausible in this participant, as entries of the manifest; only that it is not frozen where nothing was logged."""
-    return plausible_beta(read_buffer(snapshot.file_sha256).transitions().states if snapshot is not None else None)
+def beta_limits(snapshot: BufferSnapshot | None, window: int) -> dict[str, Any]:
+    """Derive which beta is plausible and how lost beta is imputed, as entries of the manifest. Without a snapshot only frozen beta is
+    implausible."""
+    if snapshot is None:
+        return plausible_beta(None)
+    buffer = read_buffer(snapshot.file_sha256)
+    return plausible_beta(buffer.transitions().states) | imputation(buffer.sessions, window)
 
 
 def _lowest(db: Session, participant: Participant, policy: Policy, limits: Limits, device: DeviceLimits | None, cdbs_ma: float) -> float:

@@ -198,7 +198,7 @@ def _scheduled(db: Session, view: PlanView, line: PlanLine, slot: Slot, signatur
             slot=slot,
             card=_card(db, view, line),
             schedule=schedule,
-            **service.beta_limits(data),
+            **service.beta_limits(data, settings.window),
         )
     except BundleError as error:
         raise Invalid(f"The bundle of session {item.position} cannot be made: {error}.", "Correct what is named.") from error

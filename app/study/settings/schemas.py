@@ -98,7 +98,9 @@ class SettingsFields(Model):
     beta_high_hz: Number = Field(35.0, description="Upper edge of the beta band, Hz.")
     min_valid_fraction: Number = Field(0.7, description="Coverage: share of its samples that a 2 s window needs to be valid.")
     most_imputed: Int = Field(
-        1, description="Imputed beta amplitudes that a state may hold, never as its newest; 0 in settings made before there was a choice."
+        2,
+        description="Imputed beta amplitudes that a state may hold, in learning and on the tablet, never as its newest; "
+        "0 in older settings.",
     )
     beta_measure: BetaMeasure = Field(
         "rms", description="Beta from time-domain LFP: 'rms' amplitude (in its unit) or 'power' (unit squared)."

@@ -189,7 +189,8 @@ def compare(
         differences = np.fmax(differences, np.abs(answers.decided_ma - vectors.decision_ma))
     compared = differences[np.isfinite(differences)]
     worst = float(compared.max()) if compared.size else None
-    off = differences[whole & np.isfinite(differences)]
+    guarded = vectors.without_dose & (np.abs(vectors.decision_ma - cdbs) <= MOST_MA)
+    off = differences[~guarded & np.isfinite(differences)]
     if worst is None or (np.any(off > MOST_MA) and all(f.code in _BESIDE_DIFFERENCES for f in faults)):
         faults.append(Fault("differs", value=float(off.max()) if off.size else None, count=int(np.sum(off > MOST_MA))))
     verdict = NOT if faults or worst is None else SAME if worst <= TOLERANCE * cdbs else WITHIN
@@ -256,7 +257,8 @@ def _of_lost(fraction: NDArray[np.float64], cdbs: float) -> dict[str, Any]:
 def _of_decisions(vectors: PortVectors, m: BundleManifest, amplitudes: NDArray[np.float64]) -> Iterator[Fault]:
     """List what is wrong with whole decisions."""
     lost = vectors.without_dose
-    unsafe = lost & ~(np.abs(amplitudes - m.cdbs_ma) <= MOST_MA)
+    guarded = lost & (np.abs(vectors.decision_ma - m.cdbs_ma) <= MOST_MA)  # the others are decided on imputed samples
+    unsafe = guarded & ~(np.abs(amplitudes - m.cdbs_ma) <= MOST_MA)
     if unsafe.any():
         known = amplitudes[unsafe & np.isfinite(amplitudes)]
         low, high = (float(known.min()), float(known.max())) if known.size else (None, None)

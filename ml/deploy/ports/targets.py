@@ -18,6 +18,7 @@ from ml.deploy.manifest import BundleManifest
 from ml.deploy.ports.answers import Answers
 from ml.deploy.ports.vectors import PortVectors
 from ml.deploy.ports.windows import Windows
+from ml.deploy.runtime.envelope import Reason
 
 LIBRARIES = (".so", ".dylib", ".dll")
 RUNNABLE = (".onnx", ".tflite", *LIBRARIES)
@@ -152,6 +153,6 @@ def _library(path: Path, vectors: PortVectors, manifest: BundleManifest) -> Answ
             sample = _Sample(step * period_ms, beta, unit, source)
             decision = decide(state, step * period_ms, ctypes.byref(sample))
         decided[i] = decision.amplitude_ma
-        if not decision.fallback:
+        if not (decision.fallback or decision.reasons & Reason.IMPUTED_BETA):  # which is of another window
             fraction[i] = decision.fraction
     return Answers(fraction, decided)

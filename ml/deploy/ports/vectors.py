@@ -105,7 +105,7 @@ def make_vectors(
     dose[whole] = act(windows[whole])
     decision_ma = np.array([run_window(controller, manifest, window) for window in windows])
     hashes = tuple(row_hash(model_sha256, row, window) for row, window in enumerate(windows, 1))
-    must_not = tuple(_must_not(name, manifest) for name in kind)
+    must_not = tuple(_must_not(name, manifest, due) for name, due in zip(kind, decision_ma.tolist(), strict=True))
     return PortVectors(tuple(kind), hashes, windows, dose, decision_ma, must_not)
 
 
@@ -124,10 +124,11 @@ def row_hash(model_sha256: str, row: int, window: NDArray[np.float64]) -> str:
     return hashlib.sha256(f"{model_sha256}:{row}:".encode() + window.astype("<f4").tobytes()).hexdigest()[:HASH_DIGITS]
 
 
-def _must_not(kind: str, m: BundleManifest) -> str:
+def _must_not(kind: str, m: BundleManifest, due_ma: float) -> str:
     """Say what must not happen with a window of a kind; without commas, for the simplest of readers."""
     if kind in LOST:
-        return f"an ordinary dose: no number from the network or {m.cdbs_ma:g} mA from the guard in front of it"
+        guard = f"{m.cdbs_ma:g} mA" if due_ma == m.cdbs_ma else f"{due_ma:.4g} mA with the lost ones imputed"
+        return f"an ordinary dose: no number from the network or {guard} from the guard in front of it"
     return {
         kinds.ZERO: "a fault of arithmetic or a dose for what was never measured",
         kinds.LEVEL: "a fall where the policy rises or a rise where it falls",

@@ -21,7 +21,6 @@ import math
 import re
 import signal
 import sys
-from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +40,7 @@ from .signature import verifies
 from .slot import SEALED, NotAllowed, opened, read_withdrawals
 
 _LIMITS = ("min_ma", "max_ma", "cdbs_ma", "ramp_ma_per_s", "window", "period_s", "max_beta_age_s")
-_OPTIONAL_LIMITS = ("beta_max", "level_low", "level_high", "frozen_after")
+_OPTIONAL_LIMITS = ("beta_max", "level_low", "level_high", "frozen_after", "most_imputed", "carried_over")
 _WITH_VALUE = ("--key", "--input", "--log", "--ledger", "--withdrawn", "--time")
 LEDGER = Path.home() / ".betaloop-tablet"
 ENDED_WELL = (End.COMPLETE, End.STOPPED)
@@ -149,7 +148,7 @@ def check(manifest: dict[str, Any], network: MlpNetwork | None, vectors: dict[st
 
 def make_controller(manifest: dict[str, Any], network: MlpNetwork | None) -> BoundedController:
     """Make the network or schedule of a manifest within its limits. Raises ValueError, KeyError, TypeError for a manifest that is none."""
-    stated = {name: manifest[name] for name in _LIMITS} | {name: manifest.get(name) for name in _OPTIONAL_LIMITS}
+    stated = {name: manifest[name] for name in _LIMITS} | {name: manifest[name] for name in _OPTIONAL_LIMITS if name in manifest}
     limits, said = EnvelopeLimits(**stated), Signal(manifest["beta_unit"], manifest["beta_source"])
     if manifest.get("schedule"):
         return ScheduledController(Schedule.from_json(manifest["schedule"]), limits, said)
@@ -239,16 +238,16 @@ def replay(manifest: dict[str, Any], manifest_sha256: str, controller: BoundedCo
     """
     facts = describe(manifest, manifest_sha256, controller, Tablet(ledger=Ledger(LEDGER)).now(), "replay")
     sink = None if log is None else LogFile(log, manifest["period_s"], facts)
-    window: deque[float] = deque(maxlen=manifest["window"])
     said = Signal(manifest["beta_unit"], manifest["beta_source"])
     for k, line in enumerate(sys.stdin):
         sample = BetaSample(k * manifest["period_s"], number(line.strip()), said)
         decision = controller.decide(sample.t_s, sample)
-        window.append(sample.beta)
         sys.stdout.write(f"{decision.amplitude_ma:.6g} {' '.join(reason_names(decision.reasons))}\n")
         sys.stdout.flush()
         if sink:
-            sink.write(Row(sample.t_s, sample, decision, list(window), 0.0, drawn=None if decision.fallback else controller.drawn()))
+            sink.write(
+                Row(sample.t_s, sample, decision, list(controller.window), 0.0, drawn=None if decision.fallback else controller.drawn())
+            )
     if sink:
         sink.close()
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -85,7 +84,6 @@ class LiveSession:
     def __post_init__(self) -> None:
         self._limits = self.controller.envelope.limits
         self._period_s = self._limits.period_s
-        self._window: deque[float] = deque(maxlen=self._limits.window)
         self._reader = Reader(self.peer, self.bare)
         self._decisions: list[Decision] = []
 
@@ -178,8 +176,7 @@ class LiveSession:
 
     def _observe(self, sample: BetaSample) -> None:
         """Take a beta amplitude that came late, or was overtaken, into the window without a decision."""
-        if not self.controller.observe(self._clock(), self._since_start(sample)) & Reason.LATE_SAMPLE:
-            self._window.append(sample.beta)
+        self.controller.observe(self._clock(), self._since_start(sample))
 
     def _clock(self) -> float:
         """Compute the seconds since the start."""
@@ -211,8 +208,6 @@ class LiveSession:
             self.link.send(amplitude_line(len(self.decisions), now_s, decision))
         else:
             decision = self._clinical(decision)
-        if sample is not None and not decision.reasons & Reason.LATE_SAMPLE:
-            self._window.append(sample.beta)
         self.decisions.append(decision)
         self.missed += missed
         due_s = self._phase_s + n * self._period_s
@@ -224,7 +219,19 @@ class LiveSession:
         late_s = max(0.0, self.link.now() - due_s)
         drawn = None if decision.fallback else self.controller.drawn()
         on_grid = decision._replace(t_s=self._began_s + decision.t_s - self._phase_s)
-        row = Row(n * self._period_s, sample, on_grid, list(self._window), latency_us, 0.0, late_s, missed, drawn, self.charge(), self._end)
+        row = Row(
+            n * self._period_s,
+            sample,
+            on_grid,
+            list(self.controller.window),
+            latency_us,
+            0.0,
+            late_s,
+            missed,
+            drawn,
+            self.charge(),
+            self._end,
+        )
         self.rows.append(row)
         self.log(row)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Protocol
 
 from .envelope import BetaSample, Decision, Envelope, EnvelopeLimits, Signal
@@ -24,13 +25,17 @@ class BoundedController:
         network: asked when its window is whole and fresh.
         limits: the clinician's.
         signal: unit and source of the beta amplitudes that the network was trained on.
+
+    Attributes:
+        window: beta amplitudes that the network was given, imputed ones too, the newest last; at most W.
     """
 
-    __slots__ = ("envelope", "network")
+    __slots__ = ("envelope", "network", "window")
 
     def __init__(self, network: WindowNetwork, limits: EnvelopeLimits, signal: Signal) -> None:
         self.network = network
         self.envelope = Envelope(limits, signal)
+        self.window: deque[float] = deque(maxlen=limits.window)
 
     def fresh(self) -> BoundedController:
         """Copy the controller at the start of a session; the network is shared, and its window is filled before it is asked."""
@@ -39,9 +44,10 @@ class BoundedController:
     def observe(self, now_s: float, sample: BetaSample) -> int:
         """Take a beta amplitude in without deciding on it, as one that came late. Returns the reasons against it."""
         self.envelope.begin(now_s)
-        reasons, use = self.envelope.admit(now_s, sample)
-        if use:
-            self.network.push(sample.beta)
+        reasons, taken = self.envelope.admit(now_s, sample)
+        for beta in taken:
+            self.network.push(beta)
+        self.window.extend(taken)
         return reasons
 
     def decide(self, now_s: float, sample: BetaSample | None, reasons: int = 0) -> Decision:

@@ -6,11 +6,14 @@ It knows nothing of how the fraction was made. Every period it decides on one am
 * from one decision to the next the amplitude moves by no more than the ramp limit times the time between them. However late a decision
   comes, it moves by no more than the ramp limit times one period;
 * untrusted beta, or a network that fails or answers outside [0, 1], gives the cDBS amplitude in the very decision in which that is found.
-  Untrusted is beta that has not come when it was due, is not a number, negative, or of another unit or source. So is beta without a whole
-  window without a gap. Where the limits define them, so is beta that is saturated, frozen or on a level that was never logged. This return
+  Untrusted is beta that has not come when it was due, is not a number, negative, or of another unit or source. So is a window that is not
+  whole. Where the limits define them, so is beta that is saturated, frozen or on a level that was never logged. This return
   to the programmed therapy is *not* ramped: a ramp would leave the participant under-treated for some periods on an untrusted signal. It is
   the one exception to the ramp limit;
-* the network is asked again once a whole window of valid beta amplitudes has come; from cDBS the amplitude then moves at the ramp limit.
+* a window is whole with W amplitudes one period apart. As many of them may be imputed as learning admits (`most_imputed`), never the
+  newest. Only what was lost is imputed: an amplitude that did not come, or was no number. What came and is wrong starts a new window;
+* the network is asked again once the window is whole and its newest amplitude is measured. From cDBS the amplitude moves at the ramp
+  limit.
 """
 
 from __future__ import annotations
@@ -42,8 +45,8 @@ class Reason:
     STALE_BETA = 2  # the newest beta amplitude is too old
     INVALID_BETA = 4  # the beta amplitude is not a number, negative or infinite
     WRONG_SIGNAL = 8  # the beta amplitude is of another unit or source than the network was trained on
-    WINDOW_INCOMPLETE = 16  # fewer than W valid beta amplitudes since the start or the last fault
-    WINDOW_GAP = 32  # the beta amplitude is not one period after the one before
+    WINDOW_INCOMPLETE = 16  # fewer than W beta amplitudes since the start or the last fault, or too many imputed ones among them
+    WINDOW_GAP = 32  # the beta amplitude is not one period after the one before, and what is between may not be imputed
     LATE_SAMPLE = 64  # a beta amplitude not newer than the last one, or from the future, was ignored
     POLICY_FAILED = 128  # the network raised an error
     POLICY_OUTPUT = 256  # the network's answer is no fraction in [0, 1]
@@ -54,6 +57,7 @@ class Reason:
     FROZEN_BETA = 8192  # the same beta amplitude came again and again
     BETA_LEVEL = 16384  # the mean of the window is far from every level that was logged: another unit, a loose contact
     LINK = 32768  # the input repeats, skips or restarts its numbers or its clock, or was lost; found by the loop, not by the envelope
+    IMPUTED_BETA = 65536  # the network's window has imputed beta amplitudes among the older ones
 
 
 _NOTES = Reason.LATE_SAMPLE | Reason.WINDOW_GAP  # no trouble in themselves: the window that they leave behind is judged
@@ -81,6 +85,8 @@ class EnvelopeLimits:
         beta_max: beta amplitude above which the input counts as saturated; None where it is unknown.
         level_low, level_high: range of the mean of a window, in the unit of the beta amplitudes; None where it is unknown.
         frozen_after: so many equal beta amplitudes in a row count as frozen, 2 or more; None leaves them uncounted.
+        most_imputed: lost beta amplitudes that a window may hold as imputed ones, fewer than W; as the policy's training had it.
+        carried_over: weight, 0 to 1, of the line between both measured neighbours in an imputed value; the rest is the window's mean.
 
     Raises:
         ValueError: a value outside its range; the message names it.
@@ -97,6 +103,8 @@ class EnvelopeLimits:
     level_low: float | None = None
     level_high: float | None = None
     frozen_after: int | None = None
+    most_imputed: int = 0
+    carried_over: float = 1.0
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
@@ -120,6 +128,10 @@ class EnvelopeLimits:
             raise ValueError(f"the level of beta needs a range that rises from 0 or more, not {self.level_low} to {self.level_high}")
         if self.frozen_after is not None and self.frozen_after < 2:
             raise ValueError(f"beta is frozen after 2 equal amplitudes at the earliest, not after {self.frozen_after}")
+        if not 0 <= self.most_imputed < self.window or not 0 <= self.carried_over <= 1:
+            raise ValueError(
+                f"{self.most_imputed} imputed beta amplitudes of {self.window}, carried over by {self.carried_over}, are no rule"
+            )
 
     @property
     def stale_after_s(self) -> float:
@@ -153,7 +165,7 @@ class Decision(NamedTuple):
         fraction: the network's answer as it came; None where it was not asked or failed.
         requested_ma: the wish in mA, before the limits; None where there was none.
         beta_age_s: age of the newest beta amplitude; None before the first.
-        valid: valid beta amplitudes in the window, 0 to W.
+        valid: beta amplitudes in the window, 0 to W; `Reason.IMPUTED_BETA` says whether any is imputed.
         detail: the network's error text, where it failed.
     """
 
@@ -184,8 +196,8 @@ class Envelope:
     """
 
     __slots__ = (
-        "_age_s", "_beta_max", "_closest_s", "_equal", "_farthest_s", "_frozen_after", "_last_beta", "_last_decision_s", "_last_sample_s",
-        "_level", "_streak", "amplitude_ma", "limits", "signal",
+        "_age_s", "_beta_max", "_closest_s", "_equal", "_farthest_s", "_frozen_after", "_imputed", "_last_beta", "_last_decision_s",
+        "_last_sample_s", "_last_valid_s", "_level", "_streak", "amplitude_ma", "limits", "signal",
     )  # fmt: skip
 
     def __init__(self, limits: EnvelopeLimits, signal: Signal) -> None:
@@ -197,48 +209,75 @@ class Envelope:
         self._farthest_s = (1 + SPACING_TOLERANCE) * limits.period_s + _TIME_EPSILON_S
         self._last_sample_s: float | None = None
         self._last_decision_s: float | None = None
-        self._streak = 0
+        self._last_valid_s = 0.0
+        self._streak = self._imputed = 0
         self._beta_max = math.inf if limits.beta_max is None else _float32(limits.beta_max)
         self._frozen_after = math.inf if limits.frozen_after is None else limits.frozen_after
         self._last_beta, self._equal, self._level = -1.0, 0, 0.0
 
     def forget(self) -> None:
         """Trust nothing that came so far, as after a break of the link: cDBS until a whole new window has come."""
-        self._last_sample_s, self._streak, self._equal = None, 0, 0
+        self._last_sample_s, self._streak, self._imputed, self._equal = None, 0, 0, 0
 
     def begin(self, now_s: float) -> None:
         """Start a decision. When the clock has run back, what came before is forgotten, so that a corrected clock does not lock the network
         out."""
         if self._last_sample_s is not None and now_s < self._last_sample_s - _TIME_EPSILON_S:
-            self._last_sample_s, self._streak = None, 0
+            self._last_sample_s, self._streak, self._imputed = None, 0, 0
         if self._last_decision_s is not None and now_s < self._last_decision_s:
             self._last_decision_s = now_s
 
-    def admit(self, now_s: float, sample: BetaSample) -> tuple[int, bool]:
-        """Judge a new beta amplitude. Returns the reasons against it, and whether it belongs into the network's window."""
+    def admit(self, now_s: float, sample: BetaSample) -> tuple[int, tuple[float, ...]]:
+        """Judge a new beta amplitude. Returns the reasons against it, and the amplitudes that enter the network's window.
+
+        These are imputed ones for what was lost before it, and itself; none where it may not be used."""
         t_s, beta, signal = sample
         last = self._last_sample_s
         if not (t_s <= now_s + _TIME_EPSILON_S and (last is None or t_s > last)) or t_s == -math.inf:  # NaN is never in order
-            return Reason.LATE_SAMPLE, False
+            return Reason.LATE_SAMPLE, ()
         self._last_sample_s = t_s
         reasons = 0
         if signal is not self.signal and signal != self.signal:
             reasons = Reason.WRONG_SIGNAL
+        before = self._last_beta
+        if math.isnan(beta) and not reasons and self.limits.most_imputed:
+            return Reason.INVALID_BETA, ()  # lost like one that did not come: the next one shows whether it may be imputed
         if not 0.0 <= beta <= LARGEST_BETA:
             reasons |= Reason.INVALID_BETA
             self._equal = 0
         else:
             reasons |= self._implausible(beta)
         if reasons:
-            self._streak = 0
-            return reasons, False
-        if last is not None and self._streak and not self._closest_s <= t_s - last <= self._farthest_s:
-            self._streak = 0
-            reasons = Reason.WINDOW_GAP
-        if self._streak < self.limits.window:
-            self._streak += 1
-        self._level = beta if self._streak == 1 else self._level + (beta - self._level) / self._streak
-        return reasons, True
+            self._streak = self._imputed = 0
+            return reasons, ()
+        lost = self._lost_before(t_s)
+        if lost is None:
+            self._streak = self._imputed = 0
+            return Reason.WINDOW_GAP, self._take(t_s, (), beta)
+        level, weight = self._level, self.limits.carried_over
+        line = [before + (beta - before) * (i + 1) / (lost + 1) for i in range(lost)]
+        return 0, self._take(t_s, tuple(level + weight * (value - level) for value in line), beta)
+
+    def _lost_before(self, t_s: float) -> int | None:
+        """Count the amplitudes lost between the newest valid one and one at `t_s`; None where the window has to start again."""
+        if not self._streak:
+            return 0
+        spacing = t_s - self._last_valid_s
+        if spacing <= self._farthest_s:
+            return 0 if spacing >= self._closest_s else None
+        periods = (spacing - _TIME_EPSILON_S) / self.limits.period_s - (1 + SPACING_TOLERANCE)
+        return math.ceil(periods) if periods <= self.limits.most_imputed else None
+
+    def _take(self, t_s: float, lost_ones: tuple[float, ...], beta: float) -> tuple[float, ...]:
+        """Move the window on by imputed amplitudes and a measured one. Returns all of them."""
+        values = (*lost_ones, beta)
+        whole = (1 << self.limits.window) - 1
+        for at, value in enumerate(values):
+            self._imputed = (self._imputed << 1 | (at < len(lost_ones))) & whole
+            self._streak = min(self._streak + 1, self.limits.window)
+            self._level = value if self._streak == 1 else self._level + (value - self._level) / self._streak
+        self._last_valid_s = t_s
+        return values
 
     def _implausible(self, beta: float) -> int:
         """Detect a beta amplitude that is saturated, or one of a row of equal ones; as float32, which is what every runtime compares."""
@@ -263,7 +302,8 @@ class Envelope:
             trouble |= Reason.NO_BETA
         elif not age <= self._age_s:  # so written that a clock that is not a number counts as stale
             trouble |= Reason.STALE_BETA
-        if self._streak < limits.window:
+        imputed = self._imputed.bit_count()
+        if self._streak < limits.window or imputed > limits.most_imputed:
             trouble |= Reason.WINDOW_INCOMPLETE
         elif limits.level_high is not None and not (limits.level_low or 0.0) <= self._level <= limits.level_high:
             trouble |= Reason.BETA_LEVEL
@@ -276,6 +316,7 @@ class Envelope:
         if trouble:
             self.amplitude_ma = limits.cdbs_ma
             return Decision(now_s, limits.cdbs_ma, True, reasons, fraction, None, age, self._streak, detail)
+        reasons |= Reason.IMPUTED_BETA if imputed else 0
         requested = min(max(fraction or 0.0, 0.0), 1.0) * limits.cdbs_ma
         wanted = min(max(requested, limits.min_ma), limits.max_ma)
         if wanted > requested + FLAG_MA:

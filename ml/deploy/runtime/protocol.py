@@ -130,7 +130,7 @@ class Reader:
         before, self._seq = self._seq, seq
         signal = self._peer.signal if signal == (self._peer.signal.unit.replace(" ", "_"), self._peer.signal.source) else signal
         fault = ""
-        if before is not None and seq != before + 1:
+        if before is not None and not self._follows(seq - before, sent_s):
             fault = f"number {seq} after number {before}"
         elif before is not None and abs((sent_s - self._sent_s) - (arrived_s - self._arrived_s)) > JUMP * self._peer.period_s:
             # a burst of delayed lines differs too: by the delay of its first line, which the oldest offset shows
@@ -142,6 +142,11 @@ class Reader:
         self._sent_s, self._arrived_s = sent_s, arrived_s
         self._offset_s = min(self._offset_s, arrived_s - sent_s)
         return Taken(BetaSample(min(sent_s + self._offset_s, arrived_s), value, signal), fault)
+
+    def _follows(self, steps: int, sent_s: float) -> bool:
+        """Decide whether a number is so many after the last one; numbers between were lost where the sender's clock went on with them."""
+        period_s = self._peer.period_s
+        return steps == 1 or (steps > 1 and abs(sent_s - self._sent_s - steps * period_s) <= JUMP * period_s)
 
     def _fault(self, what: str) -> Taken:
         self._offset_s = math.inf

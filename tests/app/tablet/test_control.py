@@ -264,6 +264,25 @@ def test_a_real_recording_with_packet_loss_is_driven_from_its_raw_lfp(tmp_path: 
         assert all(0.5 <= d.amplitude_ma <= 3.0 for d in run.decisions)
 
 
+@pytest.mark.parametrize(("most", "least", "highest"), [(0, 0.0, 0.4), (2, 0.8, 1.0)])
+def test_on_a_recording_with_heavy_loss_the_policy_decides_in_four_periods_of_five(
+    tmp_path: Path, recordings: Path, most: int, least: float, highest: float
+) -> None:
+    opened = verified(made(tmp_path, most_imputed=most, carried_over=0.5), PUBLIC)
+    pairs = ["+1-0 +2-0 +3-0 +3-1", "+2-1 +3-1 +3-2", "+10-8 +11-9 +9-8", "+11-10 +11-8 +11-9"]
+    asked: list[bool] = []
+    for channel in (f"key {key} {pair}" for key, named in enumerate(pairs) for pair in named.split()):
+        source = open_source(str(recordings / "rcs" / "montage_packet_loss.zip"), opened.manifest, Wish(channel=channel), [])
+        run = Run(2.0, 3.0)
+        drive(opened, source, run, False, None)
+        known = np.flatnonzero(np.isfinite(source.streamed))
+        assert all(d.amplitude_ma == 3.0 for k, d in enumerate(run.decisions) if k not in known), "no amplitude on stale beta"
+        for sensed in np.split(known, np.flatnonzero(np.diff(known) > 5) + 1):  # a montage senses a pair for 40 s
+            asked += [not d.fallback for d in run.decisions[sensed[0] + 9 : sensed[-1] + 1]]
+    assert len(asked) > 100
+    assert least <= np.mean(asked) <= highest
+
+
 def test_a_real_stimulation_sweep_is_driven_from_the_devices_own_band_power(tmp_path: Path, recordings: Path) -> None:
     sweep = str(recordings / "rcs" / "stim_sweep.zip")
     with pytest.raises(NotFound, match="no channel"):

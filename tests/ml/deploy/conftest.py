@@ -44,6 +44,8 @@ def manifest() -> BundleManifest:
         level_low=30.0,
         level_high=400.0,
         frozen_after=5,
+        most_imputed=2,
+        carried_over=0.7,
         snapshot_sha256="ab" * 32,
         code_version="0.1.0",
         approvals=(Approval(name="A. Clinician", role="clinician", approved_at="2026-03-01T09:00:00+00:00", statement="limits checked"),),

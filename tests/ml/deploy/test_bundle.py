@@ -169,7 +169,7 @@ def test_no_name_can_leave_its_place_in_the_sheet(network, manifest, test_window
 def test_the_manifests_limits_are_the_envelopes(manifest):
     assert manifest.limits() == EnvelopeLimits(
         min_ma=0.5, max_ma=3.2, cdbs_ma=3.0, ramp_ma_per_s=0.25, window=10, period_s=2.0, beta_max=900.0, level_low=30.0, level_high=400.0,
-        frozen_after=5,
+        frozen_after=5, most_imputed=2, carried_over=0.7,
     )  # fmt: skip
 
 

@@ -221,19 +221,30 @@ def test_a_log_entry_is_json_even_for_numbers_that_json_does_not_have():
 
 
 def whole(limits, taken, now):
-    """Straight from the rule: the newest W samples are valid, one period apart, and the newest is less than a period old."""
-    newest = taken[-limits.window :]
-    spaced = all(0.5 * limits.period_s <= b.t_s - a.t_s <= 1.5 * limits.period_s for a, b in itertools.pairwise(newest))
-    valid = all(s.signal == UV and math.isfinite(s.beta) and s.beta >= 0 for s in newest)
-    return len(newest) == limits.window and spaced and valid and 0 <= now - newest[-1].t_s < limits.period_s
+    """Decide by the rule: the newest is valid and of this period, and each of the W periods since the last fault has one.
+
+    As many may be lost as may be imputed, but not the oldest of all."""
+    if not taken or not 0 <= now - taken[-1].t_s < limits.period_s:
+        return False
+    at = {round(s.t_s / limits.period_s): s for s in taken}
+    newest = round(taken[-1].t_s / limits.period_s)
+    lost = [k not in at or (math.isnan(at[k].beta) and at[k].signal == UV) for k in range(newest - limits.window + 1, newest + 1)]
+    wrong = [k for k, s in at.items() if s.signal != UV or s.beta < 0 or (math.isnan(s.beta) and not limits.most_imputed)]
+    begun = [k for k, s in at.items() if s.signal == UV and s.beta >= 0 and k > max(wrong, default=-math.inf)]
+    for a, b in itertools.pairwise(list(begun)):
+        if b - a - 1 > limits.most_imputed:
+            begun = [k for k in begun if k >= b]
+    oldest = min(begun, default=math.inf)
+    return not lost[-1] and oldest <= newest - limits.window + 1 and sum(lost) <= limits.most_imputed
 
 
 KINDS = ("good", "nan", "negative", "missing", "unit", "again")
 
 
-@pytest.mark.parametrize("window", [1, 2, 3])
-def test_every_sequence_of_five_periods_falls_back_exactly_when_the_rule_says(window):
-    limits = dataclasses.replace(LIMITS, window=window)
+@pytest.mark.hazard("H07")
+@pytest.mark.parametrize(("window", "most"), [(1, 0), (2, 0), (3, 0), (2, 1), (3, 1), (3, 2)])
+def test_every_sequence_of_five_periods_falls_back_exactly_when_the_rule_says(window, most):
+    limits = dataclasses.replace(LIMITS, window=window, most_imputed=most)
     for kinds in itertools.product(KINDS, repeat=5):
         controller, taken = BoundedController(constant(0.1, window), limits, UV), []
         before = limits.cdbs_ma
@@ -260,11 +271,46 @@ def test_every_sequence_of_five_periods_falls_back_exactly_when_the_rule_says(wi
             before = decision.amplitude_ma
 
 
+@pytest.mark.hazard("H07")
+def test_a_lost_beta_is_imputed_in_older_places_and_never_as_the_newest():
+    network = Answers(0.2)
+    limits = dataclasses.replace(LIMITS, most_imputed=1, carried_over=0.5)
+    decisions = run(network, [100.0, 100.0, 100.0, None, 110.0, 100.0, 100.0], limits)
+    assert [d.fallback for d in decisions] == [True, True, False, True, False, False, False]
+    assert (decisions[3].amplitude_ma, names(decisions[3])) == (3.0, {"stale_beta"})
+    assert network.asked[1] == [100.0, pytest.approx(100.0 + 0.5 * 5.0), 110.0], "half of the line, and half of the window's mean"
+    assert [("imputed_beta" in names(d)) for d in decisions] == [False, False, False, False, True, True, False]
+    assert all(math.isfinite(beta) for asked in network.asked for beta in asked)
+
+
+@pytest.mark.hazard("H10")
+def test_lost_values_between_do_not_hide_that_beta_is_frozen():
+    limits = dataclasses.replace(LIMITS, most_imputed=2, frozen_after=4)
+    decisions = run(constant(0.2), [100.0, 101.0, 102.0, *[103.0, math.nan, 103.0] * 4], limits)
+    assert not any(not d.fallback for d in decisions[9:])
+    assert any("frozen_beta" in names(d) for d in decisions)
+
+
+@pytest.mark.hazard("H08")
+@pytest.mark.parametrize("bad", [-1.0, math.inf, 1e39])
+def test_what_came_and_is_wrong_is_never_imputed(bad):
+    limits = dataclasses.replace(LIMITS, most_imputed=2)
+    decisions = run(constant(0.2), [100.0] * 5 + [bad] + [100.0] * 4, limits)
+    assert [d.fallback for d in decisions[5:]] == [True, True, True, False, False]
+
+
+@pytest.mark.parametrize("change", [{"most_imputed": 3}, {"most_imputed": -1}, {"carried_over": 1.1}, {"carried_over": -0.1}])
+def test_a_rule_that_would_impute_a_whole_window_is_refused(change):
+    with pytest.raises(ValueError, match="are no rule"):
+        dataclasses.replace(LIMITS, **change)
+
+
 @st.composite
 def limits_of_any_kind(draw):
     low, cdbs, high = sorted(draw(st.lists(st.floats(0.01, 8), min_size=3, max_size=3)))
     ramp, window = draw(st.floats(0.01, 5)), draw(st.integers(1, 4))
-    return EnvelopeLimits(min_ma=low, max_ma=high, cdbs_ma=cdbs, ramp_ma_per_s=ramp, window=window)
+    most, weight = draw(st.integers(0, window - 1)), draw(st.floats(0, 1))
+    return EnvelopeLimits(min_ma=low, max_ma=high, cdbs_ma=cdbs, ramp_ma_per_s=ramp, window=window, most_imputed=most, carried_over=weight)
 
 
 ANYTHING = st.floats(allow_nan=True, allow_infinity=True)

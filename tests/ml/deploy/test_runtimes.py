@@ -252,7 +252,9 @@ def test_the_runner_of_a_bundle_checks_and_runs_it_with_numpy_alone(tmp_path, ma
     assert lines[0] == "3 window_incomplete"
     wish = float(policy.act(test_windows.ravel()[None, :10])[0]) * 3.0
     assert float(lines[9].split()[0]) == pytest.approx(min(max(wish, 2.5), 3.2), abs=1e-5)
-    assert lines[12] == "3 invalid_beta window_incomplete"
+    assert lines[12:14] == ["3 invalid_beta", "3 invalid_beta"]
+    assert "imputed_beta" in lines[14]
+    assert "invalid_beta" not in lines[14]
     (folder / "weights.f32").write_bytes(b"0" * 1764)
     again = subprocess.run([sys.executable, "-m", "controller"], cwd=folder, capture_output=True, text=True, check=False)
     assert again.returncode == 1

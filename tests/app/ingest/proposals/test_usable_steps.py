@@ -24,7 +24,7 @@ def montage(recordings: Path) -> tuple[str, bytes]:
 def test_a_recording_with_packet_loss_has_20_usable_steps_over_its_time_domain_channels(
     send: Any, client: TestClient, recordings: Path
 ) -> None:
-    client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0}})
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0, "most_imputed": 1}})
     answer = send(montage(recordings)).json()
     (proposal,) = answer["proposals"]
     first, *rest = proposal["usable_steps"]
@@ -52,7 +52,7 @@ def test_a_recording_with_packet_loss_has_20_usable_steps_over_its_time_domain_c
 
 
 def test_the_channel_is_chosen_anew_for_another_part_until_a_person_states_one(send: Any, client: TestClient, recordings: Path) -> None:
-    client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0}})
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0, "most_imputed": 1}})
     (proposal,) = send(montage(recordings)).json()["proposals"]
     number = proposal["session"]["id"]
     cut = client.patch(f"/api/v1/proposals/{number}", json={"version": 1, "start_s": 0, "stop_s": 40}).json()
@@ -69,7 +69,7 @@ def test_the_channel_is_chosen_anew_for_another_part_until_a_person_states_one(s
 
 
 def test_every_part_of_a_cut_recording_gets_its_own_channel(send: Any, client: TestClient, recordings: Path) -> None:
-    client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0}})
+    client.put("/api/v1/participants/P1/settings", json={"settings": {"cdbs_amplitude_ma": 3.0, "most_imputed": 1}})
     (proposal,) = send(montage(recordings)).json()["proposals"]
     number = proposal["session"]["id"]
     parts = [{"start_s": 0, "stop_s": 40}, {"start_s": 42, "stop_s": 84}]

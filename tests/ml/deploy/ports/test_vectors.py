@@ -57,7 +57,10 @@ def test_doses_are_those_of_the_network_and_decisions_those_of_the_whole_control
     vectors, manifest = port.vectors, port.opened.manifest
     np.testing.assert_allclose(vectors.dose, port.answers(), atol=1e-6)
     assert np.isnan(vectors.dose[vectors.without_dose]).all()
-    assert np.all(vectors.decision_ma[vectors.without_dose] == manifest.cdbs_ma), "a lost sample gives cDBS"
+    newest = np.isnan(vectors.windows[:, -1])
+    assert np.all(vectors.decision_ma[newest] == manifest.cdbs_ma), "a lost newest sample gives cDBS"
+    begun = np.isnan(vectors.windows[:, 0]) | (np.isnan(vectors.windows).sum(axis=1) > manifest.most_imputed)
+    assert np.all(vectors.decision_ma[begun] == manifest.cdbs_ma), "and so does a window with more lost than may be imputed"
     signal = Signal(manifest.beta_unit, manifest.beta_source)
     for row in (0, 150, 399):
         controller = port.opened.controller()
@@ -98,7 +101,7 @@ def test_a_schedule_has_nothing_to_port(manifest):
 def test_windows_of_every_length_have_400(manifest, length):
     policy = MlpPolicy(length, (4,), mean=30.0, std=9.0, seed=1)
     windows = np.abs(np.random.default_rng(1).normal(30.0, 9.0, (3, length)))
-    content = build_bundle(policy.to_onnx(), replace(manifest, window=length), windows)
+    content = build_bundle(policy.to_onnx(), replace(manifest, window=length, most_imputed=0), windows)
     vectors = port_vectors(content, open_bundle(content).manifest)
     assert vectors.windows.shape == (400, length)
     assert "near" in vectors.kind, "too few were recorded"

@@ -58,9 +58,9 @@ class ScriptedLink:
         return [(at, float(line.split()[3])) for at, line in self.sent if line.startswith("amplitude")]
 
 
-def network() -> MlpNetwork:
+def network(window: int = W) -> MlpNetwork:
     """Asks for 0.2 of cDBS whatever comes: a wish that shows at once when it is followed."""
-    weights = [(np.zeros((2, W), dtype=np.float32), np.zeros(2, dtype=np.float32))]
+    weights = [(np.zeros((2, window), dtype=np.float32), np.zeros(2, dtype=np.float32))]
     last = (np.zeros((1, 2), dtype=np.float32), np.array([np.arctanh(2 * 0.2 - 1)], dtype=np.float32))
     return MlpNetwork([*weights, last], 1.0, 1.0)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from ml.deploy.runtime.control_loop import End
@@ -24,6 +26,7 @@ from tests.ml.deploy.runtime.links import (
     beta_line,
     betas,
     followed,
+    network,
     ran,
     session,
 )
@@ -77,6 +80,21 @@ def test_a_value_that_comes_a_period_late_is_never_taken_for_a_present_one() -> 
 def test_one_value_that_is_merely_late_costs_one_decision_and_not_the_window() -> None:
     _, one, _ = ran([*betas(range(8)), (18.9, Event.LINE, beta_line(8)), *betas(range(9, 14))], 30.0)
     assert followed(one) == [False] * 2 + [True] * 6 + [False] + [True] * 5 + [False]
+
+
+@pytest.mark.hazard("H07", "H11")
+def test_at_five_per_cent_of_messages_lost_the_policy_decides_nine_times_in_ten_and_never_on_stale_beta() -> None:
+    lost, n = np.random.default_rng(4).random(2000) < 0.05, 2000
+    limits = replace(LIMITS, window=10, most_imputed=2, frozen_after=None)
+    link = ScriptedLink([(0.0, Event.LINE, HELLO), *betas(k for k in range(n) if not lost[k]), (PERIOD * n + 0.5, Event.ENDED, "")])
+    rows: list[Row] = []
+    one = session(link, rows, BoundedController(network(10), limits, SIGNAL))
+    one.run()
+    assert sum(followed(one)) / len(one.decisions) >= 0.9
+    stale = [row for row in rows if row.sample is None and row.ended is None]
+    assert len(stale) == lost.sum()
+    assert all(row.decision.fallback and row.decision.amplitude_ma == CDBS for row in stale)
+    assert not any(row.decision.reasons & Reason.LINK for row in rows), "a number that was lost is no fault of the link"
 
 
 @pytest.mark.hazard("H08")
