@@ -164,8 +164,8 @@ HAZARDS: tuple[Hazard, ...] = (
     ),
     Hazard(
         "H17", "A session is started again after a crash", (_U, _R), _S2, _P2,
-        "A slot runs once: it is noted on disk before the first amplitude. The next start refuses and reports when the session was "
-        "interrupted and after how many decisions. The device stays on clinical settings.",
+        "A slot runs once: it is used when its policy has decided, which is on disk before that amplitude leaves. The next start refuses "
+        "and reports when the session was interrupted and after how many decisions. The device stays on clinical settings.",
         _P1, "Another tablet does not know of it. The study notices the second log.",
     ),
     Hazard(

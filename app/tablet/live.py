@@ -43,6 +43,7 @@ _MEND = {
     Refusal.CLOCK: "Set the tablet's clock; it decides whether a bundle is of today.",
     Refusal.WITHDRAWN: "Have the plan changed and signed, and take the session's bundle from it.",
     Refusal.ALREADY_RUN: "Add a repeat of the session to the plan, have it signed, and take its bundle.",
+    Refusal.RUNNING: "Stop it there, or wait until it has ended.",
     Refusal.BROKEN_OFF: "Upload the log as it is; add a repeat to the plan to run the session again.",
 }
 

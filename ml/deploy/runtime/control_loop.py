@@ -59,6 +59,7 @@ class LiveSession:
         log: takes every row; raises LogFailed. seconds: length after the first decision of the policy or schedule; None for no end.
         bare: whether lone numbers are taken, on the bench.
         over: whether the day that the bundle is for has ended; asked at every decision. charge: of the tablet's battery, per cent.
+        take_over: called before the first amplitude of the policy or schedule leaves; raises LogFailed.
 
     Attributes:
         rows: of the log, so far. missed: the number of rows after periods that were lost to a standstill. detail: of the end, in words.
@@ -72,6 +73,7 @@ class LiveSession:
     bare: bool = False
     over: Callable[[], bool] = lambda: False
     charge: Callable[[], float | None] = lambda: None
+    take_over: Callable[[], None] = lambda: None
     rows: list[Row] = field(default_factory=list)
     missed: int = 0
     detail: str = ""
@@ -198,13 +200,16 @@ class LiveSession:
             self._end, self.detail = End.STOOD_STILL, "the device has returned to clinical settings"
         decision = self.controller.decide(now_s, sample and self._since_start(sample), Reason.LINK if faults else 0)
         latency_us = (time.perf_counter_ns() - began) / 1000.0
-        if not decision.fallback and self._took_over_s is None:
+        first = not decision.fallback and self._took_over_s is None
+        if first:
             self._took_over_s = now_s
         if self._end is None and self.over():
             self._end = End.EXPIRED
         if self._end is None and self._time_is_up(now_s):
             self._end = End.COMPLETE
         if self._end is None:
+            if first:
+                self.take_over()
             self.link.send(amplitude_line(len(self.decisions), now_s, decision))
         else:
             decision = self._clinical(decision)

@@ -162,11 +162,6 @@ class LogFile:
         except OSError as error:
             raise self._failure(error) from error
 
-    def discard(self) -> None:
-        """Take the file away again, before any decision."""
-        self._stream.close()
-        self._path.unlink()
-
     def _lines(self, *lines: str) -> None:
         try:
             self._stream.write("".join(f"{line}\r\n" for line in lines))

@@ -1,8 +1,9 @@
-"""Slots that this tablet has run: a folder with one file per slot, made before the first amplitude and never taken back.
+"""Slots that this tablet has run: a folder with one file per slot, and in it a line for each event of each attempt.
 
-A file is made whole or not at all, and reaches the disk before stimulation changes. So a killed process, a second process that starts at
-the same time, and a new bundle of the same slot all find it. Withdrawals, and the latest time that the tablet has seen, are remembered too.
-So a clock that is set back opens nothing.
+A slot is used once its policy or schedule has decided. That line reaches the disk before the amplitude leaves, so a killed process and a
+new bundle of the same slot find it. An attempt that ended earlier, as one with another device, leaves the slot free for the next attempt
+under the same signature. A running attempt locks its file. Withdrawals, and the latest time that the tablet has seen, are remembered too,
+so that a clock that is set back opens nothing.
 """
 
 from __future__ import annotations
@@ -13,10 +14,16 @@ import os
 import re
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
 from .slot import NotAllowed, Refusal, Slot, Withdrawals, withdrawals_body, withdrawals_of
+
+try:
+    import fcntl
+except ImportError:  # a system without such locks: there a slot is used once it was begun
+    fcntl = None  # type: ignore[assignment]
 
 CLOCK_TOLERANCE = timedelta(minutes=2)
 """A clock may be set back by this much, as time servers do, without being doubted."""
@@ -63,33 +70,40 @@ class Ledger:
             raise NotAllowed(Refusal.WITHDRAWN, f"{self.folder / _WITHDRAWN} is damaged: give the tablet the study's list anew") from error
 
     def check_unused(self, participant: str, slot: Slot) -> None:
-        """Raise NotAllowed where the slot was begun already; says when, and how it ended."""
+        """Raise NotAllowed where the policy or schedule of a slot has decided already; says when, and how it ended."""
         try:
-            lines = self._file(participant, slot).read_text("utf-8").splitlines()
+            _check_free(slot, _attempts(self._file(participant, slot).read_text("utf-8")))
         except FileNotFoundError:
             return
-        raise _refusal_of_run(slot, lines)
 
-    def begin(self, participant: str, slot: Slot, now: datetime, log: Path, manifest_sha256: str) -> None:
-        """Note that a slot runs from now on. Raises NotAllowed where it was begun already, by another process too."""
+    def begin(self, participant: str, slot: Slot, now: datetime, log: Path, manifest_sha256: str) -> Attempt:
+        """Note that an attempt at a slot begins. Raises NotAllowed where the slot is used, or another process runs it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self._file(participant, slot)
-        draft = path.with_suffix(f".{os.getpid()}.draft")
-        facts = {"began": now.isoformat(timespec="seconds"), "log": str(log.resolve()), "manifest": manifest_sha256, "pid": os.getpid()}
-        _write(draft, json.dumps(facts) + "\n", "w")
         try:
-            os.link(draft, path)  # of two that start at once, one gets the name
+            file = path.open("a+" if fcntl else "x+", encoding="utf-8")
         except FileExistsError:
-            self.check_unused(participant, slot)
-        finally:
-            draft.unlink()
+            raise _refusal_of_use(slot, {}) from None
+        try:
+            if fcntl:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            file.seek(0)
+            text = file.read()
+            earlier = _attempts(text)
+            _check_free(slot, earlier)
+            attempt = Attempt(len(earlier) + 1, file)
+            facts = {"began": now.isoformat(timespec="seconds"), "attempt": attempt.number, "log": str(log.resolve())}
+            file.truncate(len(text[: text.rfind("\n") + 1].encode()))  # a line that a killed process did not end was not acted on
+            attempt.note(facts | {"manifest": manifest_sha256, "pid": os.getpid()})
+        except BlockingIOError:
+            file.close()
+            raise NotAllowed(Refusal.RUNNING, f"session {slot.position} of this plan runs in another process of this tablet") from None
+        except BaseException:
+            file.close()
+            raise
         _sync_folder(self.folder)
         self._replace(_LATEST, max(now, self._latest() or now).isoformat().encode())
-
-    def end(self, participant: str, slot: Slot, now: datetime, how: str, decisions: int) -> None:
-        """Note how the run ended."""
-        facts = {"ended": now.isoformat(timespec="seconds"), "how": how, "decisions": decisions}
-        _write(self._file(participant, slot), json.dumps(facts) + "\n", "a")
+        return attempt
 
     def _file(self, participant: str, slot: Slot) -> Path:
         return self.folder / f"{re.sub('[^A-Za-z0-9-]', '_', participant)}-plan-{slot.plan_id}-slot-{slot.slot_id}.run"
@@ -110,14 +124,52 @@ class Ledger:
         _sync_folder(self.folder)
 
 
-def _refusal_of_run(slot: Slot, lines: list[str]) -> NotAllowed:
-    """Describe what is known of a run that was begun."""
-    try:
-        notes: dict[str, Any] = {}
-        for line in lines:
-            notes |= json.loads(line)
-    except ValueError:
-        notes = {}  # cut off in the middle of a line: it was begun all the same
+@dataclass(frozen=True)
+class Attempt:
+    """An attempt at a slot that runs: its number, from 1, and the slot's file, locked until the end."""
+
+    number: int
+    file: TextIOWrapper
+
+    def decide(self, now: datetime) -> None:
+        """Note that the policy or schedule decides from now on: the slot is used."""
+        self.note({"decided": now.isoformat(timespec="seconds")})
+
+    def end(self, now: datetime, how: str, decisions: int) -> None:
+        """Note how the attempt ended, and let the file go."""
+        with self.file:
+            self.note({"ended": now.isoformat(timespec="seconds"), "how": how, "decisions": decisions})
+
+    def note(self, facts: dict[str, Any]) -> None:
+        """Add a line, and wait until it is on the disk."""
+        self.file.write(json.dumps(facts) + "\n")
+        self.file.flush()
+        os.fsync(self.file.fileno())
+
+
+def _attempts(text: str) -> list[dict[str, Any]]:
+    """Read the attempts at a slot. A last line without its end does not count. Any other line that cannot be read uses the slot."""
+    found: list[dict[str, Any]] = []
+    for line in text.splitlines()[: text.count("\n")]:
+        try:
+            facts = dict(json.loads(line))
+        except (ValueError, TypeError):
+            facts = {"decided": None}
+        if "began" in facts or not found:
+            found.append({})
+        found[-1] |= facts
+    return found
+
+
+def _check_free(slot: Slot, attempts: list[dict[str, Any]]) -> None:
+    """Raise NotAllowed where an attempt has used the slot. One that names no number is of an older runner, and used it when it began."""
+    for notes in attempts:
+        if "decided" in notes or "attempt" not in notes:
+            raise _refusal_of_use(slot, notes)
+
+
+def _refusal_of_use(slot: Slot, notes: dict[str, Any]) -> NotAllowed:
+    """Describe the attempt that used a slot."""
     began = f"began at {notes['began']}" if "began" in notes else "was begun"
     if "ended" in notes:
         message = f"session {slot.position} of this plan {began} and ended at {notes['ended']} ({notes['how']}); a slot runs once"

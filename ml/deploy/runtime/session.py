@@ -15,10 +15,10 @@ import numpy as np
 
 from .control_loop import End, LiveSession
 from .controller import BoundedController
-from .decision_log import LogFile, seal_facts
+from .decision_log import LogFailed, LogFile, seal_facts
 from .envelope import BetaSample, Signal
 from .inputs import Link
-from .ledger import Ledger
+from .ledger import Attempt, Ledger
 from .protocol import Peer
 from .slot import NotAllowed, Refusal, Slot, Withdrawals
 
@@ -82,7 +82,7 @@ def check_allowed(manifest: Mapping[str, Any], tablet: Tablet, participant: str 
         participant: who is there, where it was stated.
 
     Raises:
-        NotAllowed: the plan is not signed, it is another participant's, another day, withdrawn, or the slot was run already.
+        NotAllowed: the plan is not signed, it is another participant's, another day, withdrawn, or the slot is used.
     """
     slot = slot_of(manifest)
     if not manifest.get("approvals"):
@@ -111,7 +111,7 @@ def run_slot(
     tablet: Tablet,
     participant: str | None = None,
 ) -> Outcome:
-    """Run a bundle's session with a device side, once.
+    """Run a bundle's session with a device side. Its slot is used once the policy or schedule has decided.
 
     Args:
         manifest: as JSON gives it. manifest_sha256: of its bytes. controller: within its envelope. log: a new file. participant: who is
@@ -125,27 +125,45 @@ def run_slot(
     except NotAllowed as refused:
         link.send(f"refused {refused.code.value}\n")
         raise
-    facts = describe(manifest, manifest_sha256, controller, tablet.now(), "session")
-    facts |= {"simulated": True} if tablet.simulated else {}
-    sink = LogFile(log, manifest["period_s"], facts)
     try:
-        tablet.ledger.begin(manifest["participant"], slot, tablet.now(), log, manifest_sha256)
+        attempt = tablet.ledger.begin(manifest["participant"], slot, tablet.now(), log, manifest_sha256)
     except NotAllowed as refused:
-        sink.discard()
         link.send(f"refused {refused.code.value}\n")
         raise
+    end, decisions = End.LOG_FAILED, 0
+    try:
+        facts = describe(manifest, manifest_sha256, controller, tablet.now(), "session")
+        facts |= {"attempt": attempt.number} | ({"simulated": True} if tablet.simulated else {})
+        sink = LogFile(log, manifest["period_s"], facts)
+        session = _live(manifest, controller, link, sink, slot, tablet, attempt)
+        end = End.FAULT
+        try:
+            end = session.run()
+        finally:
+            decisions = len(session.decisions)
+            sink.close()
+    finally:
+        attempt.end(tablet.now(), end.value, decisions)
+    return Outcome(end, session.detail, session)
+
+
+def _live(
+    manifest: Mapping[str, Any], controller: BoundedController, link: Link, sink: LogFile, slot: Slot, tablet: Tablet, attempt: Attempt
+) -> LiveSession:
+    """Make the loop of an attempt at a slot."""
 
     def over() -> bool:
         return tablet.now().date().isoformat() > slot.visit_date
 
-    session = LiveSession(controller, _peer(manifest), link, sink.write, 60.0 * slot.minutes, over=over, charge=battery_percent)
-    end = End.FAULT
-    try:
-        end = session.run()
-    finally:
-        sink.close()
-        tablet.ledger.end(manifest["participant"], slot, tablet.now(), end.value, len(session.decisions))
-    return Outcome(end, session.detail, session)
+    def take_over() -> None:
+        try:
+            attempt.decide(tablet.now())
+        except OSError as error:
+            raise LogFailed(f"that the slot is used cannot be noted: {error.strerror}") from error
+
+    return LiveSession(
+        controller, _peer(manifest), link, sink.write, 60.0 * slot.minutes, over=over, charge=battery_percent, take_over=take_over
+    )
 
 
 def run_bench(

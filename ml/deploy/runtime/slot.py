@@ -36,6 +36,7 @@ class Refusal(StrEnum):
     WITHDRAWN = "withdrawn"
     ALREADY_RUN = "already_run"
     BROKEN_OFF = "broken_off"
+    RUNNING = "running"
     OTHER_DEVICE = "other_device"
 
 

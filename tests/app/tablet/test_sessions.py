@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import re
 import signal
@@ -28,7 +29,7 @@ from app.tablet.sources import Task, Wish
 from ml.deploy.runtime.control_loop import End
 from ml.deploy.runtime.device import DeviceSide
 from ml.deploy.runtime.inputs import Event
-from ml.deploy.runtime.ledger import Ledger
+from ml.deploy.runtime.ledger import Attempt, Ledger
 from ml.deploy.runtime.session import Outcome, Tablet, run_slot
 from ml.deploy.runtime.signature import verifies
 from ml.deploy.runtime.slot import NotAllowed, Refusal, Slot, Withdrawals, withdrawals_body
@@ -131,11 +132,74 @@ def test_a_slot_runs_once_whatever_bundle_of_it_is_taken(tmp_path: Path) -> None
 def test_of_two_that_start_one_slot_at_the_same_time_one_runs(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path)
     ledger.check_unused("P1", SLOT)
-    ledger.begin("P1", SLOT, MORNING, tmp_path / "log.csv", "a" * 64)
+    first = ledger.begin("P1", SLOT, MORNING, tmp_path / "log.csv", "a" * 64)
+    with pytest.raises(NotAllowed) as refused:
+        ledger.begin("P1", SLOT, MORNING, tmp_path / "other.csv", "b" * 64)
+    assert refused.value.code is Refusal.RUNNING
+    first.decide(MORNING)
+    first.file.close()  # as a process that is killed
     with pytest.raises(NotAllowed) as refused:
         ledger.begin("P1", SLOT, MORNING, tmp_path / "other.csv", "b" * 64)
     assert refused.value.code is Refusal.BROKEN_OFF
-    assert not list(tmp_path.glob("*.draft"))
+
+
+@pytest.mark.hazard("H17")
+@pytest.mark.parametrize(
+    ("text", "used"),
+    [
+        ('{"began": "x", "attempt": 1, "log": "l"}\n', False),
+        ('{"began": "x", "attempt": 1, "log": "l"}\n{"decid', False),
+        ('{"began": "x", "attempt": 1, "log": "l"}\n{"decided": "y"}\n', True),
+        ('{"began": "x", "attempt": 1, "log": "l"}\nnoise\n', True),
+        ('{"began": "x", "log": "l"}\n{"ended": "y", "how": "complete", "decisions": 9}\n', True),
+        ('{"beg', False),
+    ],
+)
+def test_a_killed_attempt_uses_the_slot_where_its_policy_had_decided(tmp_path: Path, text: str, used: bool) -> None:
+    ledger = Ledger(tmp_path)
+    (tmp_path / "P1-plan-1-slot-7.run").write_text(text)
+    if used:
+        with pytest.raises(NotAllowed):
+            ledger.begin("P1", SLOT, MORNING, tmp_path / "log.csv", "a" * 64)
+        return
+    attempt = ledger.begin("P1", SLOT, MORNING, tmp_path / "log.csv", "a" * 64)
+    attempt.decide(MORNING)
+    attempt.end(MORNING, "complete", 3)
+    with pytest.raises(NotAllowed, match=r"ended at .* \(complete\)"):
+        ledger.check_unused("P1", SLOT)
+
+
+@pytest.mark.hazard("H02", "H17")
+def test_a_refused_hello_leaves_the_slot_free_and_the_next_attempt_is_numbered(tmp_path: Path) -> None:
+    opened = verified(of_slot(tmp_path), PUBLIC)
+    stranger = SimulatedDevice(brain_of("P1:3", opened.manifest, 400), dataclasses.replace(opened.manifest, participant="P2"))
+    tablet = Tablet(ledger=Ledger(tmp_path / "ledger"), now=lambda: MORNING)
+    first = run_slot(opened.manifest_json, opened.manifest_sha256, opened.controller(), stranger, tmp_path / "first.csv", tablet)
+    assert first.end is End.STRANGER
+    device = SimulatedDevice(brain_of("P1:3", opened.manifest, 400), opened.manifest)
+    second = run_slot(opened.manifest_json, opened.manifest_sha256, opened.controller(), device, tmp_path / "second.csv", tablet)
+    assert second.end is End.COMPLETE
+    lines = [json.loads(line) for line in next((tmp_path / "ledger").glob("*.run")).read_text().splitlines()]
+    assert [next(iter(line)) for line in lines] == ["began", "ended", "began", "decided", "ended"]
+    assert [line.get("attempt") for line in lines if "began" in line] == [1, 2]
+    assert '"attempt": 2' in (tmp_path / "second.csv").read_text()
+    with pytest.raises(NotAllowed, match="a slot runs once"):
+        run_slot(opened.manifest_json, opened.manifest_sha256, opened.controller(), device, tmp_path / "third.csv", tablet)
+
+
+@pytest.mark.hazard("H16", "H17")
+def test_no_amplitude_of_a_policy_leaves_before_the_slot_is_noted_as_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_attempt: Attempt, _now: datetime) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Attempt, "decide", full)
+    opened = verified(of_slot(tmp_path), PUBLIC)
+    device = SimulatedDevice(brain_of("P1:3", opened.manifest, 400), opened.manifest)
+    tablet = Tablet(ledger=Ledger(tmp_path / "ledger"), now=lambda: MORNING)
+    outcome = run_slot(opened.manifest_json, opened.manifest_sha256, opened.controller(), device, tmp_path / "log.csv", tablet)
+    assert outcome.end is End.LOG_FAILED
+    assert "cannot be noted: No space left" in outcome.detail
+    assert set(device.amplitudes_ma) == {3.0}
 
 
 @pytest.mark.hazard("H18")
