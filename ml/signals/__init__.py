@@ -12,7 +12,7 @@ from ml.signals.bands import (
     one_sample,
     spectrum,
 )
-from ml.signals.rows import row_means, row_of, step_means
+from ml.signals.rows import interval_means, row_means, row_of, step_means
 
 __all__ = [
     "BRIDGE_S",
@@ -23,6 +23,7 @@ __all__ = [
     "band_pass",
     "band_rows",
     "gap_models",
+    "interval_means",
     "one_sample",
     "row_means",
     "row_of",

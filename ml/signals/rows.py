@@ -35,6 +35,26 @@ def row_means(
         return np.where(seconds > 0, total / seconds, np.nan), np.minimum(seconds / period_s, 1.0)
 
 
+def interval_means(
+    end_s: NDArray[np.float64], values: NDArray[np.float64], interval_s: float, rows: int, period_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Average per row, weighted by time, values that each cover the interval before their time, such as a power twice a second.
+
+    Args:
+        end_s: end of each value's interval, [n], increasing.
+        values: [n]; values with NaN are gaps.
+        interval_s: length of an interval; one that begins before the last has ended is cut there.
+        rows: number of rows, the first beginning at 0.
+        period_s: length of a row, s.
+
+    Returns:
+        Means [rows], NaN without a value, and the share of each row covered, 0..1.
+    """
+    begin_s = np.maximum(end_s - interval_s, np.concatenate(([-np.inf], end_s[:-1])))
+    knots, levels = np.column_stack((begin_s, end_s)).ravel(), np.column_stack((values, np.full(values.size, np.nan))).ravel()
+    return step_means(knots, levels, float(end_s[-1]) if end_s.size else 0.0, rows, period_s)
+
+
 def step_means(
     t_s: NDArray[np.float64], values: NDArray[np.float64], end_s: float, rows: int, period_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ml.signals import BRIDGE_S, SEGMENTS_AT_ONCE, band_pass, band_rows, row_means, row_of, spectrum, step_means
+from ml.signals import BRIDGE_S, SEGMENTS_AT_ONCE, band_pass, band_rows, interval_means, row_means, row_of, spectrum, step_means
 
 RATE = 500.0
 LOW, HIGH = 13.0, 35.0
@@ -254,3 +254,23 @@ def test_a_row_that_lacks_one_sample_of_a_limit_reaches_it_and_one_that_lacks_tw
         assert rows.covered[1] == pytest.approx(held / (2 * rate))
         assert (rows.reached[1] >= 0.7 - 1e-9) == (lacking < 2)
         assert rows.reached[0] == 1.0
+
+
+@given(
+    ends=st.lists(st.integers(1, 400), min_size=1, max_size=60, unique=True).map(sorted),
+    data=st.data(),
+)
+def test_interval_means_are_those_of_each_moment(ends, data):
+    end_s = np.array(ends) / 20.0
+    values = np.array(data.draw(st.lists(st.sampled_from([0.0, 1.0, 5.0, np.nan]), min_size=len(ends), max_size=len(ends))))
+    means, covered = interval_means(end_s, values, 0.5, 11, 2.0)
+    fine = np.full(440, np.nan)  # twentieths of a second, one by one
+    for k in range(440):
+        after = np.flatnonzero(end_s >= (k + 1) / 20 - 1e-9)
+        if after.size and end_s[after[0]] - 0.5 <= k / 20 + 1e-9:
+            fine[k] = values[after[0]]
+    by_row = fine.reshape(11, 40)
+    np.testing.assert_allclose(covered, np.isfinite(by_row).mean(axis=1), atol=1e-9)
+    has = np.isfinite(by_row).any(axis=1)
+    np.testing.assert_allclose(means[has], [np.nanmean(row) for row in by_row[has]])
+    assert np.isnan(means[~has]).all()

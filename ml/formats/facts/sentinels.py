@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-INT32, UINT32 = 2**31 - 1, 2**32 - 1
+INT16, INT32, UINT32 = 2**15 - 1, 2**31 - 1, 2**32 - 1
 UINT8, UINT16 = 2**8 - 1, 2**16 - 1
 WIDE = (UINT16, INT32, UINT32, -1)
 """Largest values of integers of 16 and 32 bits, and -1."""

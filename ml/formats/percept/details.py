@@ -17,7 +17,18 @@ from numpy.typing import NDArray
 from ml.formats.facts.sentinels import reading, readings
 from ml.formats.percept.annotations import Annotation
 from ml.formats.percept.enums import UNKNOWN, mask, word
-from ml.formats.percept.facts import AMPLITUDE, BATTERY_MONTHS, BATTERY_PERCENT, IMPEDANCE, MAGNITUDE, POWER
+from ml.formats.percept.facts import (
+    AMPLITUDE,
+    AVERAGING,
+    BAND,
+    BATTERY_MONTHS,
+    BATTERY_PERCENT,
+    IMPEDANCE,
+    MAGNITUDE,
+    POWER,
+    PULSE_WIDTH,
+    RATE,
+)
 from ml.formats.percept.keys import KEYS
 from ml.formats.percept.report_json import SIDES, entries, finite, inside, moment, samples, side_of
 from ml.formats.percept.words import EVENT_WORDS, cleaned
@@ -43,7 +54,7 @@ def groups(value: Any) -> list[dict[str, Any]]:
     out = []
     for group in entries(value):
         settings = group.get("ProgramSettings")
-        rate = finite(inside(settings, "RateInHertz"))
+        rate = reading(finite(inside(settings, "RateInHertz")), RATE)
         sensing = [_sensing(s) for s in entries(inside(settings, "SensingChannel"))]
         programs = [
             _program(program, side, rate)
@@ -74,14 +85,14 @@ def _letter(value: Any) -> str | None:
 
 
 def _program(program: dict[str, Any], side: str, rate_hz: float | None) -> dict[str, Any]:
-    own = finite(program.get("RateInHertz"))
+    own = reading(finite(program.get("RateInHertz")), RATE)
     return {
         "side": side,
         "amplitude_ma": _amplitude(program),
-        "lower_ma": finite(program.get("LowerLimitInMilliAmps")),
-        "upper_ma": finite(program.get("UpperLimitInMilliAmps")),
+        "lower_ma": reading(finite(program.get("LowerLimitInMilliAmps")), AMPLITUDE),
+        "upper_ma": reading(finite(program.get("UpperLimitInMilliAmps")), AMPLITUDE),
         "rate_hz": rate_hz if own is None else own,
-        "pulse_width_us": finite(program.get("PulseWidthInMicroSecond")),
+        "pulse_width_us": reading(finite(program.get("PulseWidthInMicroSecond")), PULSE_WIDTH),
         "contacts": contacts(program.get("ElectrodeState")),
     }
 
@@ -91,11 +102,11 @@ def _amplitude(program: dict[str, Any]) -> float | None:
 
     None where one of them lacks its own.
     """
-    whole = finite(program.get("AmplitudeInMilliAmps"))
+    whole = reading(finite(program.get("AmplitudeInMilliAmps")), AMPLITUDE)
     if whole is not None:
         return whole
     cathodes = [e for e in entries(program.get("ElectrodeState")) if word(e.get("ElectrodeStateResult")) == "Negative"]
-    known = [own for e in cathodes if (own := finite(e.get("ElectrodeAmplitudeInMilliAmps"))) is not None]
+    known = [own for e in cathodes if (own := reading(finite(e.get("ElectrodeAmplitudeInMilliAmps")), AMPLITUDE)) is not None]
     return round(sum(known), 3) if known and len(known) == len(cathodes) else None
 
 
@@ -110,11 +121,11 @@ def _sensing(sensing: dict[str, Any]) -> dict[str, Any]:
     return {
         "side": side_of(sensing.get("HemisphereLocation")),
         "channel": word(sensing.get("Channel")),
-        "frequency_hz": finite(inside(sensing, "SensingSetup", "FrequencyInHertz")),
-        "averaging_ms": finite(inside(sensing, "SensingSetup", "AveragingDurationInMilliSeconds")),
-        "lower_threshold": finite(sensing.get("LowerLfpThreshold")),
-        "upper_threshold": finite(sensing.get("UpperLfpThreshold")),
-        "suspend_amplitude_ma": finite(sensing.get("SuspendAmplitudeInMilliAmps")),
+        "frequency_hz": reading(finite(inside(sensing, "SensingSetup", "FrequencyInHertz")), BAND),
+        "averaging_ms": reading(finite(inside(sensing, "SensingSetup", "AveragingDurationInMilliSeconds")), AVERAGING),
+        "lower_threshold": reading(finite(sensing.get("LowerLfpThreshold")), POWER),
+        "upper_threshold": reading(finite(sensing.get("UpperLfpThreshold")), POWER),
+        "suspend_amplitude_ma": reading(finite(sensing.get("SuspendAmplitudeInMilliAmps")), AMPLITUDE),
         "status": word(sensing.get("BrainSensingStatus")),
         "adaptive": word(sensing.get("AdaptiveTherapyStatus")),
     }
@@ -125,13 +136,13 @@ def snapshot(value: dict[str, Any], side: str) -> dict[str, Any]:
     own = inside(value, side.capitalize())
     return {
         "group": _letter(value.get("ActiveGroup")),
-        "high_pass_hz": finite(value.get("HighPassFilterInHertz")),
-        "sensing_frequency_hz": finite(inside(own, "FrequencyInHertz")),
-        "rate_hz": finite(inside(own, "RateInHertz")),
-        "pulse_width_us": finite(inside(own, "PulseWidthInMicroSecond")),
-        "averaging_ms": finite(inside(own, "AveragingDurationInMilliSeconds")),
-        "lower_threshold": finite(inside(own, "LowerLfpThreshold")),
-        "upper_threshold": finite(inside(own, "UpperLfpThreshold")),
+        "high_pass_hz": reading(finite(value.get("HighPassFilterInHertz")), BAND),
+        "sensing_frequency_hz": reading(finite(inside(own, "FrequencyInHertz")), BAND),
+        "rate_hz": reading(finite(inside(own, "RateInHertz")), RATE),
+        "pulse_width_us": reading(finite(inside(own, "PulseWidthInMicroSecond")), PULSE_WIDTH),
+        "averaging_ms": reading(finite(inside(own, "AveragingDurationInMilliSeconds")), AVERAGING),
+        "lower_threshold": reading(finite(inside(own, "LowerLfpThreshold")), POWER),
+        "upper_threshold": reading(finite(inside(own, "UpperLfpThreshold")), POWER),
         "contacts": contacts(inside(own, "ElectrodeState")),
     }
 
@@ -139,7 +150,7 @@ def snapshot(value: dict[str, Any], side: str) -> dict[str, Any]:
 def limits(value: dict[str, Any], side: str) -> dict[str, Any]:
     """Read the clinician's amplitude limits of one side, mA, in the shape of `RecordingLog.limits`."""
     own = inside(value, side.capitalize())
-    low, high = finite(inside(own, "LowerLimitInMilliAmps")), finite(inside(own, "UpperLimitInMilliAmps"))
+    low, high = (reading(finite(inside(own, f"{end}LimitInMilliAmps")), AMPLITUDE) for end in ("Lower", "Upper"))
     if low is None or high is None:
         return {}
     return {f"group {_letter(value.get('ActiveGroup')) or '?'}": {side: {"lower_ma": low, "upper_ma": high}}}
@@ -213,7 +224,7 @@ def montage(value: Any) -> list[dict[str, Any]]:
                 "side": side_of(word(entry.get("Hemisphere"))),
                 "channel": word(entry.get("SensingElectrodes")),
                 "artifact": word(entry.get("ArtifactStatus")),
-                "peak_hz": finite(entry.get("PeakFrequencyInHertz")),
+                "peak_hz": reading(finite(entry.get("PeakFrequencyInHertz")), BAND),
             }
             out.append({**said, "hz": hz.tolist(), "magnitude": _magnitudes(magnitude)})
     return out
@@ -291,7 +302,7 @@ def _log_label(states: dict[str, str]) -> str:
 
 
 def unknown_names(report: dict[str, Any]) -> list[str]:
-    """List enumerations and keys of the device's log, impedance and leads that have a word which is not knowned."""
+    """List enumerations and keys of the device's log, impedance and leads that have a word which is unknown."""
     out: dict[str, None] = {}
     held = [*_log_entries(report), *entries(report.get("Impedance"))]
     for part in ("Initial", "Final"):

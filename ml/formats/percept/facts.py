@@ -15,6 +15,10 @@ IMPEDANCE = Field("ohm", 0, 1e6, WIDE, _INTEGER)
 MAGNITUDE = Field("uVp", 0, 1e5, WIDE, f"no electrode gives 100 mV; {_INTEGER}")
 BATTERY_PERCENT = Field("%", 0, 100, (UINT8, *WIDE), "a share of 100")
 BATTERY_MONTHS = Field("months", 0, 254, (UINT8, *WIDE), "8 bits; no battery lasts 21 years")
+RATE = Field("Hz", 0, 500, WIDE, f"no stimulator gives more; {_INTEGER}")
+PULSE_WIDTH = Field("us", 0, 1000, WIDE, f"no stimulator gives longer pulses; {_INTEGER}")
+BAND = Field("Hz", 0, 125, WIDE, f"half of the rate of the samples; {_INTEGER}")
+AVERAGING = Field("ms", 0, 3.6e6, WIDE, f"no longer than an hour; {_INTEGER}")
 
 FACTS = Facts(
     clocks=(
@@ -38,7 +42,12 @@ FACTS = Facts(
     },
     fields={
         "LFP": POWER,
-        "mA, AmplitudeInMilliAmps": AMPLITUDE,
+        "mA, AmplitudeInMilliAmps, LowerLimitInMilliAmps, UpperLimitInMilliAmps": AMPLITUDE,
+        "LowerLfpThreshold, UpperLfpThreshold": POWER,
+        "RateInHertz": RATE,
+        "PulseWidthInMicroSecond": PULSE_WIDTH,
+        "FrequencyInHertz, PeakFrequencyInHertz, HighPassFilterInHertz": BAND,
+        "AveragingDurationInMilliSeconds": AVERAGING,
         "ResultValue": IMPEDANCE,
         "FFTBinData, LFPMagnitude": MAGNITUDE,
         "BatteryPercentage": BATTERY_PERCENT,

@@ -20,8 +20,8 @@ MOST_NAMES = 12
 """Unknown names that one sentence lists."""
 
 
-def _surveys(report: dict[str, Any], said: FileReport) -> list[SpectrumLog]:
-    """Read spectra of surveys and tests of 20 s, named by channel, section and time."""
+def _surveys(report: dict[str, Any], said: FileReport, utc: details.ToUtc) -> list[SpectrumLog]:
+    """Read spectra of surveys and tests of 20 s, named by channel, section and time in UTC."""
     out: list[SpectrumLog] = []
     seen: set[tuple[str, datetime | None, int]] = set()
     for section in SURVEYS:
@@ -32,7 +32,7 @@ def _surveys(report: dict[str, Any], said: FileReport) -> list[SpectrumLog]:
         channels = [c for c in time_domains(section, value) if (c.channel, c.first_packet, c.values.size) not in seen]
         seen.update((c.channel, c.first_packet, c.values.size) for c in channels)
         for c in channels:
-            when = f" {c.first_packet:%H:%M:%S}" if c.first_packet else ""
+            when = f" {utc(c.first_packet):%H:%M:%S}" if c.first_packet else ""
             out += channel_spectrum(c.stretches(c.begin_ms), f"{c.channel} {section}{when}")
         if channels:
             said.understood.append(f"{section}: {len(channels)} channels; their spectra are kept, no session")
@@ -61,7 +61,7 @@ def history_recording(
         report: as it was read. `said`: receives what was understood. options: of the decoder. dated: the report's events in UTC.
         utc: converts the report's dates.
     """
-    spectra = _surveys(report, said)
+    spectra = _surveys(report, said, utc)
     diagnostic = report.get("DiagnosticData")
     trends, void = details.trends(inside(diagnostic, "LFPTrendLogs"), utc)
     kept: dict[str, Any] = {

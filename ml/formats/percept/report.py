@@ -30,7 +30,7 @@ from ml.formats.percept.report_json import SIDES, entries, inside, looks_like_re
 from ml.formats.percept.runs import Run, pair_runs
 from ml.formats.percept.streams import DevicePower, Side, TimeDomain, device_powers, time_domains
 from ml.formats.recording import DecodedFile, EventLog, FileReport, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
-from ml.signals import row_means
+from ml.signals import interval_means
 
 
 def decode_percept(path: Path, options: DecodeOptions, name: str | None = None) -> DecodedFile:
@@ -199,16 +199,16 @@ def _power_traces(power: DevicePower, side: Side, begin_ms: float, rows: int, op
     """Make traces of the device's band power of a sensed side, and of its amplitude. The run begins `begin_ms` after the first interval
     does."""
     t_s = (power.ticks_ms - (power.ticks_ms[0] - power.interval_ms) - begin_ms) / 1000.0
-    interval = np.full(t_s.size, power.interval_ms / 1000.0)
+    interval_s = power.interval_ms / 1000.0
     out = []
     channel = power.channel_of(side)
     if channel is not None and np.isfinite(power.power[side]).any():
-        means, covered = row_means(t_s, power.power[side], interval, rows, options.period_s)
+        means, covered = interval_means(t_s, power.power[side], interval_s, rows, options.period_s)
         set_to = details.snapshot(power.snapshot, side)
         said = {"sensing_frequency_hz": set_to["sensing_frequency_hz"], "averaging_ms": set_to["averaging_ms"]}
         out.append(step_trace(("band_power", channel, "device units"), "percept_lfp", means, covered, options, said))
     if np.isfinite(power.amplitude_ma[side]).any():
-        means, covered = row_means(t_s, power.amplitude_ma[side], interval, rows, options.period_s)
+        means, covered = interval_means(t_s, power.amplitude_ma[side], interval_s, rows, options.period_s)
         out.append(step_trace(("amplitude", side, "mA"), "device_log", means, covered, options, {"origin": "BrainSenseLfp"}))
     return out
 

@@ -22,7 +22,7 @@ from ml.formats.rcs.packets.headers import PacketHeaders
 from ml.formats.rcs.packets.streams import Accel, Adaptive, Fft, Power, TimeDomain, TimeSync
 from ml.formats.rcs.packets.time import PacketTimes, RecordingTimes, reconstruct_all
 from ml.formats.rcs.quality import STEMS, describe_clock, describe_quality
-from ml.formats.rcs.settings import GROUPS, Settings, Therapy, dose_of, get, integer, number
+from ml.formats.rcs.settings import GROUPS, Settings, Therapy, dose_of, get, integer, limits_of, number
 from ml.formats.rcs.traces import Grid, accel_traces, amplitude_traces, fft_results, power_traces
 from ml.formats.recording import FileReport, Hemisphere, RecordingLog, SpectrumLog, TraceLog, fingerprint
 
@@ -229,10 +229,8 @@ def _limits(settings: Settings) -> dict[str, Any]:
         for p in range(4):
             if integer(get(settings.merged, f"TherapyConfigGroup{group}", "programs", p, "isEnabled")) != 0:
                 continue
-            low = number(get(settings.merged, f"AmplitudeLimitsGroup{group}", f"prog{p}LowerInMilliamps"))
-            high = number(get(settings.merged, f"AmplitudeLimitsGroup{group}", f"prog{p}UpperInMilliamps"))
-            if low is not None and high is not None:
-                limits.setdefault(f"group {GROUPS[group]}", {})[f"program {p}"] = {"lower_ma": low, "upper_ma": high}
+            if (bounds := limits_of(settings.merged, group, p)) is not None:
+                limits.setdefault(f"group {GROUPS[group]}", {})[f"program {p}"] = {"lower_ma": bounds[0], "upper_ma": bounds[1]}
     return limits
 
 

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.dose import Cycle, Dose, Program, delivered_dose
+from ml.formats.facts.sentinels import reading
+from ml.formats.rcs.packets.facts import FACTS
 from ml.formats.vouching import Vouching
 
 RATE_HZ = {0: 250.0, 1: 500.0, 2: 1000.0}
@@ -196,14 +198,15 @@ def therapy_of(state: dict[str, Any], stim: dict[str, Any] | None, lost: bool = 
             amplitude = number(get(settings, "programs", p, "amplitudeInMilliamps"))
         if width is None:
             width = number(get(settings, "programs", p, "pulseWidthInMicroseconds"))
-        programs.append(Program(None if enabled is None else enabled == 0, amplitude, width, _limits(state, group, p)))
+        programs.append(Program(None if enabled is None else enabled == 0, amplitude, width, limits_of(state, group, p)))
     rate = number(get(log, "RateInHz"))
     return Therapy(on, group, number(get(settings, "rateInHz")) if rate is None else rate, tuple(programs), _cycle(settings))
 
 
-def _limits(state: dict[str, Any], group: int, program: int) -> tuple[float, float] | None:
+def limits_of(state: dict[str, Any], group: int, program: int) -> tuple[float, float] | None:
     """Read the clinician's amplitude limits of a program, mA."""
-    low, high = (number(get(state, f"AmplitudeLimitsGroup{group}", f"prog{program}{end}InMilliamps")) for end in ("Lower", "Upper"))
+    stated = (number(get(state, f"AmplitudeLimitsGroup{group}", f"prog{program}{end}InMilliamps")) for end in ("Lower", "Upper"))
+    low, high = (reading(limit, FACTS.fields["AmplitudeInMilliamps"]) for limit in stated)
     return None if low is None or high is None else (low, high)
 
 

@@ -46,6 +46,9 @@ LONGEST_TABLE_S = 7 * 86_400.0
 LATEST_FIRST_S = 3600.0
 """No session begins an hour before its first row."""
 
+LATE_FIRST_S = 120.0
+"""A session whose first row comes later, and after more time than its rows span, is likely of another clock."""
+
 LONGEST_SESSION_S = 86_400.0
 """No session of a visit lasts longer than a day."""
 
@@ -115,6 +118,10 @@ def _check_start(t_s: NDArray[np.float64], columns: Columns) -> None:
             "Give t_s in seconds from the session's start. If these are seconds of the day, subtract the time of day at which the session "
             f"started (the first row would be at {hours:02d}:{minutes:02d})."
         )
+        raise columns.error(what, "t_s", hint, 0)
+    if t_s[0] > LATE_FIRST_S and t_s[0] > t_s[-1] - t_s[0]:
+        what = f"the first row comes {t_s[0]:.6g} s after the session's start, t_s 0, and the rows span {t_s[-1] - t_s[0]:.6g} s"
+        hint = "Give t_s in seconds from the session's start. If it counts from another moment, such as the device's start, subtract that."
         raise columns.error(what, "t_s", hint, 0)
     if t_s[-1] - max(0.0, float(t_s[0])) > LONGEST_SESSION_S:
         what = f"the session would last {(t_s[-1] - max(0.0, float(t_s[0]))) / 3600:.3g} h"

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from tests.app.ingest.conftest import steady
+
 pytestmark = pytest.mark.usefixtures("participant_code")
 
 
@@ -45,7 +47,7 @@ def test_times_in_single_precision_give_the_true_rate(client: TestClient, record
     answer = upload(client, recordings, "08-lfp-single-precision-times.csv")
     assert answer.status_code == 201
     report = repr(answer.json()["report"])
-    assert "250 Hz" in report
+    assert "250 Hz: 6000 samples, 24.0 s of signal" in report
     assert "missing" not in report
 
 
@@ -62,6 +64,12 @@ def test_what_may_mean_two_things_is_refused_with_its_mend(
 
 
 def test_closed_fists_are_no_open_ones(client: TestClient, recordings: Path) -> None:
-    answer = upload(client, recordings, "13-grasp-open-and-close.csv")
-    assert answer.status_code == 201
+    session = client.post(
+        "/api/v1/uploads", data={"participant": "P1", "visit": "1", "controller": "cdbs"}, files={"file": ("t.csv", steady(1.0))}
+    )
+    number = session.json()["sessions"][0]["id"]
+    content = (recordings / "reported" / "13-grasp-open-and-close.csv").read_bytes()
+    answer = client.post("/api/v1/uploads", data={"participant": "P1", "session": str(number)}, files={"file": ("grasp.csv", content)})
+    assert answer.status_code == 201, answer.text
     assert "20 open fists" in repr(answer.json()["report"])
+    assert client.get(f"/api/v1/sessions/{number}/qoc").json()["grasp_hz"] == pytest.approx(1.0, abs=0.05)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ml.formats.facts import ClockFact, DoseModifier, Facts
 from ml.formats.facts.counters import Counter
-from ml.formats.facts.sentinels import UINT8, UINT32, WIDE, Field
+from ml.formats.facts.sentinels import INT16, UINT8, UINT32, WIDE, Field
 
 FACTS = Facts(
     clocks=(
@@ -19,6 +19,9 @@ FACTS = Facts(
     fields={
         "AmplitudeInMilliamps": Field("mA", 0, 25.4, (25.5, *WIDE), "Summit API: 255 x 0.1 mA means `hold`"),
         "Bands": Field("device units", 0, UINT32 - 1, (UINT32,), "Summit API: 32 bits"),
+        "FftOutput": Field("mV", 0, 100, WIDE, "no electrode gives 100 mV"),
+        "XSamples, YSamples, ZSamples": Field("centiG", -10_000, 10_000, (-32_768, INT16, *WIDE[:-1]), "no body reaches 100 g; 16 bits"),
+        "output, featureInputs": Field("device units", 0, UINT32 - 1, (UINT32,), "Summit API: 32 bits"),
         "CurrentAdaptiveState": Field("state", 0, 8, (15,), "Summit API: 15 is no state"),
         "batteryLevelPercent": Field("%", 0, 100, (UINT8, *WIDE), "a share of 100"),
     },

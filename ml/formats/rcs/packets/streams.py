@@ -13,12 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.formats.facts.sentinels import reading, readings
+from ml.formats.rcs.packets.facts import FACTS
 from ml.formats.rcs.packets.headers import ROLLOVER, TICKS_PER_S, PacketHeaders
 from ml.formats.rcs.packets.scan import ARRAYS, Batch, join
 from ml.formats.rcs.settings import RATE_HZ, get, integer, number
 
 ACCEL_RATE_HZ = {0: 65.104, 1: 32.552, 2: 16.276, 3: 8.138, 4: 4.069}
 AXES = ("XSamples", "YSamples", "ZSamples")
+FIELDS = FACTS.fields
 Interval = Callable[[float], float | None]
 """A function from a packet's PC time in ms (NaN when unknown) to the FFT interval in force, s. None where the settings lack it."""
 
@@ -232,7 +235,7 @@ def read_power(batches: Iterable[Batch], interval_at: Interval) -> Power:
         over = batch.column("IsPowerChannelOverrange")[rows] == 1.0
         over_range += int(over.sum())
         valid = np.where(mask < 0, 255, mask)[:, None] >> np.arange(8) & 1 == 1
-        bands.append(np.where(valid & ~over[:, None], values, np.nan))
+        bands.append(np.where(valid & ~over[:, None], readings(values, FIELDS["Bands"])[0], np.nan))
     headers = table.headers(rate_hz=table.rate_of(interval_at))
     rates = _rates(table.codes("SampleRate"), RATE_HZ)
     return Power(headers, np.concatenate(bands), table.codes("FftSize"), rates, table.unusable, over_range)
@@ -248,7 +251,7 @@ def read_accel(batches: Iterable[Batch]) -> Accel:
         rate = _rates(_codes(batch.column("SampleRate")), ACCEL_RATE_HZ)
         fits = (lengths[:, 0] > 0) & np.all(lengths == lengths[:, :1], axis=1) & np.isfinite(rate)
         rows = table.take(batch, fits, rate=rate, samples=lengths[:, 0].astype(np.float64))
-        pieces.append(np.stack([join(batch, axis, rows) for axis in AXES], axis=1))
+        pieces.append(readings(np.stack([join(batch, axis, rows) for axis in AXES], axis=1), FIELDS["XSamples, YSamples, ZSamples"])[0])
     headers = table.headers(table.column("samples"))
     return Accel(headers, np.concatenate(pieces), np.cumsum(headers.samples) - headers.samples, table.unusable)
 
@@ -262,7 +265,7 @@ def read_fft(batches: Iterable[Batch], interval_at: Interval) -> Fft:
         bins = batch.lengths[:, slot]
         rows = table.take(batch, (bins > 0) & (bins <= MAX_BINS))
         out = np.full((rows.size, MAX_BINS), np.nan)
-        out[np.arange(MAX_BINS) < bins[rows, None]] = join(batch, "FftOutput", rows)
+        out[np.arange(MAX_BINS) < bins[rows, None]] = readings(join(batch, "FftOutput", rows), FIELDS["FftOutput"])[0]
         pieces.append(out[:, : int(bins[rows].max(initial=0))])
     width = max((piece.shape[1] for piece in pieces), default=0)
     whole = [np.pad(piece, ((0, 0), (0, width - piece.shape[1])), constant_values=np.nan) for piece in pieces]
@@ -318,6 +321,7 @@ def _adaptive_rows(records: Iterable[Any], interval_at: Interval) -> Iterator[ar
             continue
         gen, rx = (_float(get(update, name)) for name in ("PacketGenTime", "PacketRxUnixTime"))
         interval = interval_at(gen if gen > 0 else rx if rx > 0 else float("nan"))
+        output = get(update, "Ld0Status", "output")
         features = get(update, "Ld0Status", "featureInputs")
         inputs = [*(features if isinstance(features, list) else []), *[None] * 4][:4]
         state, bits = (integer(get(update, name), bits=31) for name in ("CurrentAdaptiveState", "SensingStatus"))
@@ -328,8 +332,7 @@ def _adaptive_rows(records: Iterable[Any], interval_at: Interval) -> Iterator[ar
                 *(gen, rx, _float(interval)),
                 *map(_float, delivered),
                 -1.0 if state is None else float(state),
-                _float(get(update, "Ld0Status", "output")),
-                *map(_float, inputs),
+                *(_float(reading(number(value), FIELDS["output, featureInputs"])) for value in (output, *inputs)),
                 float(max(0, bits or 0)),
             ),
         )

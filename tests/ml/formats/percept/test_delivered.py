@@ -170,6 +170,14 @@ def test_a_clock_ahead_or_behind_is_corrected_everywhere_and_told(percept, read,
     assert any("the implant's clock is" in text and "corrected" in text for text in told)
 
 
+def test_the_spectra_of_a_survey_are_named_by_their_time_in_utc(percept, read):
+    survey = percept.time_domain(RIGHT, percept.sine(20))
+    survey["FirstPacketDateTime"] = (BEGIN + timedelta(seconds=2254 + 60)).isoformat()
+    result = read(report_of(percept, run(percept, 300, 100_000, ahead_s=2254.0), ahead_s=2254.0, LfpMontageTimeDomain=[survey]))
+    (spectrum,) = result.recordings[-1].spectra
+    assert spectrum.channel == f"{RIGHT} LfpMontageTimeDomain 15:01:00"
+
+
 def test_a_clock_that_drifts_within_the_session_is_followed(percept, read):
     decoded = read(report_of(percept, run(percept, 1200, 500_000, ahead_s=945), ahead_s=900, ahead_at_end_s=990))
     assert abs((decoded.recordings[0].started_at - BEGIN).total_seconds() - 1200) < 2

@@ -199,3 +199,18 @@ def test_times_in_whole_milliseconds_give_the_true_rate_without_gaps(write, rate
     decoded = decode(write(text))
     assert decoded.recordings[0].settings["rate_hz"] == rate
     assert not any("missing" in text for text in decoded.reports[0].flagged)
+
+
+@pytest.mark.parametrize("start_s", [150, 1000, 3000])
+def test_times_that_count_from_another_moment_are_asked_for(write, start_s):
+    text = "t_s,lfp [uV],amplitude_ma\n" + "".join(f"{start_s + k / 250:.4f},{k % 7},2\n" for k in range(5000))
+    with pytest.raises(UndecodableFile, match=f"the first row comes {start_s} s after"):
+        decode(write(text))
+    steps = "t_s,beta,amplitude_ma\n" + "".join(f"{start_s + 2 * k},1,2\n" for k in range(20))
+    with pytest.raises(UndecodableFile, match=f"the first row comes {start_s} s after"):
+        decode(write(steps))
+
+
+def test_a_session_whose_first_minutes_are_lost_is_read(write):
+    text = "t_s,beta,amplitude_ma\n" + "".join(f"{130 + 2 * k},1,2\n" for k in range(100))
+    assert decode(write(text)).recordings[0].duration_s == 328
