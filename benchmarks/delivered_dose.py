@@ -21,13 +21,18 @@ import numpy as np
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from ml.formats import DecodedFile, RecordingLog, UndecodableFile, decode, redact, sniff
+from ml.formats import DecodedFile, DecodeOptions, RecordingLog, UndecodableFile, decode, redact, sniff
 from ml.formats.writers import PerceptRun, PerceptWorld, RcsWorld, Truth, write_percept, write_rcs
 
 TOLERANCE_MA = 0.06
 START_S = 2.0
-SLACK_S = {"rcs": 0.3, "percept": 0.6}
-"""How far a step's amplitude may lag: a command is carried out within tens of ms, a Percept states the amplitude twice a second."""
+SLACK_S = {"rcs": (0.1, 0.1), "percept": (0.55, 0.05)}
+"""How much earlier and later than it happened a change may be shown, s.
+
+PacketGenTime, by which RC+S logs are placed, wanders by tens of ms. A Percept states the amplitude at the end of every half second, which
+covers that whole half second, and its ticks count in 50 ms.
+"""
+KNOWN_SHARE = DecodeOptions().min_valid_fraction
 BEGIN_MS = 1_767_600_000_000
 
 
@@ -211,7 +216,18 @@ def _recording_of(truth: Truth, runs: list[RecordingLog], kind: str) -> Recordin
         return None
     if any(r.started_at is None for r in same):
         return next((r for r in same if r.run == truth.number), None)
-    return min(same, key=lambda r: abs(_off_s(r, truth)))
+    return min(same, key=lambda r: abs(_off_s(r, truth) - (0.0 if _is_utc(r) else truth.ahead_s)))
+
+
+def _is_utc(recording: RecordingLog) -> bool:
+    """Decide whether the recording claims that its start is in UTC; else it is as its own clock showed it."""
+    return bool(recording.settings.get("clock", {}).get("known", True))
+
+
+def _excused(off_s: float, recording: RecordingLog) -> bool:
+    """Decide whether the recording itself says that its start may be off by so much: an unknown clock, or one that was set by that."""
+    steps = [by for _, by in recording.quality.get("clock", {}).get("pc_steps", [])] if recording.kind == "rcs" else []
+    return not _is_utc(recording) or any(abs(abs(off_s) - abs(by)) <= START_S for by in steps)
 
 
 def _off_s(recording: RecordingLog, truth: Truth) -> float:
@@ -224,7 +240,7 @@ def _judge_one(kind: str, seed: int, recording: RecordingLog, truth: Truth, flag
         off = _off_s(recording, truth)
         clock = recording.settings.get("clock", {})
         within = max(START_S, float(clock.get("uncertainty_s") or 0.0)) if kind == "percept" else START_S
-        if abs(off) > within and "clock" not in flags:
+        if abs(off) > within and not _excused(off, recording):
             score.shifted += 1
             score.faults.append(f"{kind} {seed}: start {off:+.1f} s, no word")
     slack = SLACK_S[kind]
@@ -235,13 +251,13 @@ def _judge_one(kind: str, seed: int, recording: RecordingLog, truth: Truth, flag
             continue
         wrong = []
         for end, value, valid in zip(trace.t_end_s.tolist(), trace.values.tolist(), trace.valid.tolist(), strict=True):
-            if not valid or end > truth.length_s + 2.0:
+            if not valid:
                 continue
-            low, high = course.range_within(end - trace.dt_s - slack, end + slack)
+            low, high = course.means_within(end - trace.dt_s, min(end, truth.length_s), slack, KNOWN_SHARE)
             if low - TOLERANCE_MA <= value <= high + TOLERANCE_MA:
                 score.usable += truth.knowable and end <= truth.known_until_s + 1e-6
             else:
-                wrong.append(f"{end:.0f} s {value:.2f} for {low:g} to {high:g}")
+                wrong.append(f"{end:.0f} s {value:.2f} for {low:.2f} to {high:.2f}")
         if wrong:
             score.wrong += len(wrong)
             score.faults.append(f"{kind} {seed} {trace.channel}: {len(wrong)} steps wrong, first {wrong[0]}")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ml.qoc import TREMOR_CLASSES as TREMOR_CLASSES
 
-DECODE_VERSION = 9
+DECODE_VERSION = 10
 """Raised whenever a decoder would give other numbers for the same bytes; traces are stored per version."""
 
 TraceSource = Literal["time_domain", "device_power", "percept_lfp", "device_log", "table"]

@@ -30,11 +30,19 @@ class AmplitudeSteps:
     from_adaptive: bool
     assumed_program: bool
 
-    def end_at(self, end_ms: float) -> AmplitudeSteps:
-        """Make the amplitude unknown from a time on."""
-        first = int(np.searchsorted(self.t_ms, end_ms))
+    def unknown_within(self, begin_ms: float, end_ms: float) -> AmplitudeSteps:
+        """Make the amplitude unknown from a time to another one, which may be infinite."""
+        first, last = np.searchsorted(self.t_ms, begin_ms), np.searchsorted(self.t_ms, end_ms, side="right")
         unknown = np.full((1, self.amplitude_ma.shape[1]), np.nan)
-        return replace(self, t_ms=np.append(self.t_ms[:first], end_ms), amplitude_ma=np.concatenate((self.amplitude_ma[:first], unknown)))
+        # from the end on, what was in force then; none where the course begins later
+        after = self.amplitude_ma[last - 1 : last] if np.isfinite(end_ms) and last > 0 else unknown[:0]
+        amplitude = [self.amplitude_ma[:first], unknown, after, self.amplitude_ma[last:]]
+        times = [self.t_ms[:first], [begin_ms], [end_ms] * len(after), self.t_ms[last:]]
+        return replace(
+            self,
+            t_ms=np.concatenate(times),
+            amplitude_ma=np.concatenate(amplitude),
+        )
 
 
 def amplitude_steps(settings: Settings, adaptive: Adaptive | None, times: PacketTimes | None) -> AmplitudeSteps:

@@ -81,10 +81,13 @@ def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) 
     duration_s = (end_ms - start_ms) / 1000.0
     grid = Grid(start_ms, duration_s, max(0, math.ceil(duration_s / options.period_s - 1e-6)), options)
     steps = amplitude_steps(settings, streams.adaptive if "adaptive" in times else None, times.get("adaptive"))
-    if (cut_ms := timeline.clock.shown_twice_ms(streams.settings.record_times_ms)) is not None:
-        steps = steps.end_at(cut_ms)
-        since_s = max(0.0, cut_ms - start_ms) / 1000.0
-        said = f"the computer's clock was set back, so that changes have no order: the amplitude is unknown from {since_s:.0f} s on"
+    for begin_ms, until_ms in timeline.clock.doubtful_ms(streams.settings.record_times_ms):
+        steps = steps.unknown_within(begin_ms, until_ms)
+        since_s, until_s = max(0.0, begin_ms - start_ms) / 1000.0, (until_ms - start_ms) / 1000.0
+        if math.isinf(until_ms):
+            said = f"the computer's clock was set back, so that changes have no order: the amplitude is unknown from {since_s:.0f} s on"
+        else:
+            said = f"the computer's clock was set while packets were lost: the amplitude is unknown from {since_s:.0f} to {until_s:.0f} s"
         report("StimLog").flagged.append(said)
     channels: dict[str, list[Stretch]] = {}
     if main and streams.time_domain is not None and "time_domain" in times:

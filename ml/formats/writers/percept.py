@@ -159,6 +159,7 @@ def _truth(world: PerceptWorld, run: PerceptRun, number: int, side: str) -> Trut
         math.inf,
         world.cycle is None,
         both and "packets" not in world.undated,
+        world.ahead_s + world.drift_s * run.begin_s / world.seconds,
     )
 
 

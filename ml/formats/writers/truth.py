@@ -7,6 +7,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import pairwise
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,30 @@ class Course:
         on, off, begin = self.cycle_s
         return level if (t_s - begin) % (on + off) < on else 0.0
 
-    def range_within(self, begin_s: float, end_s: float) -> tuple[float, float]:
-        """Find the lowest and the highest amplitude that was delivered between two times, mA."""
+    def means_within(self, begin_s: float, end_s: float, slack_s: tuple[float, float], share: float) -> tuple[float, float]:
+        """Find the lowest and the highest mean that a recording of the amplitude between two times may have, mA.
+
+        Args:
+            begin_s, end_s: of a step.
+            slack_s: how much earlier, and how much later, the recording may show a change.
+            share: of the step that is known, at least; the mean is over that.
+        """
+        edges = sorted({begin_s, end_s, *(t + by for t in self._edges(begin_s, end_s, slack_s) for by in (-slack_s[0], 0.0, slack_s[1]))})
+        edges = [t for t in edges if begin_s <= t <= end_s]
+        pieces = []
+        for start, stop in pairwise(edges):
+            middle = (start + stop) / 2
+            # a change shown early is of a later moment, one shown late of an earlier
+            near = [t for t in self._edges(middle, middle, slack_s) if middle - slack_s[1] < t <= middle + slack_s[0]]
+            levels = [self.level_at(t) for t in (middle - slack_s[1], *near, middle + slack_s[0])]
+            pieces.append((stop - start, min(levels), max(levels)))
+        known_s = share * (end_s - begin_s)
+        lows, highs = sorted((low, s) for s, low, _ in pieces), sorted(((high, s) for s, _, high in pieces), reverse=True)
+        return _mean_of(lows, known_s), _mean_of(highs, known_s)
+
+    def _edges(self, begin_s: float, end_s: float, slack_s: tuple[float, float]) -> list[float]:
+        """List the changes between two times, and as far from them as a recording may show them."""
+        begin_s, end_s = begin_s - slack_s[1], end_s + slack_s[0]
         edges = [t for t in self.times_s if begin_s < t <= end_s]
         if self.cycle_s is not None:
             on, off, begin = self.cycle_s
@@ -39,8 +62,16 @@ class Course:
             last = math.ceil((end_s - begin) / (on + off))
             turns = [begin + k * (on + off) + part for k in range(first, last + 1) for part in (0.0, on)]
             edges += [t for t in turns if begin_s < t <= end_s]
-        found = [self.level_at(t) for t in (begin_s, *edges, end_s)]
-        return min(found), max(found)
+        return edges
+
+
+def _mean_of(levels: list[tuple[float, float]], known_s: float) -> float:
+    """Average the first levels of (mA, s), as many as add up to a time."""
+    total, left = 0.0, known_s
+    for level, seconds in levels:
+        total += level * min(seconds, left)
+        left -= min(seconds, left)
+    return total / known_s
 
 
 @dataclass(frozen=True)
@@ -56,6 +87,7 @@ class Truth:
         known_until_s: the file states the amplitude until then; after it nothing can be known.
         knowable: whether the file states the amplitude at all.
         dated: whether the file has what converts its dates to UTC.
+        ahead_s: how far the clock that dates the recording was ahead of UTC.
     """
 
     number: int
@@ -66,3 +98,4 @@ class Truth:
     known_until_s: float = math.inf
     knowable: bool = True
     dated: bool = True
+    ahead_s: float = 0.0

@@ -33,8 +33,11 @@ LEAST_PACKETS = 5
 """A step is judged by medians of up to so many seconds on either side, with at least so many packets on each."""
 
 
-STEP_MARGIN_MS = 2_000.0
-"""A step of a clock is found to the packet, and packets may be missing around it."""
+STEP_MARGIN_MS = 500.0
+"""Records so close to a time that was shown twice may be of either."""
+
+WANDER_MS = 100.0
+"""PacketGenTime wanders by less than this about the PC's clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +67,16 @@ class PcClock:
     Attributes:
         slope: gain of the PC's clock on the implant's, relative.
         drift: how fast the implant's clock runs against the PC's, relative; None where the recording is too short to estimate it.
-        steps_at_ms: device times at which the PC's clock was set, [k]. offsets_ms: PC time minus device time at device time 0, [k + 1].
+        steps_at_ms: device times of the first packets after the PC's clock was set, [k].
+        before_ms: device times of the last packets before it was, [k]; the step is anywhere between the two.
+        offsets_ms: PC time minus device time at device time 0, [k + 1].
         shift_ms: timeline minus device time.
     """
 
     slope: float
     drift: float | None
     steps_at_ms: NDArray[np.float64]
+    before_ms: NDArray[np.float64]
     offsets_ms: NDArray[np.float64]
     shift_ms: float
 
@@ -86,29 +92,36 @@ class PcClock:
     def of_pc_ms(self, pc_ms: NDArray[np.float64]) -> NDArray[np.float64]:
         """Compute when on the timeline the PC's clock showed this, [n].
 
-        A time that a step forwards skipped is that of the step; of a time that a step backwards showed twice the first counts.
+        A time that a step forwards skipped is that of the step; of a time that may have been shown twice the first counts.
         """
         ends = self.pc_ms(np.nextafter(self.steps_at_ms, -np.inf))
         piece = np.searchsorted(np.maximum.accumulate(ends), pc_ms, side="right")
         device = (pc_ms - self.offsets_ms[piece]) / (1.0 + self.slope)
-        begins = np.concatenate(([-np.inf], self.steps_at_ms))[piece]
+        begins = np.concatenate(([-np.inf], self.before_ms))[piece]
         return self.timeline_ms(np.maximum(device, begins))
 
-    def shown_twice_ms(self, records_ms: Sequence[float]) -> float | None:
-        """Find from when on the order of records is unknown: the PC's clock was set back over the time of one.
+    def doubtful_ms(self, records_ms: Sequence[float]) -> list[tuple[float, float]]:
+        """Find when on the timeline it is unknown which records were in force: the time of one may have been shown twice.
+
+        After a step backwards the order of records is unknown, to the end. A step forwards among lost packets leaves their order. A
+        record within them may then be earlier than the step or later.
 
         Args:
             records_ms: PC times of the records.
 
         Returns:
-            Time on the timeline at which the clock first showed the earliest such time; None where there is none.
+            Spans (begin, end) on the timeline, ms.
         """
-        ends = self.pc_ms(np.nextafter(self.steps_at_ms, -np.inf)).tolist()
-        for at_ms, end_ms, by_ms in zip(self.timeline_ms(self.steps_at_ms).tolist(), ends, self.steps_ms.tolist(), strict=True):
-            margin_ms = STEP_MARGIN_MS
-            if by_ms < 0 and any(end_ms + by_ms - margin_ms <= record <= end_ms + margin_ms for record in records_ms):
-                return float(at_ms + by_ms - margin_ms)
-        return None
+        spans = []
+        for i, by_ms in enumerate(self.steps_ms.tolist()):
+            before_ms, at_ms = float(self.before_ms[i]), float(self.steps_at_ms[i])
+            first_ms, last_ms = (ms * (1.0 + self.slope) + float(self.offsets_ms[i]) for ms in (before_ms, at_ms))
+            margin_ms = STEP_MARGIN_MS if by_ms < 0 else WANDER_MS
+            if any(first_ms + by_ms - margin_ms <= record <= last_ms + margin_ms for record in records_ms):
+                begin_ms = before_ms + min(by_ms, 0.0) - margin_ms
+                end_ms = np.inf if by_ms < 0 else at_ms + margin_ms
+                spans.append((begin_ms + self.shift_ms, end_ms + self.shift_ms))
+        return spans
 
     @property
     def steps_ms(self) -> NDArray[np.float64]:
@@ -173,16 +186,40 @@ def fit_clock(device_ms: NDArray[np.float64], pc_ms: NDArray[np.float64]) -> PcC
     known = known[np.argsort(device_ms[known], kind="stable")]
     if known.size == 0:
         first = float(device_ms.min(initial=np.inf))
-        return PcClock(0.0, None, np.empty(0), np.zeros(1), -first if np.isfinite(first) else 0.0)
+        return PcClock(0.0, None, np.empty(0), np.empty(0), np.zeros(1), -first if np.isfinite(first) else 0.0)
     at, ahead = device_ms[known], pc_ms[known] - device_ms[known]
-    found = levels(at, ahead, STEP_MS)
-    pieces = found.pieces()
+    pieces = levels(at, ahead, STEP_MS).pieces()
     gain = _gain(at, ahead, pieces)
     slope = gain or 0.0
+    pieces = _with_ends(ahead - slope * at, pieces)
+    starts = [piece.start for piece in pieces[1:]]
     offsets = np.array([float(np.median(ahead[piece] - slope * at[piece])) for piece in pieces])
     longest = max(range(len(pieces)), key=lambda i: pieces[i].stop - pieces[i].start)
     shift = float(offsets[longest] + slope * device_ms.min())
-    return PcClock(slope, None if gain is None else 1.0 / (1.0 + gain) - 1.0, found.at_ms, offsets, shift)
+    drift = None if gain is None else 1.0 / (1.0 + gain) - 1.0
+    return PcClock(slope, drift, at[starts], at[[start - 1 for start in starts]], offsets, shift)
+
+
+def _with_ends(level_ms: NDArray[np.float64], pieces: list[slice]) -> list[slice]:
+    """Cut off the first or last few packets where each is on another level than its piece.
+
+    They are too few for a piece, but agree with each other. The clock was set right after the first, or right before the last.
+    """
+    first, last = (float(np.median(level_ms[piece])) for piece in (pieces[0], pieces[-1]))
+    begin, end = _agreeing(level_ms[:LEAST_PACKETS], first), _agreeing(level_ms[::-1][:LEAST_PACKETS], last)
+    out = list(pieces)
+    if 0 < begin < out[0].stop - LEAST_PACKETS:
+        out[:1] = [slice(0, begin), slice(begin, out[0].stop)]
+    if 0 < end < out[-1].stop - out[-1].start - LEAST_PACKETS:
+        cut = out[-1].stop - end
+        out[-1:] = [slice(out[-1].start, cut), slice(cut, out[-1].stop)]
+    return out
+
+
+def _agreeing(level_ms: NDArray[np.float64], usual_ms: float) -> int:
+    """Count the first packets that are off the usual level by more than a step, and agree with the first."""
+    off = (np.abs(level_ms - usual_ms) > STEP_MS) & (np.abs(level_ms - level_ms[0]) < WANDER_MS)
+    return int(np.argmin(off)) if not off.all() else 0
 
 
 def _gain(at_ms: NDArray[np.float64], ahead_ms: NDArray[np.float64], pieces: list[slice]) -> float | None:

@@ -73,6 +73,39 @@ def test_what_the_computer_logged_after_its_clock_was_set_stands_where_it_happen
     np.testing.assert_allclose(clock.of_pc_ms(logged), happened, atol=1.0)
 
 
+@pytest.mark.parametrize(("by_s", "doubtful"), [(3.0, True), (7.0, False), (-3.0, True), (-30.0, True)])
+def test_a_record_within_lost_packets_has_no_place_where_two_times_fit(by_s, doubtful):
+    """Packets 150 to 209 are lost (6 s) and the clock is set at the 170th; the record is of the 174th."""
+    headers, true = packets(keep=np.concatenate((np.arange(150), np.arange(210, 380))), pc_step=(170, by_s))
+    clock = reconstruct_all({"td": headers}, {}).clock
+    happened = true[149] + 2_500.0
+    spans = clock.doubtful_ms([happened + 1000.0 * by_s])
+    assert bool(spans) == doubtful
+    for begin, end in spans:
+        # the timeline is that of the most packets, which come after the step
+        assert begin <= true[149] + 1000.0 * by_s + min(0.0, 1000.0 * by_s)
+        assert end >= true[150] + 1000.0 * by_s
+    if not doubtful:
+        np.testing.assert_allclose(clock.of_pc_ms(np.array([happened + 1000.0 * by_s])), [happened], atol=1.0)
+
+
+def test_a_record_far_from_a_step_among_lost_packets_keeps_its_place():
+    headers, true = packets(keep=np.concatenate((np.arange(150), np.arange(210, 380))), pc_step=(170, 3.0))
+    clock = reconstruct_all({"td": headers}, {}).clock
+    assert clock.doubtful_ms([true[100], true[200] + 3_000.0]) == []
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize("at_end", [False, True])
+def test_a_step_next_to_the_first_or_last_packets_is_told(count, at_end):
+    headers, true = packets(pc_step=(380 - count if at_end else count, 3.0), noise_ms=20.0)
+    clock = reconstruct_all({"td": headers}, {}).clock
+    np.testing.assert_allclose(clock.steps_ms, [3000.0], atol=60.0)
+    assert clock.timeline_ms(clock.steps_at_ms) == pytest.approx(
+        [true[380 - count if at_end else count] + (0 if at_end else 3000.0)], abs=60
+    )
+
+
 def test_a_step_of_either_clock_within_lost_packets_moves_nothing():
     kept = np.concatenate((np.arange(150), np.arange(210, 380)))
     for steps in ({"implant_step": (200, 3600.0)}, {"pc_step": (200, 10.0)}):
