@@ -37,7 +37,7 @@ class AmplitudeSteps:
         # from the end on, what was in force then; none where the course begins later
         after = self.amplitude_ma[last - 1 : last] if np.isfinite(end_ms) and last > 0 else unknown[:0]
         amplitude = [self.amplitude_ma[:first], unknown, after, self.amplitude_ma[last:]]
-        times = [self.t_ms[:first], [begin_ms], [end_ms] * len(after), self.t_ms[last:]]
+        times = [self.t_ms[:first], np.array([begin_ms, *[end_ms] * len(after)]), self.t_ms[last:]]
         return replace(
             self,
             t_ms=np.concatenate(times),
