@@ -54,6 +54,7 @@ class DeviceFormat:
         upload: what to send, as part of a sentence.
         package: that has its `CODE`.
         sources: of beta, with the name of each that no other format has.
+        magic: first bytes, any of which makes a file one of this format; its package is then not asked.
         zipped: whether a zip that cannot be read is taken for one of this format, whose decoder then reports why.
     """
 
@@ -63,6 +64,7 @@ class DeviceFormat:
     upload: str
     package: str
     sources: Mapping[str, str]
+    magic: tuple[bytes, ...] = ()
     zipped: bool = False
 
     @property
@@ -88,6 +90,15 @@ DEVICES = (
         upload="a Percept session report (JSON)",
         package="ml.formats.percept",
         sources={"percept_lfp": "Percept band power"},
+    ),
+    DeviceFormat(
+        kind="xdf",
+        device="XDF",
+        file="XDF recording",
+        upload="an XDF recording (LSL)",
+        package="ml.formats.xdf",
+        sources={},
+        magic=(b"XDF:",),
     ),
 )
 BY_KIND = {one.kind: one for one in DEVICES}

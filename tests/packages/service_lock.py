@@ -18,7 +18,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
 LOCK = ROOT / "requirements-service.lock"
-EXTRAS = ("", "nwb", "s3")
+EXTRAS = ("", "nwb", "recordings", "s3")
 
 
 def pinned() -> dict[str, str]:

@@ -16,7 +16,7 @@ def test_a_record_has_words_facts_and_sources_of_its_own(one: DeviceFormat) -> N
     assert one.device in one.upload
     assert one.device in one.file
     facts = one.code.facts
-    assert all((facts.clocks, facts.counters, facts.fields, facts.dose))
+    assert all((facts.clocks, facts.fields, facts.dose))
 
 
 def test_no_two_records_share_a_kind_or_a_source_and_one_reports_on_zips_that_cannot_be_read() -> None:
