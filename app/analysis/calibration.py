@@ -29,10 +29,9 @@ from app.evaluation.ranking.actual import QUANTITIES, Actual, actual
 from app.evaluation.ranking.results import DrivenSession, driven_sessions
 from app.planning.plans import repository as plans
 from app.platform.web.charts import counted
-from app.study import blinding
+from app.study import access, blinding
 from app.study import repository as study_repository
-from app.study import service as study
-from app.study.threshold import mdp_settings
+from app.study.settings.service import mdp_settings
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.participants import Participant
@@ -68,7 +67,7 @@ class _Before:
 
 def calibration(db: Session, participant: Participant, caller: Caller) -> CalibrationOut:
     """Predicted against actual, of every policy that ran at a visit after an evaluation of it."""
-    study.require(caller, can.READ, participant)
+    access.require(caller, can.READ, participant)
     made = repository.evaluation_times(db, participant.id)
     planned = plans.pinned_evaluations(db, participant.id)
     by_visit: dict[Visit, list[StudySession]] = defaultdict(list)

@@ -20,8 +20,8 @@ from app.platform.web.csv_files import download
 from app.platform.web.numbers import hover
 from app.platform.web.schemas import Model, problems
 from app.platform.web.templates import render
+from app.study.access import may
 from app.study.deps import CurrentParticipant
-from app.study.service import may
 
 # API types of methods by seed.
 

@@ -30,7 +30,7 @@ from app.platform.web.csv_files import download
 from app.platform.web.schemas import Model, PagingQuery, problems
 from app.platform.web.templates import render
 from app.study import repository as study
-from app.study.service import withdrawn_codes
+from app.study.access import withdrawn_codes
 from app.tables.participants import Participant
 from app.tables.sessions import Controller
 from ml.statistics.pooling import Summary

@@ -12,7 +12,7 @@ from app.learning import repository
 from app.platform.audit import record_view
 from app.platform.database import Db
 from app.platform.web.schemas import RowId
-from app.study import service as study
+from app.study import access
 from app.study.deps import CurrentParticipant
 from app.tables.learning import BufferSnapshot, Policy, Sweep
 
@@ -30,7 +30,7 @@ def current_snapshot(snapshot_id: RowId, db: Db, caller: CurrentCaller) -> Buffe
 def current_own_policy(participant: CurrentParticipant, policy_id: RowId, db: Db, caller: CurrentCaller) -> Policy:
     """Find the policy that the path names after its participant. Raises NotFound for another participant's."""
     policy = repository.policy(db, policy_id, caller)
-    study.require_own(participant, policy, f"policy {policy_id}")
+    access.require_own(participant, policy, f"policy {policy_id}")
     return policy
 
 

@@ -23,7 +23,7 @@ from app.overview import repository
 from app.overview.package_dictionary import FIELDS, TITLES, Days, descriptor
 from app.platform.audit import record
 from app.platform.errors import BetaloopError
-from app.study import blinding, service
+from app.study import access, blinding
 from app.study import repository as study
 from app.study.characteristics.schemas import CharacteristicsOut
 from app.study.doses.drugs import levodopa_equivalent_mg
@@ -48,7 +48,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
     A session whose steps cannot be read has its row all the same, with the reason in the column `problem`. No date leaves: times are days
     since the participant was enrolled.
     """
-    service.require(caller, can.READ, participant)
+    access.require(caller, can.READ, participant)
     record(db, "export", "participant", participant.id)
     found = primary(db, participant, caller)
     day = Days(participant.created_at)

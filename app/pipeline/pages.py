@@ -29,8 +29,8 @@ from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
 from app.study import repository as study
+from app.study.access import may, withdrawn_codes
 from app.study.deps import CurrentParticipant
-from app.study.service import may, withdrawn_codes
 from app.tables.jobs import Job, JobStatus
 from app.tables.participants import Participant
 from ml.ope import registry as estimators

@@ -15,7 +15,7 @@ from app.learning.snapshots.service import collect
 from app.pipeline.stages import PLAN, snapshot_facts
 from app.platform.jobs import Priority, registry
 from app.platform.jobs import service as jobs
-from app.study import service as study
+from app.study import access
 from app.tables.jobs import Job
 from app.tables.participants import Participant
 
@@ -47,10 +47,10 @@ def start_job(
         UnknownKind: there is no such kind. Invalid: params that break its schema, or something that it requires is not there.
         Forbidden: the caller may not run jobs. Conflict: the participant has withdrawn, or the study has ended, meanwhile.
     """
-    study.require(caller, can.RUN_JOBS, participant)
+    access.require(caller, can.RUN_JOBS, participant)
     wanted = registry.kind(kind)
     checked = jobs.checked_params(kind, params)
-    study.require_still_taking_part(db, participant)  # an end cancels the jobs that it sees: one that came later would run
+    access.require_still_taking_part(db, participant)  # an end cancels the jobs that it sees: one that came later would run
     # two requests at once: the second waits here and finds the job of the first
     learning.lock_participant(db, participant.id)
     if not again or wanted.one_at_a_time:
@@ -86,14 +86,14 @@ def retry_job(db: Session, participant: Participant, job: Job, caller: Caller) -
     Raises:
         Conflict: the job has not ended, or another one repeats it. NotFound: it is another participant's.
     """
-    study.require(caller, can.RUN_JOBS, participant)
-    study.require_own(participant, job, f"job {job.id}")
+    access.require(caller, can.RUN_JOBS, participant)
+    access.require_own(participant, job, f"job {job.id}")
     job = jobs.repeatable(db, job)
     return start_job(db, participant, job.kind, job.params, caller, again=True, repeats=job).job
 
 
 def cancel_job(db: Session, participant: Participant, job: Job, caller: Caller) -> Job:
     """Cancel a job. Raises Conflict when it has ended, NotFound for another participant's."""
-    study.require(caller, can.RUN_JOBS, participant)
-    study.require_own(participant, job, f"job {job.id}")
+    access.require(caller, can.RUN_JOBS, participant)
+    access.require_own(participant, job, f"job {job.id}")
     return jobs.cancel(db, job, caller.label)

@@ -34,11 +34,11 @@ from app.simulation.demo.study import participant_body
 from app.simulation.design import BETWEEN_VISITS, MORNING, Design, Remembered
 from app.simulation.sessions import VisitDay
 from app.study import repository as study_repository
-from app.study import service as study
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.enrolment import service as enrolment
 from app.study.enrolment.schemas import ParticipantIn
 from app.study.schemas import VisitIn
+from app.study.visits import changes as visits
 from app.tables.jobs import Job, JobStatus
 from app.tables.participants import Participant
 from app.tables.sessions import Controller
@@ -130,7 +130,7 @@ class ParticipantLoop:
             visit = study_repository.visit_by_number(db, person.id, number)
             if visit is None:
                 note = "Simulated: the participant is synthetic and not fitted to a patient."
-                visit = study.add_visit(db, person, VisitIn(number=number, date=day, note=note), self.caller)
+                visit = visits.add_visit(db, person, VisitIn(number=number, date=day, note=note), self.caller)
             if plans.live_plan(db, visit.id) is None:
                 if not collects:
                     self._learn(db, person, number)

@@ -21,9 +21,9 @@ from app.planning.visit_day.schemas import EntryIn
 from app.platform.errors import BetaloopError
 from app.simulation.demo.study import device_session, session_file
 from app.simulation.tablet import Moment, run_slot_of
-from app.study import service as study
 from app.study.schemas import QocIn
-from app.study.threshold import mdp_settings
+from app.study.sessions import changes
+from app.study.settings.service import mdp_settings
 from app.tables.participants import Participant
 from app.tables.plans import PlanItem
 from app.tables.sessions import Controller, StudySession
@@ -100,7 +100,7 @@ class VisitDay:
         # a session done before a stop is run again, on a tablet of its own: its time is before that of the day's
         percent = self._run(db, item, start_minute, self.tablet / f"again-{item.position}").outcomes.qoc.tremor_percent
         values = {"tremor_percent": percent, "sure": ["tremor_percent"], "reason": "as the simulated watch gave it"}
-        study.record_qoc(db, session, QocIn.model_validate(values), self.caller)
+        changes.record_qoc(db, session, QocIn.model_validate(values), self.caller)
 
     def _run(self, db: Session, item: PlanItem, start_minute: float, tablet: Path) -> Held:
         """Return the session's results, the same whenever they are asked for."""

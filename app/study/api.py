@@ -7,7 +7,7 @@ from fastapi import APIRouter
 from app.accounts.deps import CurrentCaller
 from app.platform.database import Db
 from app.platform.web.schemas import Page, PagingQuery, problems
-from app.study import repository, service
+from app.study import repository
 from app.study.blinding import require_known
 from app.study.deps import CurrentParticipant, CurrentSession, CurrentVisit, SessionViewed, VisitViewed
 from app.study.enrolment import service as enrolment
@@ -33,10 +33,12 @@ from app.study.schemas import (
     VisitUnlockIn,
 )
 from app.study.serializers import lock_rows, outcome_out, participant_out, recorded_trace_out, session_out, trace_out, visit_out
-from app.study.sessions import conditions
+from app.study.sessions import changes, conditions
 from app.study.sessions.data import session_data
+from app.study.settings import service as settings
 from app.study.settings.schemas import SettingsChange, SettingsOut
 from app.study.traces import recorded_traces
+from app.study.visits import changes as study_visits
 from app.study.visits import service as visits
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
@@ -71,7 +73,7 @@ def list_settings(participant: CurrentParticipant) -> list[SettingsOut]:
 @router.put("/participants/{code}/settings", responses=problems(409))
 def change_settings(participant: CurrentParticipant, change: SettingsChange, db: Db, caller: CurrentCaller) -> SettingsOut:
     """Change settings: a new version; members left out keep their value."""
-    row = service.change_settings(db, participant, change.settings, change.reason, caller, change.sure)
+    row = settings.change_settings(db, participant, change.settings, change.reason, caller, change.sure)
     return SettingsOut.model_validate(row)
 
 
@@ -85,7 +87,7 @@ def list_visits(participant: CurrentParticipant, db: Db, paging: PagingQuery) ->
 @router.post("/participants/{code}/visits", status_code=201, responses=problems(409))
 def add_visit(participant: CurrentParticipant, draft: VisitIn, db: Db, caller: CurrentCaller) -> VisitOut:
     """Add a visit."""
-    visit = service.add_visit(db, participant, draft, caller)
+    visit = study_visits.add_visit(db, participant, draft, caller)
     return visit_out(visit, participant.code)
 
 
@@ -98,7 +100,7 @@ def read_visit(visit: CurrentVisit) -> VisitOut:
 @router.patch("/visits/{visit_id}", responses=problems(409))
 def change_visit(visit: CurrentVisit, change: VisitChange, db: Db, caller: CurrentCaller) -> VisitOut:
     """Correct a visit: its date, its note, its cDBS amplitudes; amplitude fractions of its sessions follow."""
-    service.change_visit(db, visit, change, caller)
+    study_visits.change_visit(db, visit, change, caller)
     return visit_out(visit, visit.participant.code)
 
 
@@ -141,7 +143,7 @@ def read_session(session: CurrentSession, caller: CurrentCaller) -> SessionOut:
 @router.patch("/sessions/{session_id}", responses=problems(409))
 def change_session(session: CurrentSession, change: SessionChange, db: Db, caller: CurrentCaller) -> SessionOut:
     """Correct a session: its controller, channel, hemisphere, or whether it counts."""
-    service.change_session(db, session, change, caller)
+    changes.change_session(db, session, change, caller)
     return session_out(session, caller)
 
 
@@ -183,7 +185,7 @@ def read_qoc(session: CurrentSession) -> QocOut | None:
 @router.put("/sessions/{session_id}/qoc", responses=problems(409))
 def record_qoc(session: CurrentSession, values: QocIn, db: Db, caller: CurrentCaller) -> QocOut:
     """Enter or correct the QoCs of a session."""
-    row = service.record_qoc(db, session, values, caller)
+    row = changes.record_qoc(db, session, values, caller)
     return QocOut.model_validate(row)
 
 
@@ -196,5 +198,5 @@ def read_outcomes(session: CurrentSession, db: Db) -> list[OutcomeOut]:
 @router.post("/sessions/{session_id}/outcomes", responses=problems(409))
 def take_outcome(session: CurrentSession, choice: DerivedChoice, db: Db, caller: CurrentCaller) -> QocOut:
     """Put the value that the files give in the place of a typed one; `value` is the one that was read before."""
-    row = service.take_derived(db, session, choice, caller)
+    row = changes.take_derived(db, session, choice, caller)
     return QocOut.model_validate(row)

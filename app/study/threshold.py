@@ -2,34 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.platform.errors import Invalid
-from app.platform.web.numbers import number
 from app.study import blinding, repository
+from app.study.settings.service import SuggestedThreshold
 from app.study.traces import laid_out, traces_of
 from app.tables.participants import Participant, SettingsVersion
 from app.tables.recordings import Trace
 from app.tables.sessions import Controller
-from ml.mdp import MdpSettings
-
-MDP_FIELDS = (
-    "window", "period_s", "r_a", "r_b", "c1", "c2", "c3", "c4", "gamma", "lower_bound", "tremor_as_fraction",
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class SuggestedThreshold:
-    """A threshold from the data, in the unit and from the source of the beta that it was taken from."""
-
-    value: float
-    unit: str
-    source: str
 
 
 def mismatch(settings: SettingsVersion, trace: Trace | None) -> str:
@@ -52,22 +36,6 @@ def mismatch(settings: SettingsVersion, trace: Trace | None) -> str:
         f"The threshold of {settings.xi_beta:g} is in {wanted[0]} from {wanted[1]}; this trace is in {trace.unit} from {trace.source}. "
         "They are not comparable."
     )
-
-
-def mdp_settings(settings: SettingsVersion, suggestion: SuggestedThreshold | None = None) -> MdpSettings:
-    """The MDP of a settings version.
-
-    Raises:
-        Invalid: xi_beta is not set; names the suggestion from the data where there is one.
-    """
-    if settings.xi_beta is None:
-        hint = f" A suggestion from the data: {number(suggestion.value, 4)} {suggestion.unit}." if suggestion is not None else ""
-        raise Invalid(
-            f"Participant {settings.participant.code} has no beta threshold xi_beta yet; the paper gives no default.",
-            f"Set xi_beta in the participant's settings.{hint}",
-            suggested_xi_beta=suggestion.value if suggestion else None,
-        )
-    return MdpSettings(xi_beta=settings.xi_beta, **{name: getattr(settings, name) for name in MDP_FIELDS})
 
 
 def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> SuggestedThreshold | None:

@@ -25,8 +25,8 @@ from app.platform.errors import BetaloopError, Invalid, NotFound
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import Part, make_part, render
 from app.study import repository as study_repository
+from app.study.access import may, require
 from app.study.deps import CurrentParticipant, ResultsViewed
-from app.study.service import may, require
 from app.tables.learning import Policy
 from app.tables.participants import Participant
 from ml.policies.logged_range import LARGEST_SHARE_BELOW

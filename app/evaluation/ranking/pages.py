@@ -26,8 +26,8 @@ from app.platform.jobs import registry
 from app.platform.jobs import repository as jobs
 from app.platform.web.forms import parse
 from app.platform.web.templates import Part, make_part, render, render_part
+from app.study.access import may
 from app.study.deps import CurrentParticipant, ResultsViewed
-from app.study.service import may
 from app.tables.jobs import JobStatus
 from app.tables.participants import Participant
 from ml.designs import EARLY_RANDOM_SESSIONS

@@ -21,7 +21,7 @@ from app.study.blinding import Arm
 from app.study.margins.service import margins_of
 from app.study.sessions.data import failed_qoc_of
 from app.study.sessions.repository import ReadOnce
-from app.study.threshold import mdp_settings
+from app.study.settings.service import mdp_settings
 from app.study.traces import TracesOf, laid_out, traces_of
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot

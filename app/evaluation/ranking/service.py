@@ -17,8 +17,8 @@ from app.evaluation.ranking.staleness import stale_reasons
 from app.evaluation.schemas import CoverageOut, EstimateOut, FlagOut, GainOut, RankedPolicy, RankedSnapshot, RankingFilter, RankingOut
 from app.evaluation.shown import estimate_out, flag_out, reason_out
 from app.platform.errors import NotFound
+from app.study import access
 from app.study import repository as study_repository
-from app.study import service as study
 from app.study.sessions.repository import ReadOnce
 from app.tables.learning import BufferSnapshot
 from app.tables.participants import Participant
@@ -44,7 +44,7 @@ def current_ranking(
 
 def current(db: Session, participant: Participant, caller: Caller, method: str | None = None) -> Judged:
     """The newest evaluation, judged by the margins in force now, with what its policies showed in sessions. Raises as `current_ranking`."""
-    study.require(caller, can.READ, participant)
+    access.require(caller, can.READ, participant)
     evaluation = repository.newest_evaluation(db, participant.id)
     if evaluation is None:
         raise NotFound(

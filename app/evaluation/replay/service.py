@@ -17,8 +17,8 @@ from app.learning.policies.service import onnx_of
 from app.platform import files
 from app.platform.errors import Invalid
 from app.platform.kept import kept
+from app.study import access
 from app.study import repository as study_repository
-from app.study import service as study
 from app.study.blinding import require_known
 from app.study.sessions.data import SessionData, session_data
 from app.study.traces import StepTable
@@ -65,7 +65,7 @@ def replay(db: Session, participant: Participant, session_id: int, policies: Seq
 def recorded(db: Session, participant: Participant, session_id: int, caller: Caller) -> SessionData:
     """A session over which policies may be run. Raises NotFound and Forbidden as `replay` does."""
     session = study_repository.session(db, session_id, caller)
-    study.require_own(participant, session.visit, f"session {session_id}")
+    access.require_own(participant, session.visit, f"session {session_id}")
     require_known(session.visit, caller)
     return session_data(db, session)
 

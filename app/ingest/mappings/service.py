@@ -17,7 +17,7 @@ from app.ingest.quarantine import service as quarantine
 from app.ingest.uploads.service import FileOutcome
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound
-from app.study import service as study_service
+from app.study import access
 from app.tables.participants import Participant
 from app.tables.uploads import ColumnMapping, UploadFile
 from ml.formats.tables.mapping import TableMapping
@@ -49,7 +49,7 @@ def waiting_table(db: Session, file_id: int, caller: Caller, lock: bool = False)
         NotFound: no such file, or it waits for none. Forbidden: the caller may not upload.
     """
     file, participant = uploads.upload_file(db, file_id, caller, lock)
-    study_service.require(caller, can.UPLOAD, participant)
+    access.require(caller, can.UPLOAD, participant)
     if file.preview is None:
         raise NotFound(f"File {file.id} waits for no column mapping.", f"See what became of it: upload {file.upload_id}.")
     headers = {line["header"] for line in file.preview["lines"]}

@@ -30,8 +30,8 @@ from app.ingest.uploads import service
 from app.platform.database import Db
 from app.platform.errors import NotFound
 from app.platform.web.schemas import RowId, problems
+from app.study import access
 from app.study import repository as study
-from app.study import service as study_service
 from app.study.deps import CurrentParticipant
 from app.study.serializers import session_out, visit_out
 from app.tables.sessions import StudySession
@@ -98,7 +98,7 @@ def discard_proposal(session: CurrentProposal, why: DiscardIn, db: Db, caller: C
 def attach_file(file_id: RowId, target: AttachIn, db: Db, caller: CurrentCaller) -> AttachedOut:
     """Attach a grasp file, which names no clock, to its session."""
     file, participant = repository.upload_file(db, file_id, caller, lock=True)
-    study_service.require(caller, can.WRITE_STUDY, participant)
+    access.require(caller, can.WRITE_STUDY, participant)
     session = study.session(db, target.session_id, caller)
     notes = service.attach_grasps(db, file, session)
     return AttachedOut(session=session_out(study.session(db, session.id, caller), caller), notes=notes)

@@ -19,8 +19,8 @@ from app.ingest.sessions import TOGETHER, set_segments
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.platform.web.schemas import Model, Number, Text
+from app.study.access import require
 from app.study.outcomes import service as outcomes
-from app.study.service import require
 from app.study.sessions import conditions
 from app.study.sessions.contradictions import control_recording
 from app.study.visits.service import require_unlocked

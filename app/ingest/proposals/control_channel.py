@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from app.ingest import channels, programs
 from app.ingest.proposals.evidence import Evidence, Reason, Source
 from app.study import repository as study
-from app.study import service
+from app.study.sessions import changes
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.usable_steps import usable_steps
 from app.tables.sessions import StudySession
@@ -77,7 +77,7 @@ def renewed_program(db: Session, session: StudySession, evidence: Mapping[str, A
 
 def choose(db: Session, session: StudySession, given: dict[str, object]) -> None:
     """Choose the stated channel, which a control recording of the session must have."""
-    service.check_control(db, session, given)
+    changes.check_control(db, session, given)
     session.control_stream = str(given.get("control_stream") or session.control_stream)
     if given.get("control_program") is not None:
         session.control_program = int(str(given["control_program"]))

@@ -11,8 +11,8 @@ from app.ingest.proposals import control_channel
 from app.ingest.proposals.evidence import Evidence, Reason, Source, guess_controller
 from app.platform.errors import Invalid
 from app.study import blinding
-from app.study.service import POLICY_CONTROLLERS
 from app.study.sessions import logged
+from app.study.sessions.changes import POLICY_CONTROLLERS
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.stimulation import delivered
 from app.tables.sessions import Controller, StudySession

@@ -21,7 +21,7 @@ from app.study import repository as study
 from app.study.sessions import conditions, logged
 from app.study.sessions.contradictions import contradictions, control_recording, local_day
 from app.study.sessions.usable_steps import sentence, usable_steps
-from app.study.wording import sentences
+from app.study.sessions.wording import sentences
 from app.tables.participants import Participant
 from app.tables.recordings import Recording
 from app.tables.sessions import StudySession

@@ -24,8 +24,8 @@ from app.platform.errors import BetaloopError, Invalid, about
 from app.platform.web.forms import FormValues, field_notes, renamed
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
+from app.study import access
 from app.study import repository as study
-from app.study import service as study_service
 from app.study.blinding import CONTROLLER_NAMES, may_know
 from app.study.deps import CurrentParticipant
 from app.study.sessions import designs
@@ -33,8 +33,8 @@ from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions
 from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.usable_steps import usable_steps
+from app.study.sessions.wording import drawn_words, sentences
 from app.study.traces import control_programs
-from app.study.wording import drawn_words, sentences
 from app.tables.participants import Participant
 from app.tables.sessions import StudySession
 from app.tables.uploads import SessionProposal
@@ -63,7 +63,7 @@ def proposal_page(request: Request, session: CurrentProposal, db: Db, caller: Cu
 @router.post("/participants/{code}/proposals")
 def decide(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Do what the pressed button says to its proposal; corrections typed into the others are saved too."""
-    study_service.require(caller, can.WRITE_STUDY, participant)
+    access.require(caller, can.WRITE_STUDY, participant)
     verb, _, which = str(values.get("do", "")).partition(":")
     typed = {str(k): str(v) for k, v in values.items()}
     rows = study.proposals_of_participant(db, participant.id)
@@ -94,7 +94,7 @@ def decide(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
 def attach(request: Request, file_id: RowId, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Attach a grasp file to its session."""
     file, participant = repository.upload_file(db, file_id, caller, lock=True)
-    study_service.require(caller, can.WRITE_STUDY, participant)
+    access.require(caller, can.WRITE_STUDY, participant)
     chosen = str(values.get("session_id", ""))
     try:
         with about("session_id"):

@@ -18,15 +18,14 @@ from app.ingest.sessions import add_session
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
-from app.study import blinding
+from app.study import access, blinding
 from app.study import repository as study
-from app.study import service as study_service
 from app.study.data_queries import repository as data_queries
-from app.study.service import POLICY_CONTROLLERS
 from app.study.sessions import conditions, logged
+from app.study.sessions.changes import POLICY_CONTROLLERS
 from app.study.sessions.contradictions import contradictions, control_recording
+from app.study.sessions.wording import sentences
 from app.study.visits.service import require_unlocked
-from app.study.wording import sentences
 from app.tables.sessions import Controller, StudySession
 from app.tables.uploads import SessionProposal
 
@@ -204,7 +203,7 @@ def _delete(db: Session, session: StudySession) -> None:
 
 def locked(db: Session, session: StudySession, version: int, caller: Caller) -> SessionProposal:
     """Lock the proposal's row for a change. Raises Conflict where it was confirmed, or changed after the caller looked at it."""
-    study_service.require(caller, can.WRITE_STUDY, session.visit.participant)
+    access.require(caller, can.WRITE_STUDY, session.visit.participant)
     proposal = repository.proposal(db, session.id, caller, lock=True)
     db.refresh(session, ["status"])
     if session.status != "proposed":

@@ -14,10 +14,11 @@ from app.ingest import repository
 from app.ingest.proposals.evidence import Evidence, Reason, Source
 from app.ingest.proposals.service import locked, renew
 from app.platform.errors import Conflict, Invalid
+from app.study import access
 from app.study import repository as study
-from app.study import service as study_service
 from app.study.schemas import VisitIn
 from app.study.sessions.contradictions import control_recording, local_day
+from app.study.visits import changes as study_visits
 from app.tables.sessions import StudySession
 from app.tables.uploads import SessionProposal
 from app.tables.visits import Visit
@@ -80,7 +81,7 @@ def add_visit_of_recording(db: Session, session: StudySession, version: int, cal
             has a visit, or its recording states no date.
     """
     participant = session.visit.participant
-    study_service.require(caller, can.WRITE_STUDY, participant)
+    access.require(caller, can.WRITE_STUDY, participant)
     proposal = locked(db, session, version, caller)
     visits = study.visits(db, participant.id, 1000, 0)[0]
     if not proposal.visit_open:
@@ -90,7 +91,7 @@ def add_visit_of_recording(db: Session, session: StudySession, version: int, cal
     day = day_to_add(session, proposal, visits)
     if day is None:
         raise Conflict("A visit on the day of this recording is there already.", "Choose it in the proposal.")
-    visit = study_service.add_visit(db, participant, VisitIn(number=_numbered(day, visits).number, date=day), caller)
+    visit = study_visits.add_visit(db, participant, VisitIn(number=_numbered(day, visits).number, date=day), caller)
     why = Evidence(Source.RECORDING, Reason.DAY_OF_VISIT, {"day": str(day), "visit": visit.number}).as_json()
     waiting = study.proposals_of_participant(db, participant.id)
     behind = repository.proposals(db, [s.id for s in waiting])

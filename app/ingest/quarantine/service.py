@@ -28,7 +28,7 @@ from app.platform.audit import record
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
 from app.platform.raw_bytes import RawFile, raw_file
-from app.study import service as study_service
+from app.study import access
 from app.tables.participants import Participant
 from app.tables.uploads import PREVIEW, StoredFile, UploadFile
 from ml.formats import REDACTOR_VERSION, UndecodableFile
@@ -64,8 +64,8 @@ def read_again(db: Session, file_id: int, reason: str, caller: Caller) -> Upload
 def read_held(db: Session, file: UploadFile, participant: Participant, reason: str, caller: Caller) -> UploadOutcome:
     """Read a quarantined file, as `read_again` does, for users who may decide that it can be read."""
     # what is read of it is new data, although its bytes came before the end
-    study_service.refuse_withdrawn(participant)
-    study_service.refuse_ended(participant.site)
+    access.refuse_withdrawn(participant)
+    access.refuse_ended(participant.site)
     if file.status == "failed" and (known := repository.decoded_file(db, participant.id, file.original_sha256)) is not None:
         raise Conflict(f"The same bytes were read as file {known.id} of upload {known.upload_id}.", "Discard this copy.")
     upload = repository.upload(db, file.upload_id, caller)[0]
@@ -143,7 +143,7 @@ def discard(db: Session, file_id: int, reason: str, caller: Caller) -> UploadFil
 
 def _held(db: Session, file_id: int, caller: Caller) -> tuple[UploadFile, Participant]:
     file, participant = repository.upload_file(db, file_id, caller, lock=True)
-    study_service.require(caller, can.DECIDE_QUARANTINE, participant)
+    access.require(caller, can.DECIDE_QUARANTINE, participant)
     if file.quarantine_sha256 is None:
         done = f": {file.decided_by} decided on it" if file.decided_by else ""
         raise Conflict(f"File {file.id} is not in quarantine{done}.", "Load the page again.")

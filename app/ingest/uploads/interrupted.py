@@ -19,7 +19,7 @@ from app.ingest.uploads.service import UploadOutcome
 from app.platform.database import transaction
 from app.platform.errors import Conflict, Invalid
 from app.platform.jobs.children.child import places
-from app.study import service as study
+from app.study import access
 from app.tables.participants import Participant
 from app.tables.uploads import Upload
 
@@ -80,8 +80,8 @@ def why_left(participant: Participant) -> str | None:
     Participants who have withdrawn, sites and studies that have ended get no new data, not those either whose bytes came before.
     """
     try:
-        study.refuse_withdrawn(participant)
-        study.refuse_ended(participant.site)
+        access.refuse_withdrawn(participant)
+        access.refuse_ended(participant.site)
     except Conflict as refused:
         return refused.detail
     return None

@@ -25,8 +25,8 @@ from app.platform.web.forms import field_notes, parse
 from app.platform.web.schemas import Int, RowId, Text
 from app.platform.web.templates import render
 from app.settings import get_settings
+from app.study import access
 from app.study import repository as study
-from app.study import service as study_service
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.deps import CurrentParticipant
 from app.study.settings.form import SOURCES
@@ -54,7 +54,7 @@ class _PageForm(UploadForm):
 @router.get("/participants/{code}/upload")
 def upload_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, visit: str = "") -> HTMLResponse:
     """Show the upload form and the uploads so far."""
-    study_service.require(caller, can.UPLOAD, participant)
+    access.require(caller, can.UPLOAD, participant)
     limited.prepare()  # it is ready before a file is chosen
     return _page(request, db, participant, {"visit": visit} if visit else {})
 

@@ -26,8 +26,8 @@ from app.platform import files
 from app.platform.errors import BetaloopError, Conflict, Invalid, TooLarge, passing
 from app.platform.jobs.children.child import places
 from app.platform.web.schemas import sensible_time
+from app.study import access
 from app.study import repository as study
-from app.study import service as study_service
 from app.study.visits.service import require_unlocked
 from app.tables.participants import Hemisphere, Participant
 from app.tables.sessions import Controller, StudySession
@@ -169,8 +169,8 @@ def receive(
         TooLarge: every file exceeds the installation's limit. Invalid: no file. Conflict: the site has ended. CutShort: a fault, after
             something was kept. TooManyUploads, StoreAway: too many at once.
     """
-    study_service.require(caller, can.UPLOAD, participant)
-    study_service.refuse_ended(participant.site)
+    access.require(caller, can.UPLOAD, participant)
+    access.refuse_ended(participant.site)
     if not incoming:
         raise Invalid("The upload holds no file.", "Choose at least one file.", field="file")
     beta = beta or BetaStated()

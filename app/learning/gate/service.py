@@ -19,8 +19,7 @@ from app.accounts.permissions import SYSTEM, Caller
 from app.learning import repository
 from app.platform.database import set_reason
 from app.platform.errors import Invalid
-from app.study import blinding
-from app.study import service as study
+from app.study import access, blinding
 from app.tables.learning import BufferGateDecision, GateChoice
 from app.tables.participants import Participant
 from app.tables.sessions import Controller, StudySession
@@ -98,7 +97,7 @@ def decide(db: Session, participant: Participant, choice: GateChoice, reason: st
     Raises:
         Invalid: no reason. Forbidden: the caller approves no plans in this study.
     """
-    study.require(caller, can.DECIDE_GATE, participant)
+    access.require(caller, can.DECIDE_GATE, participant)
     if not reason.strip():
         raise Invalid("A decision on what policies learn from needs its reason.", "Say why in a sentence.", field="reason")
     row = BufferGateDecision(participant_id=participant.id, choice=choice, reason=reason.strip(), created_by=caller.label)

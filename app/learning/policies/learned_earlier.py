@@ -15,8 +15,8 @@ from app.learning import repository
 from app.learning.snapshots.buffers import read_buffer
 from app.platform import files
 from app.platform.errors import Conflict, Invalid
+from app.study import access
 from app.study import repository as study_repository
-from app.study import service as study
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.participants import Participant
 from ml.policies.onnx_policy import OnnxPolicy, PolicyFileError
@@ -59,8 +59,8 @@ def add_learned(
         Invalid: the snapshot holds other sessions than the policy was learned on, the file is no policy, or its teacher or parent is not
             here. Conflict: another policy has this name. Forbidden: the caller may not write policies.
     """
-    study.require(caller, can.WRITE_POLICIES, participant)
-    study.require_own(participant, snapshot, f"snapshot {snapshot.id}")
+    access.require(caller, can.WRITE_POLICIES, participant)
+    access.require_own(participant, snapshot, f"snapshot {snapshot.id}")
     known = repository.policy_by_name(db, participant.id, learned.name)
     if known is not None:
         if hashlib.sha256(learned.onnx).hexdigest() == known.onnx_sha256:

@@ -22,8 +22,8 @@ from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import field_notes, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render
+from app.study.access import may
 from app.study.deps import CurrentParticipant
-from app.study.service import may
 from app.tables.participants import Participant
 
 router = APIRouter()

@@ -22,8 +22,8 @@ from app.platform import files
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.platform.jobs.service import code_version
+from app.study import access
 from app.study import repository as study_repository
-from app.study import service as study
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.participants import Participant, SettingsVersion
 from ml.policies.onnx_policy import MAX_FILE_BYTES, OnnxPolicy, PolicyFileError
@@ -66,7 +66,7 @@ def add_external(db: Session, participant: Participant, name: str, content: byte
     Raises:
         Invalid: the file is no such policy; says what is wrong with it. Conflict: the name is taken.
     """
-    study.require(caller, can.WRITE_POLICIES, participant)
+    access.require(caller, can.WRITE_POLICIES, participant)
     settings = participant.current_settings
     newest = repository.newest_snapshot(db, participant.id)
     probe = probe_windows(newest, settings) if newest and _window_of(db, newest) == settings.window else None
@@ -107,8 +107,8 @@ def retire(db: Session, participant: Participant, policy: Policy, reason: str | 
     Raises:
         NotFound: the policy is another participant's. Forbidden: the caller may not change policies.
     """
-    study.require(caller, can.WRITE_POLICIES, participant)
-    study.require_own(participant, policy, f"policy {policy.id}")
+    access.require(caller, can.WRITE_POLICIES, participant)
+    access.require_own(participant, policy, f"policy {policy.id}")
     policy.retired_reason = (reason or "").strip() or None
     set_reason(db, policy.retired_reason)
     db.flush()

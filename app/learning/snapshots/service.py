@@ -26,15 +26,15 @@ from app.learning.snapshots.trajectories import trajectory_of
 from app.platform import files
 from app.platform.errors import Invalid
 from app.platform.kept import kept
-from app.study import blinding
+from app.study import access, blinding
 from app.study import repository as study_repository
-from app.study import service as study
 from app.study.doses.since import hours_since_dose
 from app.study.sessions import repository as session_repository
 from app.study.sessions.data import failed_qoc_of, session_data
 from app.study.sessions.programming import Difference, Program, differences, stored
 from app.study.sessions.repeated import counts_elsewhere
-from app.study.threshold import mdp_settings, suggest_xi_beta
+from app.study.settings.service import mdp_settings
+from app.study.threshold import suggest_xi_beta
 from app.study.traces import StepTable, TracesOf, traces_of
 from app.tables.learning import BufferSnapshot, SnapshotSession
 from app.tables.participants import CharacteristicsVersion, Hemisphere, Participant, SettingsVersion
@@ -199,7 +199,7 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
     Raises:
         Invalid: as `collect`. Forbidden: the caller may not run jobs.
     """
-    study.require(caller, can.RUN_JOBS, participant)
+    access.require(caller, can.RUN_JOBS, participant)
     found = collect(db, participant)
     known = repository.snapshot_by_pins(db, participant.id, found.pins_sha256)
     if known is not None:

@@ -16,7 +16,7 @@ from app.pipeline import service as pipeline
 from app.pipeline.next_generation.parents import Tested, best, posterior_of, tested_policies
 from app.pipeline.params import NEXT_GENERATION, NextGenerationParams
 from app.platform.jobs import repository as jobs
-from app.study import service as study
+from app.study import access
 from app.tables.evaluations import Evaluation
 from app.tables.jobs import Job, JobStatus
 from app.tables.participants import Participant
@@ -47,7 +47,7 @@ class Outlook:
 
 def outlook(db: Session, participant: Participant, caller: Caller) -> Outlook:
     """Collect what the page shows before a generation is started. Raises Forbidden for callers who may not run jobs."""
-    study.require(caller, can.RUN_JOBS, participant)
+    access.require(caller, can.RUN_JOBS, participant)
     newest = evaluation.newest_evaluation(db, participant.id)
     current = newest is not None and not stale_reasons(db, participant, newest)
     rows, _ = jobs.find(db, participant.id, NEXT_GENERATION, jobs.LIVE, limit=1)
@@ -70,7 +70,7 @@ def start(db: Session, participant: Participant, params: NextGenerationParams, c
     Raises:
         Forbidden: the caller may not run jobs. Invalid: no policy that could be trained further was tested, or no usable session.
     """
-    study.require(caller, can.RUN_JOBS, participant)
+    access.require(caller, can.RUN_JOBS, participant)
     # two clicks at once: the second waits here and finds the job of the first
     learning.lock_participant(db, participant.id)
     found = outlook(db, participant, caller)

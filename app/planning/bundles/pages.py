@@ -28,8 +28,8 @@ from app.platform.web import numbers
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.settings import get_settings
+from app.study.access import may
 from app.study.deps import CurrentParticipant, CurrentVisit, ResultsViewed
-from app.study.service import may
 from app.tables.learning import Policy
 from app.tables.participants import Hemisphere, Participant
 from ml.deploy.ports.answers import MAX_BYTES

@@ -13,7 +13,7 @@ from app.planning.bundles import repository
 from app.planning.bundles.service import FOREIGN
 from app.platform import files
 from app.platform.errors import Conflict, Invalid, NotFound, TooLarge
-from app.study import service as study
+from app.study import access
 from app.tables.learning import Policy
 from app.tables.participants import Participant
 from app.tables.plans import PortCheck as PortCheckRow
@@ -42,8 +42,8 @@ def add_check(
         Forbidden: the caller may not take bundles. Conflict: no bundle of the policy with port vectors was taken.
         Invalid: the table cannot be used, or no target is named. NotFound: no such bundle of this policy.
     """
-    study.require(caller, can.TAKE_BUNDLES, participant)
-    study.require_own(participant, policy, f"policy {policy.id}")
+    access.require(caller, can.TAKE_BUNDLES, participant)
+    access.require_own(participant, policy, f"policy {policy.id}")
     if not target.strip():
         raise Invalid("The check needs a name of the copy.", "Say what was converted, by what: 'TFLite, onnx2tf 1.29.24'.", field="target")
     if len(table) > MAX_BYTES:

@@ -30,9 +30,8 @@ from app.platform import files
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.settings import get_settings
-from app.study import cdbs_amplitude
+from app.study import access, cdbs_amplitude
 from app.study import repository as study_repository
-from app.study import service as study
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.participants import Hemisphere, Participant
 from app.tables.plans import BundleRelease
@@ -106,7 +105,7 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
         Invalid: the cDBS amplitude or the unit of beta is not known, limits that contradict each other, or leave the stimulator's own.
         Conflict: as `refuse_after_events`. Forbidden: the caller may only read.
     """
-    study.require(caller, can.TAKE_BUNDLES, participant)
+    access.require(caller, can.TAKE_BUNDLES, participant)
     refuse_after_events(db, participant, policy)
     manifest, windows = manifest_of(db, participant, policy, limits, hemisphere, caller)
     content = content_of(manifest, windows, policy, caller.label if limits.stated else None)
@@ -234,7 +233,7 @@ def _in_child(policy: Policy, manifest: BundleManifest, windows: Tried, target: 
 
 def may_take(participant: Participant, caller: Caller) -> bool:
     """Whether somebody may take a bundle and state its limits."""
-    return study.may(caller, can.TAKE_BUNDLES, participant)
+    return access.may(caller, can.TAKE_BUNDLES, participant)
 
 
 def approvals(db: Session, participant_id: int, policy_id: int) -> tuple[Approval, ...]:
@@ -255,7 +254,7 @@ def manifest_of(
     db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
 ) -> tuple[BundleManifest, Tried]:
     """What the bundle says about itself, and the beta windows that it is tried on: logged ones, where there are any of its length."""
-    study.require_own(participant, policy, f"policy {policy.id}")
+    access.require_own(participant, policy, f"policy {policy.id}")
     version = study_repository.settings_version(db, policy.settings_version_id)
     snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id else None
     data = snapshot or learning.newest_snapshot(db, participant.id)

@@ -23,7 +23,7 @@ from app.planning.plans.visits import today
 from app.planning.sheet.content import BUNDLE, card_of
 from app.platform import files
 from app.platform.errors import Conflict, Invalid, NotFound
-from app.study import service as study
+from app.study import access
 from app.study.adverse_events.repository import with_blocking_events
 from app.tables.audit import Signature
 from app.tables.participants import Hemisphere
@@ -48,7 +48,7 @@ def bundle(db: Session, visit: Visit, position: int, caller: Caller, at: datetim
         NotFound: no plan, or no such session. Conflict: the plan may not run, the visit has no date or is past, or the session has no
             bundle, as one without stimulation. Invalid: it cannot be made. Forbidden: the caller may only read.
     """
-    study.require(caller, can.TAKE_BUNDLES, visit.participant)
+    access.require(caller, can.TAKE_BUNDLES, visit.participant)
     view = read_plan(db, visit, caller)
     signature = runnable(view, at.date() if at else None)
     line = next((line for line in view.lines if line.item.position == position), None)

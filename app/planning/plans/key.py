@@ -12,7 +12,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
-from app.study import service as study
+from app.study import access
 from app.tables.plans import Plan, PlanItem
 from app.tables.visits import Visit
 
@@ -56,7 +56,7 @@ def open_key(db: Session, visit: Visit, plan: Plan, caller: Caller, reason: str,
         Forbidden: the caller may not open keys. Conflict: the plan is not blinded, not signed, or open already.
         Invalid: no reason, and no emergency.
     """
-    study.require(caller, can.OPEN_KEY, visit.participant)
+    access.require(caller, can.OPEN_KEY, visit.participant)
     if not sealed(plan):
         why = "is not blinded" if not plan.blinded else "is not signed yet" if plan.approved_at is None else "has an open key already"
         raise Conflict(f"Plan {plan.id} of visit {visit.number} {why}.", "Load the page again.")
@@ -75,7 +75,7 @@ def give_reason(db: Session, visit: Visit, plan: Plan, caller: Caller, reason: s
     Raises:
         Forbidden: the caller may not open keys. Conflict: a reason stands, or nothing was opened. Invalid: no reason.
     """
-    study.require(caller, can.OPEN_KEY, visit.participant)
+    access.require(caller, can.OPEN_KEY, visit.participant)
     if plan.key_opened_at is None or plan.key_opened_reason is not None:
         raise Conflict(f"Plan {plan.id} of visit {visit.number} waits for no reason.", "Load the page again.")
     if not reason.strip():

@@ -27,8 +27,8 @@ from app.platform.errors import BetaloopError, NotFound
 from app.platform.web.forms import FormValues, field_notes, parse, renamed
 from app.platform.web.schemas import Int, Model, PagingQuery
 from app.platform.web.templates import Part, make_part, render
+from app.study.access import may, require
 from app.study.deps import CurrentParticipant, CurrentVisit, VisitViewed
-from app.study.service import may, require
 from app.tables.participants import Participant
 from app.tables.sessions import Controller
 from app.tables.visits import Visit

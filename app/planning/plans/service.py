@@ -29,7 +29,7 @@ from app.planning.releases import service as releases
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.platform.signatures.service import SignatureState
-from app.study import service as study
+from app.study import access
 from app.study.sessions.logged import CONTROLLER_OF_KIND
 from app.tables.evaluations import Evaluation
 from app.tables.learning import Policy
@@ -50,7 +50,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
             held near an amplitude that the participant's bound forbids, or what `safeguards` refuses.
     """
     participant = visit.participant
-    study.require(caller, can.DRAFT_PLAN, participant)
+    access.require(caller, can.DRAFT_PLAN, participant)
     chosen = testable_policies(db, participant, draft.policy_ids)
     held = sum(wish.sessions for wish in draft.held)
     rules = replace(rules_of(draft), held_sessions=held, block=repository.earlier_planned_visits(db, visit))
@@ -59,7 +59,7 @@ def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> Plan
     evaluation = _evaluation(db, participant, draft.evaluation_id)
     found = grounds(db, participant, evaluation)
     overrides, limits = {o.policy_id: o.reason for o in draft.overrides}, {v.policy_id: v.min_fraction for v in draft.limits}
-    guarded = safeguards(found, chosen, overrides, limits, may_override=study.may(caller, can.SIGN_PLAN, participant))
+    guarded = safeguards(found, chosen, overrides, limits, may_override=access.may(caller, can.SIGN_PLAN, participant))
     repository.lock_visit(db, visit.id)
     _supersede(db, visit, draft.reason, caller)
     plan = Plan(
@@ -112,7 +112,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
             or what `safeguards.refuse_approval` or `releases.refuse_unreleased` refuse.
         Invalid: no cDBS amplitude by which limits are ones in milliamperes. Forbidden, TooMany: as `sign_off.sign_plan`.
     """
-    study.require(caller, can.SIGN_PLAN, visit.participant)
+    access.require(caller, can.SIGN_PLAN, visit.participant)
     repository.lock_visit(db, visit.id)
     view = read_plan(db, visit, caller)
     plan = view.plan
@@ -189,7 +189,7 @@ def reorder(db: Session, visit: Visit, move: Move, caller: Caller) -> PlanView:
         NotFound: no plan. Conflict: it is signed. Invalid: no tested session stands there, there are not so many before or after it, or
             two policies would follow one another without a cDBS session between them.
     """
-    study.require(caller, can.DRAFT_PLAN, visit.participant)
+    access.require(caller, can.DRAFT_PLAN, visit.participant)
     repository.lock_visit(db, visit.id)
     plan = read_plan(db, visit, caller).plan
     if plan.status != "draft":
@@ -241,7 +241,7 @@ def _supersede(db: Session, visit: Visit, reason: str | None, caller: Caller) ->
     if earlier is None:
         return
     if earlier.status == "approved":
-        study.require(caller, can.SIGN_PLAN, visit.participant)
+        access.require(caller, can.SIGN_PLAN, visit.participant)
         if sealed(earlier) and repository.has_sessions(db, visit.id):
             raise Conflict(
                 f"Sessions of visit {visit.number} ran under blinded plan {earlier.id}, whose key is sealed.",

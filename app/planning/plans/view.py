@@ -29,7 +29,7 @@ from app.planning.wording import ANSWER_EVENT, happened
 from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
 from app.platform.signatures.service import SignatureState
 from app.platform.web.templates import Part, make_part
-from app.study import service as study
+from app.study import access
 from app.study.adverse_events.service import Events
 from app.study.characteristics.service import fields_of
 from app.tables.audit import Signature
@@ -91,7 +91,7 @@ class PlanView:
 
 def read_plan(db: Session, visit: Visit, caller: Caller) -> PlanView:
     """The plan of a visit. Raises NotFound when there is none."""
-    study.require(caller, can.READ, visit.participant)
+    access.require(caller, can.READ, visit.participant)
     plan = repository.live_plan(db, visit.id)
     if plan is None:
         raise NotFound(

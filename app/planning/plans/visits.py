@@ -11,8 +11,9 @@ from app.accounts.permissions import Caller
 from app.planning.plans import repository
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
-from app.study import service as study
+from app.study import access
 from app.study.schemas import VisitIn
+from app.study.visits import changes as visits
 from app.study.visits.service import require_unlocked
 from app.tables.participants import Participant
 from app.tables.visits import Visit
@@ -48,7 +49,7 @@ def visit_for_draft(
         raise Invalid("No visit is chosen.", "Choose an open visit, or name the number and the date of a new one.")
     if day is None:
         raise Invalid(f"The new visit {number} has no date.", "Give the day on which the participant comes.", field="visit_date")
-    return study.add_visit(db, participant, VisitIn(number=number, date=day), caller)
+    return visits.add_visit(db, participant, VisitIn(number=number, date=day), caller)
 
 
 def remove_visit(db: Session, visit: Visit, reason: str, caller: Caller) -> None:
@@ -58,7 +59,7 @@ def remove_visit(db: Session, visit: Visit, reason: str, caller: Caller) -> None
         Conflict: it is locked, has sessions (proposed ones too), doses, adverse events or data queries, or a plan of it was once signed.
         Invalid: no reason.
     """
-    study.require(caller, can.WRITE_STUDY, visit.participant)
+    access.require(caller, can.WRITE_STUDY, visit.participant)
     if not reason.strip():
         raise Invalid("A reason is missing.", "Say why the visit is removed; it stands in the audit trail.")
     repository.lock_visit(db, visit.id)

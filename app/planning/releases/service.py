@@ -17,8 +17,8 @@ from app.platform.errors import Conflict, Forbidden
 from app.platform.signatures import repository as signatures
 from app.platform.signatures.service import SignatureState, state_of
 from app.settings import get_settings
+from app.study import access
 from app.study import repository as study_repository
-from app.study import service as study
 from app.tables.audit import Signature
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.participants import Hemisphere, Participant
@@ -69,8 +69,8 @@ def release(
         Conflict: a retired policy, or as `bundles.refuse_after_events`. Invalid: limits that contradict each other or leave the
             stimulator's own; a damaged file; or nobody has stated the cDBS amplitude or the unit of beta.
     """
-    study.require(caller, can.RELEASE, participant)
-    study.require_own(participant, policy, f"policy {policy.id}")
+    access.require(caller, can.RELEASE, participant)
+    access.require_own(participant, policy, f"policy {policy.id}")
     if policy.retired_reason:
         raise Conflict(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", "Take it back first, or release another one.")
     bundles.refuse_after_events(db, participant, policy)

@@ -21,8 +21,8 @@ from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues
 from app.platform.web.templates import render
 from app.settings import get_settings
+from app.study.access import may
 from app.study.deps import CurrentVisit, VisitViewed
-from app.study.service import may
 from app.tables.visits import Visit
 
 router = APIRouter()

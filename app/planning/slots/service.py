@@ -22,7 +22,7 @@ from app.planning.visit_day import repository as clinic_day
 from app.planning.visit_day.record import SlotTimes, times_of
 from app.planning.visit_day.session_outcomes import differences, take_outcomes
 from app.platform.errors import BetaloopError, Conflict
-from app.study import service as study
+from app.study import access
 from app.study.blinding import require_known, stated_arm
 from app.study.sessions import logged
 from app.study.sessions.contradictions import control_recording
@@ -127,7 +127,7 @@ def confirm(db: Session, visit: Visit, caller: Caller, *, other_day: bool = Fals
         Conflict: nothing is found to confirm, the visit is locked, or sessions of another day and nobody said that they are meant.
         Invalid, Conflict: as confirming a proposal does, with the session's number.
     """
-    study.require(caller, can.WRITE_STUDY, visit.participant)
+    access.require(caller, can.WRITE_STUDY, visit.participant)
     require_unlocked(visit)
     found = compare(db, visit, caller)
     if not found.waiting:

@@ -10,10 +10,10 @@ from app.planning.plans.key import common_limits, sealed
 from app.planning.visit_day.schemas import DayDoseOut, DayOut, EntryOut, LimitsOut, SlotOut
 from app.planning.visit_day.service import Day
 from app.platform.database import now
-from app.study import service as study
+from app.study import access
+from app.study.access import may
 from app.study.blinding import CONTROLLER_NAMES, may_know
 from app.study.characteristics.service import fields_of
-from app.study.service import may
 from app.tables.plans import PlanItem
 from app.tables.sessions import Controller
 
@@ -41,7 +41,7 @@ def day_out(day: Day, caller: Caller) -> DayOut:
         planned_doses=fields_of(visit.participant.current_characteristics).medication,
         reader=caller.label,
         may_enter=may(caller, can.WRITE_QOC, visit.participant) and not visit.locked,
-        may_dose=may(caller, can.WRITE_STUDY, visit.participant) and not visit.locked and visit.participant.status != study.WITHDRAWN,
+        may_dose=may(caller, can.WRITE_STUDY, visit.participant) and not visit.locked and visit.participant.status != access.WITHDRAWN,
         server_time=now(),
     )
 

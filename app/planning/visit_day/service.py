@@ -25,7 +25,7 @@ from app.planning.visit_day.session_outcomes import is_stop, locked_session, sto
 from app.platform.database import now
 from app.platform.errors import BetaloopError, Conflict, Forbidden, Invalid, NotFound
 from app.settings import get_settings
-from app.study import service as study
+from app.study import access
 from app.study.adverse_events import repository as events
 from app.study.adverse_events.schemas import AdverseEventIn
 from app.study.adverse_events.service import add_adverse_event, take_back_entry
@@ -68,7 +68,7 @@ class DeviceKey:
 
 def read_day(db: Session, visit: Visit, caller: Caller) -> Day:
     """The clinic day of a visit. Raises NotFound without a plan, Conflict where it is not approved."""
-    study.require(caller, can.READ, visit.participant)
+    access.require(caller, can.READ, visit.participant)
     plan = plans.live_plan(db, visit.id)
     if plan is None:
         raise NotFound(f"Visit {visit.number} has no plan, and so nothing to run.", "Draft a plan and have it approved.")
@@ -88,7 +88,7 @@ def add_entries(db: Session, visit: Visit, plan_id: int, entries: Sequence[Entry
     Raises:
         NotFound: the visit never had this plan approved. Forbidden: the caller may only read.
     """
-    study.require(caller, can.WRITE_QOC, visit.participant)
+    access.require(caller, can.WRITE_QOC, visit.participant)
     plan = repository.plan_of_visit(db, visit.id, plan_id)
     if plan is None:
         raise NotFound(f"Visit {visit.number} has no approved plan {plan_id}.", "Load the page of the day again.")

@@ -16,12 +16,12 @@ from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.study import repository as study_repository
+from app.study.access import may
 from app.study.adverse_events import repository, service
 from app.study.adverse_events.deps import CurrentEvent
 from app.study.adverse_events.schemas import AdverseEventChange, AdverseEventIn, ClearanceIn
+from app.study.adverse_events.words import EVENT_KINDS, EVENT_SEVERITIES
 from app.study.deps import CurrentParticipant, ResultsViewed
-from app.study.service import may
-from app.study.wording import EVENT_KINDS, EVENT_SEVERITIES
 from app.tables.participants import Participant
 
 router = APIRouter()

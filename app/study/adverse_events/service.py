@@ -14,9 +14,8 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, about
-from app.study import blinding
+from app.study import access, blinding
 from app.study import repository as study_repository
-from app.study import service as study
 from app.study.adverse_events import repository
 from app.study.adverse_events.schemas import AdverseEventChange, AdverseEventFields, AdverseEventIn
 from app.tables.adverse_events import AdverseEvent, AdverseEventRevision, Severity
@@ -41,7 +40,7 @@ def add_adverse_event(db: Session, participant: Participant, draft: AdverseEvent
         Invalid: the session is of another visit, or has a policy of its own. Conflict: the session is a proposal, or the key belongs to
             an entry that says something else.
     """
-    study.require(caller, can.WRITE_QOC, participant)
+    access.require(caller, can.WRITE_QOC, participant)
     if draft.entry_key is not None and (known := repository.event_by_key(db, participant.id, draft.entry_key)):
         return _same(known, draft)
     visit_id = _checked_visit(db, participant, draft, caller)
@@ -71,7 +70,7 @@ def change_adverse_event(db: Session, event: AdverseEvent, change: AdverseEventC
     Raises:
         Forbidden: the caller may not correct the study's data. Conflict: somebody else changed it. Invalid: no reason.
     """
-    study.require(caller, can.WRITE_STUDY, event.participant)
+    access.require(caller, can.WRITE_STUDY, event.participant)
     return _follow(db, event, change.revision, change.reason, caller, change, None)
 
 
@@ -81,7 +80,7 @@ def take_back_entry(db: Session, event: AdverseEvent, reason: str, caller: Calle
     Raises:
         Forbidden: the caller may not enter outcomes.
     """
-    study.require(caller, can.WRITE_QOC, event.participant)
+    access.require(caller, can.WRITE_QOC, event.participant)
     if event.now.revision == 1:
         none = AdverseEventFields(kind=event.now.kind, severity=Severity.NONE, serious=False, note=event.now.note)
         _follow(db, event, 1, reason, caller, none, None)
@@ -97,7 +96,7 @@ def clear_adverse_event(db: Session, event: AdverseEvent, revision: int, reason:
         Forbidden: the caller approves no plans of this participant. Conflict: it does not block, or somebody changed it.
         Invalid: no reason.
     """
-    study.require(caller, can.CLEAR_EVENT, event.participant)
+    access.require(caller, can.CLEAR_EVENT, event.participant)
     if not event.blocks:
         why = "not serious" if event.now.cleared_reason is None else "cleared already"
         raise Conflict(f"Adverse event {event.id} is {why}.", "Nothing waits for it.")
@@ -135,11 +134,11 @@ def _checked_visit(db: Session, participant: Participant, draft: AdverseEventIn,
     if draft.session_id is None:
         if draft.visit_id is not None:
             with about("visit_id"):
-                study.require_own(participant, study_repository.visit(db, draft.visit_id, caller), f"visit {draft.visit_id}")
+                access.require_own(participant, study_repository.visit(db, draft.visit_id, caller), f"visit {draft.visit_id}")
         return draft.visit_id
     with about("session_id"):
         session = study_repository.session(db, draft.session_id, caller)
-        study.require_own(participant, session.visit, f"session {draft.session_id}")
+        access.require_own(participant, session.visit, f"session {draft.session_id}")
     if session.status == "proposed":
         raise Conflict(
             f"Session {session.id} is a proposal that nobody has confirmed yet.",

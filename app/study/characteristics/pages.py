@@ -13,13 +13,14 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, field_notes
 from app.platform.web.templates import render
+from app.study.access import may
 from app.study.characteristics import form, service
 from app.study.characteristics.schemas import MOST_DOSES, MOST_LEADS
+from app.study.characteristics.words import SYMPTOMS, TARGETS, characteristics_words
 from app.study.deps import CurrentParticipant
+from app.study.doses.words import DRUG_NAMES
 from app.study.form_changes import reason_of
-from app.study.service import may
 from app.study.settings.form import history_of
-from app.study.wording import DRUG_NAMES, SYMPTOMS, TARGETS, characteristics_words
 from app.tables.participants import Participant
 
 router = APIRouter()

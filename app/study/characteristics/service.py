@@ -9,8 +9,8 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
+from app.study import access
 from app.study import repository as study_repository
-from app.study import service as study
 from app.study.characteristics import repository
 from app.study.characteristics.schemas import CharacteristicsFields
 from app.study.outcomes import service as outcomes
@@ -34,7 +34,7 @@ def change_characteristics(
         Forbidden: the caller enters no data of this participant. Conflict: somebody else was faster.
         Invalid: no reason, or nothing was ever stated.
     """
-    study.require(caller, can.WRITE_STUDY, participant)
+    access.require(caller, can.WRITE_STUDY, participant)
     current = participant.current_characteristics
     if seen != (current.version if current else 0):
         raise Conflict("Somebody else changed these characteristics after you opened them; nothing was saved.", "Load them again.")

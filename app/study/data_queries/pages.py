@@ -16,13 +16,13 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
+from app.study.access import may
 from app.study.data_queries import repository, service
 from app.study.data_queries.deps import CurrentDataQuery
 from app.study.data_queries.fields import FIELDS
 from app.study.data_queries.schemas import DataQueryEntryIn, DataQueryIn
+from app.study.data_queries.words import ASKED_ABOUT, QUERIED_FIELDS
 from app.study.deps import CurrentParticipant
-from app.study.service import may
-from app.study.wording import ASKED_ABOUT, QUERIED_FIELDS
 from app.tables.data_queries import OF_PARTICIPANT, DataQuery, QueryState, Subject
 from app.tables.participants import Participant
 

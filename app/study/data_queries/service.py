@@ -11,8 +11,8 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.errors import Conflict, Invalid, NotFound, about
+from app.study import access
 from app.study import repository as study_repository
-from app.study import service as study
 from app.study.adverse_events import repository as events
 from app.study.data_queries import repository
 from app.study.data_queries.fields import Found, value_of
@@ -33,7 +33,7 @@ def ask(db: Session, participant: Participant, draft: DataQueryIn, caller: Calle
     Raises:
         Forbidden: the caller may not ask. NotFound: what is asked about is not the participant's. Invalid: nothing was asked.
     """
-    study.require(caller, can.ASK_QUERIES, participant)
+    access.require(caller, can.ASK_QUERIES, participant)
     named = {f"{s.value}_id": getattr(draft, f"{s.value}_id") for s in Subject if s not in OF_PARTICIPANT}
     row = DataQuery(participant_id=participant.id, participant=participant, record=draft.record, field=draft.field, **named)
     with about("record" if draft.record else f"{draft.subject.value}_id"):
@@ -53,7 +53,7 @@ def follow(db: Session, query: DataQuery, given: DataQueryEntryIn, caller: Calle
         Forbidden: the caller may not. Conflict: somebody said something meanwhile, or the query is closed or answered already.
         Invalid: nothing was said.
     """
-    study.require(caller, can.WRITE_STUDY if given.state is QueryState.ANSWERED else can.ASK_QUERIES, query.participant)
+    access.require(caller, can.WRITE_STUDY if given.state is QueryState.ANSWERED else can.ASK_QUERIES, query.participant)
     repository.lock_query(db, query)
     if len(query.entries) != given.entries:
         raise Conflict(f"{query.entries[-1].entered_by} said something to data query {query.id} after you opened it.", "Load it again.")
@@ -79,14 +79,14 @@ def _found(db: Session, query: DataQuery, caller: Caller) -> Found:
     what = f"{query.subject.value} {number}"
     if query.subject is Subject.SESSION:
         session = study_repository.session(db, number, caller)
-        study.require_own(participant, session.visit, what)
+        access.require_own(participant, session.visit, what)
         return session
     if query.subject is Subject.VISIT:
         visit = study_repository.visit(db, number, caller)
-        study.require_own(participant, visit, what)
+        access.require_own(participant, visit, what)
         return visit
     if query.subject is Subject.EVENT:
         event = events.event(db, number, caller)
-        study.require_own(participant, event, what)
+        access.require_own(participant, event, what)
         return event
     return repository.dose_of(db, participant.id, number) if query.subject is Subject.DOSE else None

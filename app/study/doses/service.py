@@ -11,7 +11,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
-from app.study import service as study
+from app.study import access
 from app.study.doses.drugs import DRUGS
 from app.study.doses.schemas import DoseIn
 from app.study.visits.service import require_unlocked
@@ -31,8 +31,8 @@ def add_dose(db: Session, visit: Visit, draft: DoseIn, caller: Caller) -> Dose:
             what else was done in the transaction stays.
         Invalid: a time that is not near the visit's day, or has not come yet.
     """
-    study.require(caller, can.WRITE_STUDY, visit.participant)
-    study.refuse_withdrawn(visit.participant)
+    access.require(caller, can.WRITE_STUDY, visit.participant)
+    access.refuse_withdrawn(visit.participant)
     require_unlocked(visit)
     _check_time(visit, draft.taken_at)
     row = Dose(visit_id=visit.id, entered_by=caller.label, **draft.model_dump())
@@ -55,7 +55,7 @@ def remove_dose(db: Session, dose: Dose, visit: Visit, reason: str, caller: Call
     Raises:
         Forbidden: the caller enters no data. Conflict: the visit is locked. Invalid: no reason.
     """
-    study.require(caller, can.WRITE_STUDY, visit.participant)
+    access.require(caller, can.WRITE_STUDY, visit.participant)
     require_unlocked(visit)
     if not reason.strip():
         raise Invalid("A reason is missing.", "Say why the dose is taken back; the audit trail keeps it.", field="reason")

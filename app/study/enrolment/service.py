@@ -10,11 +10,12 @@ from app.accounts import studies
 from app.accounts.permissions import Caller
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
-from app.study import repository, wording
-from app.study.enrolment import codes
+from app.study import repository
+from app.study.access import refuse_ended
+from app.study.enrolment import codes, words
 from app.study.enrolment.schemas import ParticipantIn
 from app.study.margins.schemas import MarginsFields
-from app.study.service import add_settings, refuse_ended
+from app.study.settings.service import add_settings
 from app.study.usual.questions import require_sure
 from app.tables.accounts import Site
 from app.tables.participants import MarginsVersion, Participant
@@ -38,10 +39,10 @@ def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
     refuse_ended(site)
     asked = codes.questions(studies.require_own(db, site.study, draft.code), now().date())
     if asked and not draft.is_study_code:
-        told = wording.code_questions(draft.code, asked)
-        raise Invalid(told, wording.CODE_HINT, questions=[{"code": q.value, "text": wording.CODE_QUESTIONS[q]} for q in asked])
+        told = words.code_questions(draft.code, asked)
+        raise Invalid(told, words.CODE_HINT, questions=[{"code": q.value, "text": words.CODE_QUESTIONS[q]} for q in asked])
     if asked:
-        set_reason(db, wording.CODE_CONFIRMED)
+        set_reason(db, words.CODE_CONFIRMED)
     require_sure(draft.settings.model_dump(exclude_unset=True), draft.sure)
     participant = Participant(site_id=site.id, code=draft.code)
     db.add(participant)

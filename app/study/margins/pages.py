@@ -13,11 +13,11 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, field_notes, parse, renamed
 from app.platform.web.templates import render
+from app.study.access import may
 from app.study.deps import CurrentParticipant
 from app.study.form_changes import Shown, own_changes, reason_of
 from app.study.margins import service, sign_off
 from app.study.margins.schemas import MarginsIn, MarginsLockFields
-from app.study.service import may
 from app.study.settings.form import SettingField, SettingGroup, history, texts
 from app.tables.participants import Participant
 from ml.outcomes import OUTCOMES

@@ -9,7 +9,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
-from app.study import service as study
+from app.study import access
 from app.study.margins import sign_off
 from app.study.margins.schemas import MarginsIn
 from app.tables.participants import MarginsLock, MarginsVersion, Participant
@@ -28,7 +28,7 @@ def change_margins(db: Session, participant: Participant, change: MarginsIn, rea
     Raises:
         Invalid: no reason. Forbidden: the caller approves no plans of this participant. Conflict: somebody else was faster.
     """
-    study.require(caller, can.SET_MARGINS, participant)
+    access.require(caller, can.SET_MARGINS, participant)
     current = participant.current_margins
     values = {name: getattr(current, name) for name in MarginsIn.model_fields} | change.model_dump(exclude_unset=True)
     if all(getattr(current, name) == value for name, value in values.items()):
@@ -61,7 +61,7 @@ def lock_margins(
         Invalid: no reason. Forbidden: the caller approves no plans of this participant, or as `app.accounts.sign_on`, as TooMany is.
             Conflict: newer margins are there, or these are locked already.
     """
-    study.require(caller, can.SET_MARGINS, participant)
+    access.require(caller, can.SET_MARGINS, participant)
     current = participant.current_margins
     if current.version != version:
         raise Conflict(f"The present margins are version {current.version}, not {version}.", "Look at them and lock again.")

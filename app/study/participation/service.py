@@ -8,8 +8,8 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.jobs import service as jobs
+from app.study.access import WITHDRAWN, require
 from app.study.participation.schemas import StatusChange
-from app.study.service import WITHDRAWN, require
 from app.tables.participants import Participant
 
 

@@ -12,7 +12,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
-from app.study import blinding, repository, service
+from app.study import access, blinding, repository
 from app.study.schemas import ConditionsChange, ConditionsFields
 from app.study.sessions import designs, logged, programming
 from app.study.traces import StepTable, driving, step_table
@@ -60,7 +60,7 @@ def change(db: Session, session: StudySession, wanted: ConditionsChange, caller:
         Conflict: a proposal, which has none yet, or a locked visit.
         Invalid: B, W or period taken back, or a lower limit above the upper one.
     """
-    service.require(caller, can.WRITE_STUDY, session.visit.participant)
+    access.require(caller, can.WRITE_STUDY, session.visit.participant)
     if session.status != "confirmed":
         raise Conflict(f"Session {session.id} is a proposal that nobody has confirmed yet.", "Confirm it first; then state its conditions.")
     require_unlocked(session.visit)

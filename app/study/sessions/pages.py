@@ -18,8 +18,9 @@ from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.numbers import typed
 from app.platform.web.templates import render
-from app.study import repository, service
+from app.study import access, repository
 from app.study.adverse_events.repository import events_of_session
+from app.study.adverse_events.words import EVENT_KINDS, EVENT_SEVERITIES
 from app.study.blinding import CONTROLLER_NAMES, arm, may_know, require_known
 from app.study.data_queries.repository import not_closed_of_session
 from app.study.deps import CurrentSession, SessionViewed
@@ -27,15 +28,16 @@ from app.study.doses.since import since_last_dose
 from app.study.form_changes import Shown, own_changes
 from app.study.recordings import tablet
 from app.study.schemas import ConditionsChange, DerivedChoice, QocIn, SessionChange
+from app.study.sessions import changes as study_changes
 from app.study.sessions import conditions, designs
 from app.study.sessions import view as session_view
 from app.study.sessions.charts import beta_by_amplitude, in_chart_table, notes, operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.stimulation import beside, delivered
+from app.study.sessions.wording import ACTIVITIES, drawn_words, sentences
 from app.study.traces import NO_CONTROL, control_programs, session_offset_s
 from app.study.visits.blinded import blinded_page
-from app.study.wording import ACTIVITIES, EVENT_KINDS, EVENT_SEVERITIES, drawn_words, sentences
 from app.tables.outcomes import QocRevision
 from app.tables.recordings import Recording
 from app.tables.sessions import StudySession
@@ -126,10 +128,10 @@ def record_qoc(request: Request, session: CurrentSession, db: Db, caller: Curren
     changes = own_changes(values, seen, _qoc_revisions(session), _QOC_LABELS)
     reason = {"reason": str(values["reason"])} if "reason" in values else {}
     try:
-        service.require(caller, can.WRITE_QOC, session.visit.participant)
+        access.require(caller, can.WRITE_QOC, session.visit.participant)
         changes.refuse_conflicts()
         answers = {"sure": confirmed(values, changes.fields)}
-        service.record_qoc(db, session, parse(QocIn, changes.fields | reason | answers, _QOC_LABELS), caller)
+        study_changes.record_qoc(db, session, parse(QocIn, changes.fields | reason | answers, _QOC_LABELS), caller)
     except BetaloopError as error:
         db.rollback()
         if _on_blinded_page(session, caller):
@@ -149,7 +151,7 @@ def exclude(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
         if not include and not why:
             raise Invalid("An exclusion needs a reason.", "Say why the session shall not count.", field="excluded_reason")
         change = SessionChange(excluded_reason=None if include else why[:1000], reason="included again" if include else why[:1000])
-        service.change_session(db, session, change, caller)
+        study_changes.change_session(db, session, change, caller)
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, session, caller, error)
@@ -165,7 +167,7 @@ def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
     changes = own_changes(values, "0", [shown, present], _CORRECTION_LABELS)
     reason = str(values.get("reason", "")).strip()[:1000]
     try:
-        service.require(caller, can.WRITE_STUDY, session.visit.participant)
+        access.require(caller, can.WRITE_STUDY, session.visit.participant)
         changes.refuse_conflicts()
         fields: dict[str, Any] = {n: changes.fields[n] for n in _STATED if n in changes.fields} | {"reason": reason}
         if "policy" in changes.fields:
@@ -174,7 +176,7 @@ def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
         stream, _, channel = changes.fields.get("control", "").partition("\t")
         if stream:
             fields |= {"control_stream": stream, "control_channel": channel}
-        service.change_session(db, session, parse(SessionChange, fields, _CORRECTION_LABELS), caller)
+        study_changes.change_session(db, session, parse(SessionChange, fields, _CORRECTION_LABELS), caller)
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, session, caller, error, typed=changes.fields | {"correction_reason": reason})
@@ -188,7 +190,7 @@ def correct_conditions(request: Request, session: CurrentSession, db: Db, caller
     changes = own_changes(values, seen, _conditions_revisions(session), _CONDITIONS_LABELS)
     reason = str(values.get("conditions_reason", "")).strip()[:1000]
     try:
-        service.require(caller, can.WRITE_STUDY, session.visit.participant)
+        access.require(caller, can.WRITE_STUDY, session.visit.participant)
         require_known(session.visit, caller)  # before what is refused could tell
         changes.refuse_conflicts()
         labels = _CONDITIONS_LABELS | {"reason": "Reason"}
@@ -204,7 +206,7 @@ def take_derived(request: Request, session: CurrentSession, db: Db, caller: Curr
     """Put the value that the uploaded files give in the place of a typed one."""
     try:
         shown = parse(DerivedChoice, {"name": values.get("name", ""), "value": values.get("value", "")}, {"value": "Derived value"})
-        service.take_derived(db, session, shown, caller)
+        study_changes.take_derived(db, session, shown, caller)
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, session, caller, error)
@@ -228,7 +230,7 @@ def _correction(session: StudySession, caller: Caller) -> dict[str, str]:
 
 def _on_blinded_page(session: StudySession, caller: Caller) -> bool:
     """Whether the caller enters QoCs on the blinded page of the visit."""
-    return not may_know(session.visit, caller) and not service.may(caller, can.READ_ARMS, session.visit.participant)
+    return not may_know(session.visit, caller) and not access.may(caller, can.READ_ARMS, session.visit.participant)
 
 
 def _qoc_revisions(session: StudySession) -> list[Shown]:

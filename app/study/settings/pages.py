@@ -14,13 +14,15 @@ from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
 from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import render
-from app.study import service
+from app.study import access
+from app.study.access import may
 from app.study.deps import CurrentParticipant
 from app.study.form_changes import Shown, own_changes, reason_of
-from app.study.service import may
 from app.study.settings import form
+from app.study.settings import service as versions
 from app.study.settings.schemas import SettingsIn
-from app.study.threshold import SuggestedThreshold, suggest_xi_beta
+from app.study.settings.service import SuggestedThreshold
+from app.study.threshold import suggest_xi_beta
 from app.tables.participants import Participant
 
 log = structlog.get_logger()
@@ -42,10 +44,10 @@ def change_settings(request: Request, participant: CurrentParticipant, db: Db, c
     shown = [Shown(v.version, form.texts(v), v.created_by) for v in participant.settings]
     changes = own_changes(values, seen, shown, form.LABELS)
     try:
-        service.require(caller, can.WRITE_SETTINGS, participant)
+        access.require(caller, can.WRITE_SETTINGS, participant)
         changes.refuse_conflicts()
         wanted, sure = parse(SettingsIn, changes.fields, form.LABELS), confirmed(values, changes.fields)
-        row = service.change_settings(db, participant, wanted, reason_of(values), caller, sure)
+        row = versions.change_settings(db, participant, wanted, reason_of(values), caller, sure)
     except BetaloopError as error:
         db.rollback()
         typed = form.texts(participant.current_settings) | changes.fields

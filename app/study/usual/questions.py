@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from app.platform.errors import Invalid
-from app.study import wording
+from app.study.usual import words
 from app.study.usual.values import FAR, USUAL, Question, question
 
 
@@ -15,7 +15,7 @@ class Unusual(Invalid):
     """Values that a person has to confirm; `questions` has them."""
 
     def __init__(self, questions: Sequence[Question]) -> None:
-        super().__init__(wording.UNUSUAL, wording.UNUSUAL_HINT, questions=[_told(q) for q in questions])
+        super().__init__(words.UNUSUAL, words.UNUSUAL_HINT, questions=[_told(q) for q in questions])
         self.questions = tuple(questions)
 
 
@@ -47,4 +47,4 @@ def refuse(asked: Iterable[Question]) -> None:
 
 
 def _told(asked: Question) -> dict[str, Any]:
-    return {k: v for k, v in asdict(asked).items() if v is not None} | {"text": wording.unusual(asked)}
+    return {k: v for k, v in asdict(asked).items() if v is not None} | {"text": words.unusual(asked)}

@@ -14,7 +14,7 @@ from app.platform.errors import BetaloopError
 from app.platform.web.forms import field_notes
 from app.platform.web.templates import render
 from app.study import repository
-from app.study.service import may
+from app.study.access import may
 from app.tables.sessions import StudySession
 from app.tables.visits import Visit
 

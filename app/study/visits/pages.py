@@ -17,25 +17,26 @@ from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import Part, make_part, render
 from app.settings import get_settings
-from app.study import cdbs_amplitude, repository, service
+from app.study import access, cdbs_amplitude, repository
+from app.study.access import may
 from app.study.blinding import arm, may_know, visible_arm
 from app.study.deps import CurrentParticipant, CurrentVisit, ResultsViewed, VisitViewed
 from app.study.doses.serializers import dose_out
 from app.study.doses.since import since_last_dose
+from app.study.doses.words import DRUG_NAMES
 from app.study.form_changes import Shown, own_changes, reason_of
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
 from app.study.recordings import tablet
 from app.study.schemas import VisitIn
-from app.study.service import may
 from app.study.sessions import pages as session_pages
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.data import session_data
 from app.study.traces import TracesOf, traces_of
+from app.study.visits import changes as entering
 from app.study.visits import form, sign_off
 from app.study.visits import service as visit_locks
 from app.study.visits.blinded import blinded_page
-from app.study.wording import DRUG_NAMES
 from app.tables.participants import Participant
 from app.tables.sessions import StudySession
 from app.tables.visits import Visit
@@ -61,7 +62,7 @@ def visits(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
 @router.get("/participants/{code}/visits/new")
 def new_visit(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """The form of a new visit; the number is the next one."""
-    service.require(caller, can.WRITE_STUDY, participant)
+    access.require(caller, can.WRITE_STUDY, participant)
     rows, _ = repository.visits(db, participant.id, 1000, 0)
     draft = {"number": str(max((v.number for v in rows), default=0) + 1), "date": datetime.now(UTC).date().isoformat(), "note": ""}
     return _visit_form(request, participant, draft)
@@ -74,7 +75,7 @@ def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller:
     try:
         draft = parse(VisitIn, {name: values.get(name, "") for name in ("number", "date", "note")}, _VISIT_LABELS)
         draft.cdbs_amplitudes = form.amplitudes({n: typed[n] for n in _FIRST_PROGRAM if n in typed}, confirmed(values, typed))
-        visit = service.add_visit(db, participant, draft, caller)
+        visit = entering.add_visit(db, participant, draft, caller)
     except BetaloopError as error:
         db.rollback()
         return _visit_form(request, participant, typed, error)
@@ -112,10 +113,10 @@ def change_visit(request: Request, visit: CurrentVisit, db: Db, caller: CurrentC
     changes = own_changes(form.posted(values), "0", [seen, present], form.labels(present.fields))
     typed = changes.fields | {"reason": reason_of(values) or ""}
     try:
-        service.require(caller, can.WRITE_STUDY, visit.participant)
+        access.require(caller, can.WRITE_STUDY, visit.participant)
         changes.refuse_conflicts()
         sure = confirmed(values, {**present.fields, **changes.fields})
-        service.change_visit(db, visit, form.change(present.fields, changes.fields, typed["reason"], sure), caller)
+        entering.change_visit(db, visit, form.change(present.fields, changes.fields, typed["reason"], sure), caller)
     except BetaloopError as error:
         db.rollback()
         return shown_visit(request, db, visit, caller, typed, error)
@@ -163,7 +164,7 @@ def shown_visit(
         doses=[dose_out(row) for row in visit.doses],
         drugs=DRUG_NAMES,
         dose=dose,
-        may_dose=may(caller, can.WRITE_STUDY, visit.participant) and visit.participant.status != service.WITHDRAWN and not visit.locked,
+        may_dose=may(caller, can.WRITE_STUDY, visit.participant) and visit.participant.status != access.WITHDRAWN and not visit.locked,
         may_lock=may(caller, can.LOCK_VISIT, visit.participant),
         lock_reason=lock_reason,
         lock_meaning=sign_off.MEANING,

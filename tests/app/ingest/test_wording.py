@@ -8,7 +8,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.ingest import wording as ingest_wording
-from app.study import wording as study_wording
+from app.study.sessions import wording
 from app.study.sessions.contradictions import Kind
 
 TWO_SIDES = {"visit": "", "confirm": "false"}
@@ -50,9 +50,9 @@ def test_other_words_change_no_decision(client: TestClient, monkeypatch: pytest.
     monkeypatch.setattr(ingest_wording, "reason", lambda evidence: "reworded")
     monkeypatch.setattr(ingest_wording, "unreadable", lambda members: ["reworded" for _ in members])
     for kind in Kind:
-        monkeypatch.setitem(study_wording._SENTENCES, kind, lambda facts: "reworded")
+        monkeypatch.setitem(wording._SENTENCES, kind, lambda facts: "reworded")
     assert run(client, enrol("P9")) == plain
 
 
 def test_every_contradiction_has_words() -> None:
-    assert set(study_wording._SENTENCES) == set(Kind)
+    assert set(wording._SENTENCES) == set(Kind)

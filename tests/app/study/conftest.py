@@ -10,12 +10,13 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.study import blinding, repository, service
+from app.study import blinding, repository
 from app.study.enrolment import service as enrolment
 from app.study.enrolment.schemas import ParticipantIn
 from app.study.schemas import VisitIn
 from app.study.settings.schemas import SettingsIn
 from app.study.traces import pack
+from app.study.visits import changes as visits
 from app.tables.participants import Hemisphere
 from app.tables.recordings import Device, Recording, Trace
 from app.tables.sessions import Controller, SessionSegment, StudySession
@@ -30,7 +31,7 @@ def study_session(db: Session) -> StudySession:
     """A confirmed session of 10 minutes from 09:00 UTC on, of the left hemisphere, at half of a cDBS amplitude of 3 mA."""
     settings = SettingsIn(xi_beta=1.0, cdbs_amplitude_ma=3.0, beta_unit="uV", beta_source="table")
     participant = enrolment.enrol(db, ParticipantIn(code="P1", settings=settings), SYSTEM)
-    visit = service.add_visit(db, participant, VisitIn(number=1, date=START.date()), SYSTEM)
+    visit = visits.add_visit(db, participant, VisitIn(number=1, date=START.date()), SYSTEM)
     device = Device(participant_id=participant.id, pseudonym="d", kind="rcs")
     db.add(device)
     db.flush()

@@ -6,10 +6,10 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.study import service
 from app.study.sessions.charts import control_chart
 from app.study.sessions.data import session_data
 from app.study.sessions.pages import summarise
+from app.study.settings import service as settings
 from app.study.settings.schemas import SettingsIn
 from app.tables.sessions import StudySession
 
@@ -33,7 +33,7 @@ def test_a_threshold_with_stated_unit_and_source_counts(db: Session, study_sessi
 def test_without_a_stated_unit_and_source_no_threshold_is_drawn_and_no_share_is_told(
     db: Session, study_session: StudySession, left_open: dict[str, None], named: str
 ) -> None:
-    service.change_settings(db, study_session.visit.participant, SettingsIn(**left_open), "unknown", SYSTEM)
+    settings.change_settings(db, study_session.visit.participant, SettingsIn(**left_open), "unknown", SYSTEM)
     data = session_data(db, study_session)
     assert data.threshold is None
     said = f"Nobody has stated {named} the threshold of 1; this trace is in uV from table."

@@ -16,12 +16,12 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.platform import files
 from app.platform.database import new_session
-from app.study import service as study
 from app.study.doses import service
 from app.study.doses.drugs import DRUGS, levodopa_equivalent_mg
 from app.study.doses.schemas import DoseIn
 from app.study.doses.since import disagreement_h, since_last_dose
 from app.study.schemas import SessionChange
+from app.study.sessions import changes
 from app.study.sessions.contradictions import Kind, contradictions
 from app.tables.learning import BufferSnapshot
 from app.tables.sessions import StudySession
@@ -57,10 +57,10 @@ def test_what_a_person_stated_of_the_session_counts_and_is_questioned_where_the_
     db: Session, study_session: StudySession
 ) -> None:
     take(db, study_session, Drug.LEVODOPA, 2.0)
-    study.change_session(db, study_session, SessionChange(medication_h=2.2, reason="diary"), SYSTEM)
+    changes.change_session(db, study_session, SessionChange(medication_h=2.2, reason="diary"), SYSTEM)
     assert since_last_dose(study_session) == (2.2, "stated")
     assert disagreement_h(study_session) is None
-    study.change_session(db, study_session, SessionChange(medication_h=0.5, reason="diary"), SYSTEM)
+    changes.change_session(db, study_session, SessionChange(medication_h=0.5, reason="diary"), SYSTEM)
     (asked,) = [c for c in contradictions(db, study_session) if c.kind is Kind.LAST_DOSE]
     assert asked.facts == {"stated": 0.5, "by_doses": pytest.approx(2.0)}
 

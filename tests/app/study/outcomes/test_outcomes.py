@@ -12,10 +12,11 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.platform.errors import Invalid
-from app.study import blinding, service
+from app.study import blinding
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
 from app.study.schemas import QocIn, SessionChange
+from app.study.sessions import changes
 from app.tables.audit import AuditEvent
 from app.tables.outcomes import TremorSeries
 from app.tables.participants import Hemisphere
@@ -117,7 +118,7 @@ def test_minutes_of_one_file_that_contradict_each_other_are_left_out(db: Session
 
 
 def test_a_typed_value_stays_and_both_numbers_are_told(db: Session, study_session: StudySession, new_file: NewFile) -> None:
-    service.record_qoc(db, study_session, QocIn(tremor_percent=12.0, rating=7), SYSTEM)
+    changes.record_qoc(db, study_session, QocIn(tremor_percent=12.0, rating=7), SYSTEM)
     said = store(db, study_session, new_file(study_session), HALF_MILD)
     qoc = study_session.qoc
     assert qoc is not None
@@ -130,7 +131,7 @@ def test_a_typed_value_stays_and_both_numbers_are_told(db: Session, study_sessio
 def test_a_value_that_a_person_took_back_is_not_derived_again(db: Session, study_session: StudySession, new_file: NewFile) -> None:
     file = new_file(study_session)
     store(db, study_session, file, HALF_MILD)
-    service.record_qoc(db, study_session, QocIn(tremor_percent=None, reason="watch on the wrong arm"), SYSTEM)
+    changes.record_qoc(db, study_session, QocIn(tremor_percent=None, reason="watch on the wrong arm"), SYSTEM)
     store(db, study_session, file, HALF_MILD)
     assert study_session.qoc is not None
     assert study_session.qoc.tremor_percent is None
@@ -139,13 +140,13 @@ def test_a_value_that_a_person_took_back_is_not_derived_again(db: Session, study
 
 
 def test_the_other_qocs_stay_when_one_is_derived(db: Session, study_session: StudySession, new_file: NewFile) -> None:
-    service.record_qoc(db, study_session, QocIn(grasp_hz=2.5, rating=7), SYSTEM)
+    changes.record_qoc(db, study_session, QocIn(grasp_hz=2.5, rating=7), SYSTEM)
     store(db, study_session, new_file(study_session), HALF_MILD)
     qoc = study_session.qoc
     assert qoc is not None
     assert (qoc.grasp_hz, qoc.rating, qoc.tremor_percent) == (2.5, 7, pytest.approx(50.0))
     # and a later entry of a person keeps the derived one as derived
-    service.record_qoc(db, study_session, QocIn(rating=8), SYSTEM)
+    changes.record_qoc(db, study_session, QocIn(rating=8), SYSTEM)
     assert study_session.qoc is not None
     assert study_session.qoc.derived == ["tremor_percent"]
 
@@ -153,7 +154,7 @@ def test_the_other_qocs_stay_when_one_is_derived(db: Session, study_session: Stu
 def test_taking_the_derived_value_replaces_the_typed_one_and_says_who_took_it(
     db: Session, study_session: StudySession, new_file: NewFile
 ) -> None:
-    service.record_qoc(db, study_session, QocIn(tremor_percent=12.0), SYSTEM)
+    changes.record_qoc(db, study_session, QocIn(tremor_percent=12.0), SYSTEM)
     file = new_file(study_session)
     store(db, study_session, file, HALF_MILD)
     with pytest.raises(Invalid, match="another value by now"):
@@ -219,7 +220,7 @@ def test_of_two_hands_the_one_contralateral_to_the_stimulated_side_counts(
     outcomes.store_grasp(db, study_session, file, "right", *grasps(10, 2.0))
     assert study_session.qoc.grasp_hz == pytest.approx(2.0)
     assert "right hand, contralateral to the left hemisphere" in (study_session.qoc.reason or "")
-    service.change_session(db, study_session, SessionChange(hemisphere=Hemisphere.RIGHT), SYSTEM)
+    changes.change_session(db, study_session, SessionChange(hemisphere=Hemisphere.RIGHT), SYSTEM)
     assert study_session.qoc.grasp_hz == pytest.approx(3.0)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from app.study import wording
+from app.study.usual import words as wording
 from app.study.usual.values import Question, Why, question
 from tests.app.pages.conftest import browser, password_hash, sign_in  # noqa: F401
 from tests.app.pages.test_stale_forms import Tab

@@ -1,4 +1,4 @@
-"""Sentences of the study, made where somebody reads them; nothing is decided by them."""
+"""Words of sessions: activities, an order drawn, what contradicts what."""
 
 from __future__ import annotations
 
@@ -6,48 +6,10 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from app.platform.web.numbers import stated
-from app.study.characteristics.schemas import CharacteristicsFields, Symptom, Target
-from app.study.doses.drugs import DRUGS
-from app.study.enrolment.codes import CodeQuestion
 from app.study.sessions.contradictions import Contradiction, Kind
 from app.study.sessions.designs import Drawn
-from app.study.settings.form import LABELS as SETTING_LABELS
-from app.study.usual.values import Question, Why
-from app.tables.adverse_events import EventKind, Severity
 from app.tables.sessions import Activity, Controller
-from app.tables.visits import Dose, Drug
-from ml.outcomes import BY_FIELD, OUTCOMES
 
-EVENT_KINDS = {
-    EventKind.DYSKINESIA: "Dyskinesia",
-    EventKind.SPEECH: "Speech",
-    EventKind.GAIT: "Gait or balance",
-    EventKind.FALL: "Fall",
-    EventKind.MUSCLE_CONTRACTION: "Muscle contraction",
-    EventKind.PARAESTHESIA: "Paraesthesia",
-    EventKind.VISION: "Vision",
-    EventKind.MOOD: "Mood",
-    EventKind.COGNITION: "Thinking or confusion",
-    EventKind.PAIN: "Pain",
-    EventKind.NAUSEA: "Nausea",
-    EventKind.DEVICE: "Device",
-    EventKind.STOPPED: "Session stopped for the participant's sake",
-    EventKind.OTHER: "Other",
-}
-EVENT_SEVERITIES = {Severity.NONE: "none", Severity.MILD: "mild", Severity.SEVERE: "severe", Severity.NOT_STATED: "not stated"}
-
-DRUG_NAMES = {drug.value: facts.name for drug, facts in DRUGS.items()}
-SYMPTOMS = {
-    Symptom.TREMOR: "Tremor",
-    Symptom.BRADYKINESIA: "Bradykinesia",
-    Symptom.RIGIDITY: "Rigidity",
-    Symptom.GAIT: "Gait",
-    Symptom.DYSKINESIA: "Dyskinesia",
-    Symptom.DYSTONIA: "Dystonia",
-    Symptom.SPEECH: "Speech",
-}
-TARGETS = {Target.STN: "STN", Target.GPI: "GPi", Target.GPE: "GPe", Target.VIM: "Vim", Target.OTHER: "other"}
-MEDICATION = "Medication of a visit day"
 ACTIVITIES = {
     Activity.REST: "sat or lay",
     Activity.LIGHT: "walked, talked",
@@ -56,95 +18,8 @@ ACTIVITIES = {
     Activity.SLEEP: "slept",
 }
 
-UNUSUAL = "Some values are unusual: are they right?"
-UNUSUAL_HINT = "Correct them, or say that they are right; nothing was saved yet."
-
-
-def unusual(asked: Question) -> str:
-    """What is asked about one value."""
-    value = f"{stated(asked.value, 4)} {asked.unit}".strip()
-    usual = f"{asked.low:g} to {asked.high:g} {asked.unit}".strip()
-    match asked.code:
-        case Why.SHARE:
-            return f"{value}: less than one per cent. Was it meant as a share, {stated(100 * asked.value, 3)} %?"
-        case Why.FAR_FROM_VISIT:
-            return f"{value}, where the other sessions of this visit have {usual}: {_ends(asked.field)}. Is it right?"
-        case Why.BELOW:
-            return f"{value} is below what is usual ({usual}). Is it right?"
-        case Why.ABOVE:
-            return f"{value} is above what is usual ({usual}). Is it right?"
-
-
-def _ends(field: str) -> str:
-    """Which end of an outcome's scale is the worst, and which the best."""
-    outcome = BY_FIELD[field]
-    best = outcome.high if outcome.higher_is_better else outcome.low
-    return f"{outcome.worst_possible:g} is worst, {best:g} is best"
-
-
-CODE_QUESTIONS = {
-    CodeQuestion.NAME: "it holds a word that may be a name",
-    CodeQuestion.BIRTH_YEAR: "it holds a year in which a participant may have been born",
-    CodeQuestion.BIRTH_DATE: "it holds a date on which a participant may have been born",
-}
-CODE_HINT = "Choose a code that tells nothing about the person, or confirm that this is a study code."
-CODE_CONFIRMED = "looked at by a person: a study code"
-
-QUERIED_FIELDS = {
-    **{o.field: o.label for o in OUTCOMES},
-    "controller": "Controller",
-    "started_at": "Start",
-    "hemisphere": "Hemisphere",
-    "medication_h": "Time since the last dose",
-    "stopped_reason": "Early stop",
-    "file": "Uploaded file",
-    "date": "Date",
-    "cdbs_left": "cDBS amplitude, left",
-    "cdbs_right": "cDBS amplitude, right",
-    "note": "Note",
-    "drug": "Drug",
-    "mg": "Dose",
-    "taken_at": "Time it was taken",
-    "kind": "What happened",
-    "severity": "Severity",
-    "serious": "Whether it is serious",
-    "occurred_at": "When it happened",
-    "leads": "Leads",
-    "symptoms": "Symptoms",
-    "hand": "Hand of the grasp test",
-    "medication": "Medication of a visit day",
-    **SETTING_LABELS,
-    "other": "Something else",
-}
-"""Values that a data query may be about, by the name of their field."""
-ASKED_ABOUT = {name: said[:1].lower() + said[1:] if said[:2] not in ("cD", "r_") else said for name, said in QUERIED_FIELDS.items()}
-"""The same within a sentence."""
 
 _SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be without DBS"}
-
-
-def characteristics_words(known: CharacteristicsFields) -> dict[str, str]:
-    """Characteristics in words, by label; empty where nothing is stated."""
-    leads = "; ".join(
-        f"{lead.hemisphere} {TARGETS[lead.target]}"
-        + (f", {lead.model}" if lead.model else "")
-        + (f", sensing {lead.sensing}" if lead.sensing else "")
-        + (f", stimulating {lead.stimulating}" if lead.stimulating else "")
-        for lead in known.leads
-    )
-    medication = "; ".join(f"{d.at} {DRUGS[d.drug].name} {d.mg:g} mg" for d in known.medication)
-    symptoms = ", ".join(SYMPTOMS[s].lower() for s in known.symptoms)
-    return {"Leads": leads, "Symptoms": symptoms, "Hand of the grasp test": str(known.hand or ""), MEDICATION: medication}
-
-
-def doses_words(doses: Iterable[Dose]) -> str:
-    """Doses that were taken, by time."""
-    return "; ".join(f"{d.taken_at:%Y-%m-%d %H:%M} {DRUGS[Drug(d.drug)].name} {d.mg:g} mg" for d in doses)
-
-
-def code_questions(code: str, found: Iterable[CodeQuestion]) -> str:
-    """What a study code looks like."""
-    return f"The code '{code}' may tell who the participant is: {' and '.join(CODE_QUESTIONS[q] for q in found)}."
 
 
 def sentences(contradictions: Iterable[Contradiction]) -> list[str]:
