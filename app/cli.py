@@ -29,8 +29,8 @@ from app.platform.terminal import ACTOR, AsJson, Code, say, show
 from app.platform.upkeep.commands import app as upkeep_app
 from app.settings import Settings, get_settings
 from app.simulation import commands as simulation
-from app.study.closing import commands as closing
-from app.study.participation.commands import participant_app
+from app.study import commands as closing
+from app.study.commands import participant_app
 
 app = typer.Typer(
     no_args_is_help=True,

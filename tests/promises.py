@@ -233,7 +233,7 @@ PROMISES = [
          f"{ROUTES}::test_a_caller_of_another_study_sees_nothing"),
     ),
     *_of(
-        "study/service",
+        "study/access",
         ("objects of another participant look as if they did not exist", "    if row.participant_id != participant.id:\n",
          "    if False:\n",
          f"{OWNED}::test_every_route_with_two_ids_refuses_another_participants"),
@@ -248,16 +248,16 @@ PROMISES = [
          f"{KEY}::test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened"),
     ),
     *_of(
-        "study/visits/service",
+        "study/visits",
         ("a locked visit takes no change", "    if visit.locked:\n        last", "    if False:\n        last",
          f"{LOCKS}::test_a_locked_visit_takes_no_change_until_it_is_unlocked_with_a_reason"),
-        ("locks are signed", "    sign_off.sign_lock(db, visit, row, caller, password, code)\n", "",
+        ("locks are signed", "    sign_lock(db, visit, row, caller, password, code)\n", "",
          f"{LOCK_SIGNED}::test_a_lock_is_signed_with_its_meaning_and_stands_in_the_trail"),
         ("a locked visit goes by the settings at its lock", "visit.participant.current_settings.id if locked else None", "None",
          f"{LOCK_SIGNED}::test_a_locked_visit_goes_by_the_settings_at_its_lock"),
     ),
     *_of(
-        "study/visits/sign_off",
+        "study/visits",
         ("doses are signed", '"doses": sorted(', '"doses": 0 and sorted(', f"{LOCK_SIGNED}::test_any_change_breaks_it_visibly"),
         ("samples are signed", '| {"samples": read.get(s.recording_id)}', "", f"{LOCK_SIGNED}::test_any_change_breaks_it_visibly"),
         ("which samples are valid is signed", ", t.valid_bits.hex()]", "]", f"{LOCK_SIGNED}::test_any_change_breaks_it_visibly"),
@@ -283,7 +283,7 @@ PROMISES = [
     ),
     *_of(
         "ingest/quarantine/service",
-        ("a clinician alone decides on quarantined files", "    study_service.require(caller, can.DECIDE_QUARANTINE, participant)\n", "",
+        ("a clinician alone decides on quarantined files", "    access.require(caller, can.DECIDE_QUARANTINE, participant)\n", "",
          f"{QUARANTINE}::test_only_a_clinician_or_an_administrator_decides"),
         ("nothing is released that nobody looked at", "    if file.reviewed_at is None:\n", "    if False:\n",
          f"{QUARANTINE}::test_a_file_is_released_as_it_is_only_after_somebody_looked"),
@@ -380,7 +380,7 @@ PROMISES = [
          f"{SIGN_IN}::test_the_cookie_is_out_of_reach_of_scripts_and_other_sites"),
     ),
     *_of(
-        "study/data_queries/service",
+        "study/data_queries",
         ("what one asks, another answers", "can.WRITE_STUDY if given.state is QueryState.ANSWERED else can.ASK_QUERIES", "can.READ",
          f"{PAGES}::test_every_form_against_every_role"),
     ),

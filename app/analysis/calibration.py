@@ -31,7 +31,7 @@ from app.planning.plans import repository as plans
 from app.platform.web.charts import counted
 from app.study import access, blinding
 from app.study import repository as study_repository
-from app.study.settings.service import mdp_settings
+from app.study.settings import mdp_settings
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.participants import Participant

@@ -19,7 +19,7 @@ from app.platform.web.forms import parse
 from app.platform.web.schemas import problems
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant
-from app.study.recordings.battery import readings
+from app.study.recordings.history import readings
 
 # Energy as API types and as rows of a table.
 

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session, selectinload
 from app.accounts.permissions import Caller
 from app.evaluation.ranking.results import DrivenSession, driven_sessions, results_by_policy
 from app.study import repository as study
-from app.study.settings.service import mdp_settings
+from app.study.settings import mdp_settings
 from app.tables.evaluations import EstimateRow, Evaluation
 from app.tables.learning import BufferSnapshot, SnapshotSession
 from app.tables.participants import Participant

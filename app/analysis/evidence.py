@@ -16,9 +16,9 @@ from app.platform.errors import Invalid
 from app.platform.kept import keep, recalled
 from app.study import blinding
 from app.study import repository as study
-from app.study.adverse_events.repository import late_stops
-from app.study.sessions.data import failed_qoc_of
+from app.study.adverse_events import late_stops
 from app.study.sessions.repository import fingerprints
+from app.study.sessions.usable_steps import failed_qoc_of
 from app.tables.participants import Participant
 from app.tables.recordings import Recording, Trace
 from app.tables.sessions import SessionSegment, StudySession

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from app.platform.errors import Invalid
 from app.study.blinding import Arm
-from app.study.doses.since import hours_since_dose
-from app.study.sessions.data import qoc_of
+from app.study.doses import hours_since_dose
 from app.study.sessions.stimulation import delivered_by
+from app.study.sessions.usable_steps import qoc_of
 from app.study.traces import AMPLITUDE_STREAM, StepTable, TracesOf, amplitude_program, laid_out
 from app.tables.recordings import Trace
 from app.tables.sessions import Controller, StudySession

@@ -18,7 +18,7 @@ from app.analysis.primary_results import PLANNED, ControllerResult, results
 from app.analysis.primary_verdict import LockedMargins, VerdictResult, earlier_verdicts, policy_verdicts, verdicts
 from app.platform.errors import NotFound
 from app.platform.kept import kept
-from app.study.margins.service import margins_of
+from app.study.margins import margins_of
 from app.tables.learning import Policy
 from app.tables.participants import Participant
 from app.tables.plans import Plan, PlanItem

@@ -15,8 +15,7 @@ from app.evaluation import repository as evaluations
 from app.evaluation import verdict_wording
 from app.evaluation.ranking.decisions import Decided, findings_of
 from app.evaluation.ranking.judged import judged
-from app.study.adverse_events.repository import events_of_participant
-from app.study.adverse_events.service import blocking_events
+from app.study.adverse_events import blocking_events, events_of_participant
 from app.tables.participants import Participant
 from ml.ope import Flag
 from ml.statistics.noninferiority import PLANNED_SESSIONS

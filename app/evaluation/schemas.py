@@ -11,7 +11,7 @@ from app.evaluation.estimates.methods import Method as Method
 from app.evaluation.estimates.methods import Methods
 from app.learning.schemas import PolicyIds, Preset
 from app.platform.web.schemas import Int, Model
-from app.study.outcome_fields import fields_model
+from app.study.outcomes.fields import fields_model
 from ml.outcomes import FIELDS
 
 

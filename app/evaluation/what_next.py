@@ -8,7 +8,7 @@ from app.evaluation import verdict_wording, wording
 from app.evaluation.ranking.answer import OFF_SHARE
 from app.evaluation.ranking.judged import Judged
 from app.platform.web.templates import render_part
-from app.study.margins.service import margins_of
+from app.study.margins import margins_of
 from ml.ope import NEARLY_OFF
 
 

@@ -16,11 +16,11 @@ from app.platform.errors import Conflict, Invalid
 from app.study import blinding, cdbs_amplitude
 from app.study import repository as study
 from app.study.recordings.facts import unknown_clock
-from app.study.sessions import repeated
+from app.study.sessions import designs
 from app.study.sessions import repository as session_repository
 from app.study.sessions.usable_steps import CONTROL_STREAMS
 from app.study.traces import AMPLITUDE_STREAM, pack, unpack
-from app.study.visits.service import require_unlocked
+from app.study.visits import require_unlocked
 from app.tables.participants import Hemisphere, Participant
 from app.tables.recordings import Recording, Trace
 from app.tables.sessions import Controller, SessionSegment, StudySession
@@ -243,7 +243,7 @@ def in_milliamperes(trace: Trace, cdbs_ma: float) -> None:
 
 def refuse_overlap(db: Session, session: StudySession) -> None:
     """Raise Conflict where a confirmed session already counts on the same stretch of a recording, or of its device in another one."""
-    repeated.refuse(db, session)
+    designs.refuse(db, session)
     for segment in session.segments:
         for other in repository.segments_of_recording(db, segment.recording_id, besides=session.id):
             shared = min(segment.stop_s, other.stop_s) - max(segment.start_s, other.start_s)

@@ -40,10 +40,9 @@ from app.platform.web.templates import render
 from app.settings import get_settings
 from app.study import repository as study
 from app.study.access import may, withdrawn_codes
-from app.study.characteristics.service import fields_of
-from app.study.characteristics.words import characteristics_words
+from app.study.characteristics import characteristics_words, fields_of
 from app.study.deps import CurrentParticipant, ResultsViewed
-from app.study.visits.service import days_of
+from app.study.visits import days_of
 from app.tables.participants import Participant, SettingsVersion
 from app.tables.visits import Visit
 

@@ -25,11 +25,10 @@ from app.platform.audit import record
 from app.platform.errors import BetaloopError
 from app.study import access, blinding
 from app.study import repository as study
-from app.study.characteristics.schemas import CharacteristicsOut
-from app.study.doses.drugs import levodopa_equivalent_mg
-from app.study.doses.since import hours_since_dose
-from app.study.sessions.data import session_data
-from app.study.settings.schemas import SettingsOut
+from app.study.characteristics import CharacteristicsOut
+from app.study.doses import hours_since_dose, levodopa_equivalent_mg
+from app.study.sessions.usable_steps import session_data
+from app.study.settings_types import SettingsOut
 from app.tables.learning import Policy
 from app.tables.participants import Participant
 from app.tables.visits import Drug

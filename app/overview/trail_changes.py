@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from app.overview.trail_rows import Names, Row
-from app.study.adverse_events.words import EVENT_KINDS
-from app.study.data_queries.words import ASKED_ABOUT
+from app.study.adverse_event_types import EVENT_KINDS
+from app.study.data_queries import ASKED_ABOUT
 
 _JOBS = {
     "evaluate": "evaluation", "train": "training", "distil": "distillation", "next_generation": "next-generation", "pipeline": "pipeline",

@@ -12,7 +12,7 @@ from app.accounts.permissions import Caller
 from app.learning.snapshots import service as snapshots
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
-from app.study.margins.service import margins_of
+from app.study.margins import margins_of
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.participants import Participant
 

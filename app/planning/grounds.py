@@ -12,8 +12,7 @@ from app.evaluation.ranking.assessment import Assessment
 from app.evaluation.ranking.decisions import Decided, findings_of
 from app.evaluation.ranking.judged import judged
 from app.evaluation.schemas import Decision
-from app.study.adverse_events.repository import events_of_participant
-from app.study.adverse_events.service import Events, blocking_events
+from app.study.adverse_events import Events, blocking_events, events_of_participant
 from app.tables.evaluations import Evaluation
 from app.tables.participants import Participant
 from app.tables.plans import Plan

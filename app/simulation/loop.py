@@ -33,12 +33,12 @@ from app.platform.jobs.watch import POLL_S, look
 from app.simulation.demo.study import participant_body
 from app.simulation.design import BETWEEN_VISITS, MORNING, Design, Remembered
 from app.simulation.sessions import VisitDay
+from app.study import participation as enrolment
 from app.study import repository as study_repository
+from app.study import visits
 from app.study.blinding import CONTROLLER_NAMES
-from app.study.enrolment import service as enrolment
-from app.study.enrolment.schemas import ParticipantIn
+from app.study.participation import ParticipantIn
 from app.study.schemas import VisitIn
-from app.study.visits import changes as visits
 from app.tables.jobs import Job, JobStatus
 from app.tables.participants import Participant
 from app.tables.sessions import Controller

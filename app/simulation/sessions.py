@@ -23,7 +23,7 @@ from app.simulation.demo.study import device_session, session_file
 from app.simulation.tablet import Moment, run_slot_of
 from app.study.schemas import QocIn
 from app.study.sessions import changes
-from app.study.settings.service import mdp_settings
+from app.study.settings import mdp_settings
 from app.tables.participants import Participant
 from app.tables.plans import PlanItem
 from app.tables.sessions import Controller, StudySession

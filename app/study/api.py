@@ -7,12 +7,13 @@ from fastapi import APIRouter
 from app.accounts.deps import CurrentCaller
 from app.platform.database import Db
 from app.platform.web.schemas import Page, PagingQuery, problems
-from app.study import repository
+from app.study import participation as enrolment
+from app.study import repository, settings
+from app.study import visits as study_visits
 from app.study.blinding import require_known
 from app.study.deps import CurrentParticipant, CurrentSession, CurrentVisit, SessionViewed, VisitViewed
-from app.study.enrolment import service as enrolment
-from app.study.enrolment.schemas import ParticipantIn
 from app.study.outcomes import values as outcome_values
+from app.study.participation import ParticipantIn
 from app.study.schemas import (
     ConditionsChange,
     ConditionsOut,
@@ -34,12 +35,9 @@ from app.study.schemas import (
 )
 from app.study.serializers import lock_rows, outcome_out, participant_out, recorded_trace_out, session_out, trace_out, visit_out
 from app.study.sessions import changes, conditions
-from app.study.sessions.data import session_data
-from app.study.settings import service as settings
-from app.study.settings.schemas import SettingsChange, SettingsOut
+from app.study.sessions.usable_steps import session_data
+from app.study.settings_types import SettingsChange, SettingsOut
 from app.study.traces import recorded_traces
-from app.study.visits import changes as study_visits
-from app.study.visits import service as visits
 
 router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
@@ -116,14 +114,14 @@ def lock_visit(visit: CurrentVisit, why: VisitLockIn, db: Db, caller: CurrentCal
 
     The signature covers the visit, its doses, and every session with its controller, QoCs, conditions, exclusion and samples.
     """
-    visits.lock(db, visit, why.reason, caller, why.password, why.code)
+    study_visits.lock(db, visit, why.reason, caller, why.password, why.code)
     return lock_rows(db, visit)[-1]
 
 
 @router.post("/visits/{visit_id}/unlock", responses=problems(409))
 def unlock_visit(visit: CurrentVisit, why: VisitUnlockIn, db: Db, caller: CurrentCaller) -> VisitLockOut:
     """Open the data of a visit for corrections."""
-    visits.unlock(db, visit, why.reason, caller)
+    study_visits.unlock(db, visit, why.reason, caller)
     return lock_rows(db, visit)[-1]
 
 

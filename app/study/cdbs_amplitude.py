@@ -7,7 +7,7 @@ from datetime import date
 from typing import overload
 
 from app.platform.errors import Invalid
-from app.study.settings.schemas import CDBS_MA
+from app.study.settings_types import CDBS_MA
 from app.tables.participants import Hemisphere, Participant, SettingsVersion
 from app.tables.sessions import StudySession
 from app.tables.visits import Visit

@@ -12,9 +12,8 @@ from pydantic_core import PydanticCustomError
 from app.platform.signatures.schemas import SignatureOut, Signing
 from app.platform.signatures.service import SignatureState
 from app.platform.web.schemas import Bool, Day, Int, Model, Number, Text
-from app.study.outcome_fields import DerivedField, EnteredOutcomes, OutcomeField, StoredOutcomes
-from app.study.settings.schemas import CDBS_MA, SettingsOut
-from app.study.usual.values import SURE
+from app.study.outcomes.fields import SURE, DerivedField, EnteredOutcomes, OutcomeField, StoredOutcomes
+from app.study.settings_types import CDBS_MA, SettingsOut
 from app.tables.participants import Hemisphere
 from app.tables.sessions import Activity, Controller
 from ml.designs import SessionDesign

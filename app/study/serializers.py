@@ -9,14 +9,14 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.platform.signatures.schemas import SignatureOut
 from app.study import blinding
-from app.study.doses.since import hours_since_dose
+from app.study.doses import hours_since_dose
 from app.study.outcomes import service as outcomes
 from app.study.outcomes import values as outcome_values
 from app.study.schemas import OutcomeOut, ParticipantOut, QocOut, RecordedTraceOut, SessionOut, TraceOut, VisitLockOut, VisitOut
-from app.study.sessions.data import SessionData
-from app.study.settings.schemas import SettingsOut
+from app.study.sessions.usable_steps import SessionData
+from app.study.settings_types import SettingsOut
 from app.study.traces import RecordedTrace
-from app.study.visits.sign_off import signatures_of_locks
+from app.study.visits import signatures_of_locks
 from app.tables.participants import Participant
 from app.tables.sessions import StudySession
 from app.tables.visits import Visit

@@ -63,7 +63,7 @@ class DataQuery(Base):
     record: Mapped[str | None] = mapped_column(String(20))
     """`settings` or `characteristics`: the participant's, whose present version holds the value."""
     field: Mapped[str] = mapped_column(String(40))
-    """Which value, by its name in the API (`app.study.data_queries.fields`)."""
+    """Which value, by its name in the API (`app.study.data_queries`)."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     participant: Mapped[Participant] = relationship()
     session: Mapped[StudySession | None] = relationship()

@@ -90,7 +90,7 @@ class StudySession(Base):
     stopped_reason: Mapped[str | None] = mapped_column(Text)
     """Why it was stopped for the patient's sake: a failure of its controller, never a missing value. None where it was not."""
     medication_h: Mapped[float | None]
-    """Hours from the last dose to the start, as a person stated them; what counts says `app.study.doses.since`."""
+    """Hours from the last dose to the start, as a person stated them; what counts says `app.study.doses`."""
     activity: Mapped[Activity | None] = mapped_column(String(10))
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     visit: Mapped[Visit] = relationship(back_populates="sessions")

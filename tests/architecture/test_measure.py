@@ -51,7 +51,7 @@ def test_names_are_found_as_words() -> None:
 
 
 def test_features_and_imports_between_them_are_found() -> None:
-    assert measure.feature("app.study.service") == "app.study"
-    assert measure.feature("app.study.visits.service") == "app.study.visits"
+    assert measure.feature("app.study.visits") == "app.study"
+    assert measure.feature("app.study.sessions.pages") == "app.study.sessions"
     assert ("app.cli", "app.main") in measure.imports()
     assert all(a.split(".")[1] == b.split(".")[1] for a, b in measure.between_features())

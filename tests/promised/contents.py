@@ -41,8 +41,8 @@ CONTENTS: list[Promise] = [
     ),
     *of(
         "ingest/quarantine/service",
-        ("nothing new is read at a site that has ended", "    study_service.refuse_ended(participant.site)\n", "", OVER),
-        ("nothing new is read for who has withdrawn", "    study_service.refuse_withdrawn(participant)\n", "", OVER),
+        ("nothing new is read at a site that has ended", "    access.refuse_ended(participant.site)\n", "", OVER),
+        ("nothing new is read for who has withdrawn", "    access.refuse_withdrawn(participant)\n", "", OVER),
     ),
     *of(
         "ingest/uploads/reading",
@@ -65,9 +65,9 @@ CONTENTS: list[Promise] = [
     Promise("a package recomputes its own tables", "app/overview/recompute.py", "float(np.nanmean(a**2)) if known(a)",
             "float(np.nanmean(a)) if known(a)", PACKAGE, at_start=True),
     *of(
-        "study/visits/pages",
+        "study/visits_web",
         ("a visit's form takes the amplitude of each side",
-         "        draft.cdbs_amplitudes = form.amplitudes({n: typed[n] for n in _FIRST_PROGRAM if n in typed}, confirmed(values, typed))\n",
+         "        draft.cdbs_amplitudes = amplitudes({n: typed[n] for n in _FIRST_PROGRAM if n in typed}, confirmed(values, typed))\n",
          "",
          VISIT_FORM),
     ),
@@ -95,13 +95,13 @@ CONTENTS: list[Promise] = [
          f"{RELEASES}::test_any_change_breaks_it_visibly"),
     ),
     *of(
-        "study/margins/sign_off",
+        "study/margins",
         ("locked margins are signed over their values",
          "        **{name: getattr(version, name) for name in MarginsFields.model_fields},\n", "",
          f"{MARGINS}::test_a_lock_is_signed_over_its_values"),
     ),
     *of(
-        "study/data_queries/service",
+        "study/data_queries",
         ("nobody closes a question over words that they have not seen", "    if len(query.entries) != given.entries:\n", "    if False:\n",
          QUERIES),
         ("each word about a value keeps it as it stood",

@@ -43,13 +43,13 @@ PEOPLE: list[Promise] = [
          f"{CLOSING}::test_a_study_that_has_ended_is_read_and_nothing_in_it_changes"),
     ),
     *of(
-        "study/service",
+        "study/access",
         ("a site that has ended takes no data", "    if site.ended_at is not None:\n", "    if False:\n",
          f"{CLOSING}::test_an_ended_site_takes_neither_enrolments_nor_uploads_and_all_else_goes_on"),
     ),
     *of(
-        "study/closing/service",
-        ("jobs of a study that has ended are cancelled", "            jobs.cancel(db, job, caller.label)\n", "            pass\n",
+        "study/participation",
+        ("jobs of a study that has ended are cancelled", "in jobs.live_of(db, participant_id):\n", "in ():\n",
          f"{CLOSING}::test_jobs_of_an_ended_study_are_cancelled"),
     ),
     *of(
@@ -62,7 +62,7 @@ PEOPLE: list[Promise] = [
         ("a bundle that is taken again writes no file", "    if sha256 is not None and files.is_whole(sha256):\n",
          "    if False:\n",
          f"{BUNDLES}::test_the_same_bundle_taken_twice_is_one_file_and_stands_twice_in_the_audit_trail"),
-        ("viewers take no bundles", "    study.require(caller, can.TAKE_BUNDLES, participant)\n", "",
+        ("viewers take no bundles", "    access.require(caller, can.TAKE_BUNDLES, participant)\n", "",
          f"{BUNDLES}::test_who_may_only_read_takes_no_bundle_and_leaves_no_trace"),
     ),
     *of(
@@ -110,7 +110,7 @@ PEOPLE: list[Promise] = [
          "    return _accounts_page(request, db, caller)\n", f"{PAGES}::test_every_page_against_every_role"),
     ),
     *of(
-        "study/service",
+        "study/visits",
         ("a route is closed to roles that may not", "    require(caller, can.WRITE_STUDY, participant)\n    if repository.visit_by_number",
          "    if repository.visit_by_number", f"{ROUTES}::test_every_route_against_every_role"),
     ),
@@ -191,7 +191,7 @@ PEOPLE: list[Promise] = [
             "from __future__ import annotations\n\nimport torch\n",
             "tests/app/test_heavy_imports.py::test_the_web_process_never_loads_torch_and_starts_without_what_it_may_never_need"),
     *of(
-        "study/margins/sign_off",
+        "study/margins",
         ("a signature covers why margins were locked", '        "lock_reason": lock.reason,\n', "",
          f"{MARGINS}::test_any_change_breaks_it_visibly"),
     ),

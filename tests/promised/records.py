@@ -37,15 +37,18 @@ RECORDS = [
          "tests/app/ingest/proposals/test_proposals.py::test_a_proposal_that_a_data_query_is_about_is_neither_dropped_nor_cut"),
     ),
     *_of(
-        "study/doses/service",
+        "study/doses",
         ("doses are not deleted", "    dose.removed_at = now()\n", "    db.delete(dose)\n",
          f"{KEPT}::test_a_dose_that_was_taken_back_stays_and_may_be_entered_anew"),
     ),
     *_of(
-        "study/service",
+        "study/access",
+        ("lists mark who has withdrawn", "if p.status == WITHDRAWN)", "if False)", f"{MARKS}::test_lists_mark_who_has_withdrawn"),
+    ),
+    *_of(
+        "study/visits",
         ("cDBS amplitudes are not deleted", "                row.removed_at = now()\n", "                db.delete(row)\n",
          f"{KEPT}::test_an_amplitude_that_is_stated_no_more_stays_and_outlasts_its_visit"),
-        ("lists mark who has withdrawn", "if p.status == WITHDRAWN)", "if False)", f"{MARKS}::test_lists_mark_who_has_withdrawn"),
     ),
     *_of(
         "study/outcomes/service",

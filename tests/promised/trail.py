@@ -59,7 +59,7 @@ TRAIL: list[Promise] = [
          f"{FOUND}::test_a_participants_rows_are_all_of_theirs_and_of_nobody_else"),
     ),
     *of(
-        "study/data_queries/fields",
+        "study/data_queries",
         ("a question keeps the value as it stood", "return value if isinstance(value, str) else",
          "return None if isinstance(value, str) else",
          f"{QUERIES}::test_every_clinical_value_is_asked_about_and_keeps_its_old_value"),

@@ -10,7 +10,7 @@ import numpy as np
 from app.evaluation.estimates.coverage import STORED
 from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.evaluation.ranking.decisions import Decided
-from app.study.margins.service import margins_of
+from app.study.margins import margins_of
 from app.tables.evaluations import Evaluation
 from ml.ope import SAME_AMPLITUDE, BehaviourMap, Estimate, chance_within, interval, outcome_draws
 from ml.outcomes import FIELDS

@@ -9,7 +9,7 @@ from datetime import datetime
 from typing import Any
 
 from app.evaluation.schemas import Decision, Standing
-from app.study.margins.service import margins_of
+from app.study.margins import margins_of
 from app.tables.adverse_events import AdverseEvent
 from app.tables.evaluations import Evaluation
 from app.tables.participants import MarginsVersion

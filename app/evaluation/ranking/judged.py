@@ -28,8 +28,7 @@ from app.platform.errors import Invalid
 from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
-from app.study.adverse_events.repository import events_of_participant
-from app.study.adverse_events.service import Events, blocking_events
+from app.study.adverse_events import Events, blocking_events, events_of_participant
 from app.study.sessions.repository import ReadOnce
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot

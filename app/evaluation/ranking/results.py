@@ -18,10 +18,10 @@ from app.platform.kept import kept
 from app.study import blinding
 from app.study import repository as study_repository
 from app.study.blinding import Arm
-from app.study.margins.service import margins_of
-from app.study.sessions.data import failed_qoc_of
+from app.study.margins import margins_of
 from app.study.sessions.repository import ReadOnce
-from app.study.settings.service import mdp_settings
+from app.study.sessions.usable_steps import failed_qoc_of
+from app.study.settings import mdp_settings
 from app.study.traces import TracesOf, laid_out, traces_of
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot

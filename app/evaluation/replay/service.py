@@ -20,7 +20,7 @@ from app.platform.kept import kept
 from app.study import access
 from app.study import repository as study_repository
 from app.study.blinding import require_known
-from app.study.sessions.data import SessionData, session_data
+from app.study.sessions.usable_steps import SessionData, session_data
 from app.study.traces import StepTable
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.participants import Participant

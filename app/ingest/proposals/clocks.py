@@ -23,7 +23,7 @@ from app.study.access import require
 from app.study.outcomes import service as outcomes
 from app.study.sessions import conditions
 from app.study.sessions.contradictions import control_recording
-from app.study.visits.service import require_unlocked
+from app.study.visits import require_unlocked
 from app.tables.recordings import Recording
 from app.tables.sessions import StudySession
 from ml.formats import RecordingLog, lead_in_words

@@ -18,7 +18,8 @@ from app.ingest.sessions import Placement, StatedSession, add_session
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.platform.web import numbers
 from app.study import repository as study
-from app.study.sessions import conditions, logged
+from app.study.sessions import conditions
+from app.study.sessions import usable_steps as usable_steps_rules
 from app.study.sessions.contradictions import contradictions, control_recording, local_day
 from app.study.sessions.usable_steps import sentence, usable_steps
 from app.study.sessions.wording import sentences
@@ -60,9 +61,9 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
         # what differs from a session that counts is for a person to look at
         stated = replace(stated, confirm=False)
     day = local_day(placement.control, placement.started_at) if placement.started_at else None
-    slot = logged.slot_of_recording(db, placement.control)
+    slot = usable_steps_rules.slot_of_recording(db, placement.control)
     visits = study.visits(db, participant.id, 1000, 0)[0] if stated.visit is None or slot is not None else []
-    if logged.rehearsed(placement.control) or differs_from_slot(slot, stated):
+    if usable_steps_rules.rehearsed(placement.control) or differs_from_slot(slot, stated):
         # a log of a bench, or of another session than the sender says, is for a person to look at
         stated = replace(stated, confirm=False)
     if any(r.details.get("quality", {}).get("amplitude_conflicts") for r in group):

@@ -31,8 +31,7 @@ from app.study.deps import CurrentParticipant
 from app.study.sessions import designs
 from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions
-from app.study.sessions.data import SessionData, session_data
-from app.study.sessions.usable_steps import usable_steps
+from app.study.sessions.usable_steps import SessionData, session_data, usable_steps
 from app.study.sessions.wording import drawn_words, sentences
 from app.study.traces import control_programs
 from app.tables.participants import Participant

@@ -18,14 +18,13 @@ from app.ingest.sessions import add_session
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
-from app.study import access, blinding
+from app.study import access, blinding, data_queries
 from app.study import repository as study
-from app.study.data_queries import repository as data_queries
-from app.study.sessions import conditions, logged
+from app.study.sessions import conditions, usable_steps
 from app.study.sessions.changes import POLICY_CONTROLLERS
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.wording import sentences
-from app.study.visits.service import require_unlocked
+from app.study.visits import require_unlocked
 from app.tables.sessions import Controller, StudySession
 from app.tables.uploads import SessionProposal
 
@@ -223,7 +222,7 @@ def _move_to_visit(db: Session, session: StudySession, proposal: SessionProposal
     visit = study.visit_by_number(db, participant.id, number)
     if visit is None:
         raise Invalid(f"Participant {participant.code} has no visit {number}.", "Add the visit first.", field="visit")
-    slot = logged.slot_of_recording(db, control_recording(session))
+    slot = usable_steps.slot_of_recording(db, control_recording(session))
     if slot is not None and slot.planned is not None and slot.planned.sealed and visit.id not in (session.visit_id, slot.planned.visit_id):
         raise Conflict(
             f"Session {session.id} stays at its visit: its log is of a session of visit {slot.visit_number}, whose plan's key is sealed, "

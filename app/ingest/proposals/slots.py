@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from app.ingest.proposals.evidence import Evidence, Reason, Source, VisitGuess
 from app.ingest.sessions import StatedSession
-from app.study.sessions.logged import LoggedSlot
+from app.study.sessions.usable_steps import LoggedSlot
 from app.tables.visits import Visit
 
 

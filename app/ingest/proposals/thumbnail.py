@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from app.platform.web.charts import counted, written
 from app.platform.web.svg import Plane, drawing
-from app.study.sessions.data import SessionData
+from app.study.sessions.usable_steps import SessionData
 
 W, LEFT, TOP, EACH, BETWEEN, BOTTOM = 520.0, 44.0, 22.0, 48.0, 44.0, 38.0
 

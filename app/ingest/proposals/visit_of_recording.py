@@ -16,9 +16,9 @@ from app.ingest.proposals.service import locked, renew
 from app.platform.errors import Conflict, Invalid
 from app.study import access
 from app.study import repository as study
+from app.study import visits as study_visits
 from app.study.schemas import VisitIn
 from app.study.sessions.contradictions import control_recording, local_day
-from app.study.visits import changes as study_visits
 from app.tables.sessions import StudySession
 from app.tables.uploads import SessionProposal
 from app.tables.visits import Visit

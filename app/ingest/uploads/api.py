@@ -20,7 +20,7 @@ from app.platform.errors import Invalid
 from app.platform.web.schemas import Moment, RowId, Text, problems
 from app.study import repository as study
 from app.study.serializers import session_out
-from app.study.settings.schemas import BetaSource
+from app.study.settings_types import BetaSource
 from app.tables.participants import Hemisphere
 from app.tables.sessions import Controller
 from app.tables.uploads import UploadFile as UploadFileRow

@@ -29,8 +29,8 @@ from app.study import access
 from app.study import repository as study
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.deps import CurrentParticipant
-from app.study.settings.form import SOURCES
-from app.study.settings.schemas import BetaSource
+from app.study.settings_form import SOURCES
+from app.study.settings_types import BetaSource
 from app.tables.participants import Participant
 from app.tables.uploads import Upload
 

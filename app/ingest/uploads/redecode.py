@@ -29,7 +29,7 @@ from app.platform.database import transaction
 from app.platform.errors import Conflict, NotFound
 from app.platform.jobs.children.child import places
 from app.study import repository as study
-from app.study.outcomes import repository as outcomes
+from app.study.outcomes import values as outcomes
 from app.study.traces import AMPLITUDE_STREAM, unpack
 from app.tables.participants import Participant
 from app.tables.recordings import Recording, Trace

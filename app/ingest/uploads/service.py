@@ -28,7 +28,7 @@ from app.platform.jobs.children.child import places
 from app.platform.web.schemas import sensible_time
 from app.study import access
 from app.study import repository as study
-from app.study.visits.service import require_unlocked
+from app.study.visits import require_unlocked
 from app.tables.participants import Hemisphere, Participant
 from app.tables.sessions import Controller, StudySession
 from app.tables.uploads import Upload, UploadFile

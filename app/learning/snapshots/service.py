@@ -28,13 +28,11 @@ from app.platform.errors import Invalid
 from app.platform.kept import kept
 from app.study import access, blinding
 from app.study import repository as study_repository
-from app.study.doses.since import hours_since_dose
+from app.study.doses import hours_since_dose
 from app.study.sessions import repository as session_repository
-from app.study.sessions.data import failed_qoc_of, session_data
-from app.study.sessions.programming import Difference, Program, differences, stored
-from app.study.sessions.repeated import counts_elsewhere
-from app.study.settings.service import mdp_settings
-from app.study.threshold import suggest_xi_beta
+from app.study.sessions.designs import Difference, Program, counts_elsewhere, differences, stored
+from app.study.sessions.usable_steps import failed_qoc_of, session_data
+from app.study.settings import mdp_settings, suggest_xi_beta
 from app.study.traces import StepTable, TracesOf, traces_of
 from app.tables.learning import BufferSnapshot, SnapshotSession
 from app.tables.participants import CharacteristicsVersion, Hemisphere, Participant, SettingsVersion

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from app.study.blinding import Arm
-from app.study.sessions.data import qoc_of
 from app.study.sessions.designs import drawn
+from app.study.sessions.usable_steps import qoc_of
 from app.study.traces import StepTable
 from app.tables.participants import SettingsVersion
 from app.tables.sessions import Controller, StudySession

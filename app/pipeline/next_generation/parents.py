@@ -13,8 +13,7 @@ from app.evaluation.estimates.rows import estimate_of
 from app.learning import repository as learning
 from app.learning.policies.service import window_of
 from app.study import repository as study
-from app.study.adverse_events.repository import events_of_participant
-from app.study.adverse_events.service import blocked_policies
+from app.study.adverse_events import blocked_policies, events_of_participant
 from app.study.blinding import arm
 from app.tables.evaluations import Evaluation
 from app.tables.learning import Policy

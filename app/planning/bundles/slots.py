@@ -24,7 +24,7 @@ from app.planning.sheet.content import BUNDLE, card_of
 from app.platform import files
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import access
-from app.study.adverse_events.repository import with_blocking_events
+from app.study.adverse_events import with_blocking_events
 from app.tables.audit import Signature
 from app.tables.participants import Hemisphere
 from app.tables.plans import PlanItem

@@ -30,7 +30,7 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.platform.signatures.service import SignatureState
 from app.study import access
-from app.study.sessions.logged import CONTROLLER_OF_KIND
+from app.study.sessions.usable_steps import CONTROLLER_OF_KIND
 from app.tables.evaluations import Evaluation
 from app.tables.learning import Policy
 from app.tables.participants import Hemisphere, Participant

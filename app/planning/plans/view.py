@@ -30,8 +30,8 @@ from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
 from app.platform.signatures.service import SignatureState
 from app.platform.web.templates import Part, make_part
 from app.study import access
-from app.study.adverse_events.service import Events
-from app.study.characteristics.service import fields_of
+from app.study.adverse_events import Events
+from app.study.characteristics import fields_of
 from app.tables.audit import Signature
 from app.tables.evaluations import Evaluation
 from app.tables.learning import Policy

@@ -11,10 +11,9 @@ from app.accounts.permissions import Caller
 from app.planning.plans import repository
 from app.platform.database import now, set_reason
 from app.platform.errors import Conflict, Invalid
-from app.study import access
+from app.study import access, visits
 from app.study.schemas import VisitIn
-from app.study.visits import changes as visits
-from app.study.visits.service import require_unlocked
+from app.study.visits import require_unlocked
 from app.tables.participants import Participant
 from app.tables.visits import Visit
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import time
 
-from app.study.characteristics.schemas import PlannedDose
-from app.study.doses.drugs import DRUGS
+from app.study.characteristics import PlannedDose
+from app.study.doses import DRUGS
 
 
 def due_before(lengths: Sequence[float], starts_at: time | None, schedule: Sequence[PlannedDose]) -> list[str]:

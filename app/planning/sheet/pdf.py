@@ -19,9 +19,8 @@ from app.planning.sheet.content import HASH
 from app.planning.sheet.ink import INK, LINE, MUTED, clock, latin, shade
 from app.platform.signatures.service import SignatureState
 from app.study.cdbs_amplitude import held_settings
-from app.study.characteristics.service import fields_of
-from app.study.characteristics.words import MEDICATION, characteristics_words
-from app.study.doses.words import doses_words
+from app.study.characteristics import MEDICATION, characteristics_words, fields_of
+from app.study.doses import doses_words
 from ml.outcomes import ALL
 
 _CLOSING_MM = 32.0

@@ -24,10 +24,10 @@ from app.planning.visit_day.session_outcomes import differences, take_outcomes
 from app.platform.errors import BetaloopError, Conflict
 from app.study import access
 from app.study.blinding import require_known, stated_arm
-from app.study.sessions import logged
+from app.study.sessions import usable_steps
 from app.study.sessions.contradictions import control_recording
-from app.study.sessions.data import session_data
-from app.study.visits.service import require_unlocked
+from app.study.sessions.usable_steps import session_data
+from app.study.visits import require_unlocked
 from app.tables.plans import DayEntry
 from app.tables.sessions import Controller, StudySession
 from app.tables.uploads import SessionProposal
@@ -179,7 +179,7 @@ def _planned(line: PlanLine, times: dict[int, SlotTimes]) -> Planned:
 
 def _done(db: Session, session: StudySession) -> Done:
     recording = control_recording(session)
-    slot = logged.slot_of_recording(db, recording)
+    slot = usable_steps.slot_of_recording(db, recording)
     # a number that this participant's plans do not have, or have for another session, may be that of any slot here
     of_log = None if slot is None else slot.slot_id if slot.planned is not None else NO_SLOT
     # while the key is sealed a stated or guessed controller counts for nothing: where it were put to would tell what ran there
@@ -193,7 +193,7 @@ def _done(db: Session, session: StudySession) -> Done:
         session.started_at,
         session.plan_item_id,
         of_log,
-        logged.rehearsed(recording),
+        usable_steps.rehearsed(recording),
     )
 
 

@@ -41,9 +41,9 @@ from app.platform.errors import BetaloopError, Invalid, NotFound
 from app.platform.web.forms import FormValues, field_notes, parse, renamed
 from app.platform.web.schemas import Model
 from app.platform.web.templates import STATIC, render
-from app.study.adverse_events.words import EVENT_KINDS
+from app.study.adverse_event_types import EVENT_KINDS
 from app.study.deps import CurrentVisit, VisitViewed
-from app.study.doses.words import DRUG_NAMES
+from app.study.doses import DRUG_NAMES
 from app.tables.adverse_events import EventKind
 from app.tables.visits import Visit
 

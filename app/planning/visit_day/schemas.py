@@ -12,7 +12,7 @@ from uuid import UUID
 from pydantic import AfterValidator, Field, Strict, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
-from app.study.characteristics.schemas import PlannedDose
+from app.study.characteristics import PlannedDose
 from app.tables.adverse_events import EventKind
 from app.tables.visits import Drug
 

@@ -13,7 +13,7 @@ from app.platform.database import now
 from app.study import access
 from app.study.access import may
 from app.study.blinding import CONTROLLER_NAMES, may_know
-from app.study.characteristics.service import fields_of
+from app.study.characteristics import fields_of
 from app.tables.plans import PlanItem
 from app.tables.sessions import Controller
 

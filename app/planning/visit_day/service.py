@@ -25,13 +25,12 @@ from app.planning.visit_day.session_outcomes import is_stop, locked_session, sto
 from app.platform.database import now
 from app.platform.errors import BetaloopError, Conflict, Forbidden, Invalid, NotFound
 from app.settings import get_settings
-from app.study import access
-from app.study.adverse_events import repository as events
-from app.study.adverse_events.schemas import AdverseEventIn
-from app.study.adverse_events.service import add_adverse_event, take_back_entry
-from app.study.doses import service as doses
-from app.study.doses.schemas import DoseIn
-from app.study.visits.service import require_unlocked
+from app.study import access, doses
+from app.study import adverse_events as events
+from app.study.adverse_event_types import AdverseEventIn
+from app.study.adverse_events import add_adverse_event, take_back_entry
+from app.study.doses import DoseIn
+from app.study.visits import require_unlocked
 from app.tables.adverse_events import EventKind, Severity
 from app.tables.learning import Policy
 from app.tables.plans import DayEntry, Plan, PlanItem

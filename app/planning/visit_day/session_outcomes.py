@@ -15,11 +15,11 @@ from app.planning import wording
 from app.planning.visit_day import repository
 from app.planning.visit_day.record import GRADED, MILD, Entry, attempt_at, moment, outcome_of, said_of, standing
 from app.platform.database import set_reason
-from app.study.adverse_events import repository as events
-from app.study.adverse_events.schemas import AdverseEventIn
-from app.study.adverse_events.service import add_adverse_event, take_back_entry
+from app.study import adverse_events as events
+from app.study.adverse_event_types import AdverseEventIn
+from app.study.adverse_events import add_adverse_event, take_back_entry
 from app.study.outcomes.service import follow_day
-from app.study.visits.service import require_unlocked
+from app.study.visits import require_unlocked
 from app.tables.plans import DayEntry
 from app.tables.sessions import StudySession
 from app.tables.visits import Visit

@@ -21,10 +21,9 @@ from app.platform.errors import Invalid
 from app.platform.web.charts import counted
 from app.platform.web.numbers import stated
 from app.study import repository
-from app.study.adverse_events.repository import stops_of_session
-from app.study.outcomes import repository as of_files
+from app.study.adverse_events import stops_of_session
 from app.study.outcomes import tremor
-from app.study.outcomes import values as outcome_values
+from app.study.outcomes import values as of_files
 from app.study.outcomes.tremor import Minutes
 from app.study.outcomes.values import Derived
 from app.tables.adverse_events import AdverseEvent, AdverseEventRevision, EventKind, Severity
@@ -150,7 +149,7 @@ def derive_for_session(db: Session, session: StudySession) -> list[str]:
     Returns:
         Sentences on what was derived, what was not and why, and where a person's value disagrees. Empty where no file speaks of it.
     """
-    found = outcome_values.derive(db, session)
+    found = of_files.derive(db, session)
     if session.status != "confirmed":
         return [f"Session {session.id} is proposed: its outcomes are derived when it is confirmed."] if found else []
     if session.visit.locked:
@@ -241,7 +240,7 @@ def take_derived(db: Session, session: StudySession, name: str, shown: float, au
     Raises:
         Invalid: the files give another value by now, or none.
     """
-    found = next((d for d in outcome_values.derive(db, session) if d.name == name and d.value is not None), None)
+    found = next((d for d in of_files.derive(db, session) if d.name == name and d.value is not None), None)
     if session.status != "confirmed" or found is None or found.value is None or abs(found.value - shown) > 1e-6 * max(1.0, abs(shown)):
         raise Invalid("The uploaded files give another value by now.", "Look at the value on this page and decide again.")
     repository.lock_session(db, session)

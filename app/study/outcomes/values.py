@@ -2,25 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from datetime import timedelta
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime, timedelta
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from app.platform.errors import Invalid
 from app.platform.web.numbers import stated
 from app.study import repository
-from app.study.outcomes import repository as of_files
-from app.study.outcomes import tremor
+from app.study.outcomes import fields, tremor
+from app.study.outcomes.fields import FAR, USUAL, Question, question
 from app.study.outcomes.tremor import SessionMinutes
 from app.study.recordings.facts import unknown_clock
-from app.tables.outcomes import GraspTest
+from app.tables.outcomes import GraspTest, TremorSeries
 from app.tables.participants import CharacteristicsVersion, Hemisphere
 from app.tables.sessions import StudySession
 from ml.outcomes import BY_FIELD
 from ml.qoc import PLAUSIBLE_INTERVAL_S, TremorReading, grasp_frequency, read_tremor
+
+# Queries of what tremor and grasp files gave.
+
+
+def tremor_series(
+    db: Session, participant_id: int, start: datetime, stop: datetime, but_file_id: int | None = None
+) -> Sequence[TremorSeries]:
+    """Files of minutes of tremor that reach into a stretch of time, oldest first; one of them can be left out, for each may be a year."""
+    reaching = (TremorSeries.last_end_at > start) & (TremorSeries.first_start_at < stop)
+    own = select(TremorSeries).where(TremorSeries.participant_id == participant_id, reaching, TremorSeries.removed_at.is_(None))
+    if but_file_id is not None:
+        own = own.where(TremorSeries.upload_file_id != but_file_id)
+    return db.scalars(own.order_by(TremorSeries.upload_file_id)).all()
+
+
+def tremor_series_of_file(db: Session, participant_id: int, upload_file_id: int) -> TremorSeries | None:
+    """The minutes of tremor that a file gave."""
+    own = (TremorSeries.participant_id == participant_id) & (TremorSeries.upload_file_id == upload_file_id)
+    return db.scalar(select(TremorSeries).where(own, TremorSeries.removed_at.is_(None)))
+
+
+def grasp_tests(db: Session, session_id: int) -> Sequence[GraspTest]:
+    """The grasp tests of a session, oldest file first."""
+    mine = (GraspTest.session_id == session_id) & GraspTest.removed_at.is_(None)
+    return db.scalars(select(GraspTest).where(mine).order_by(GraspTest.upload_file_id, GraspTest.id)).all()
+
+
+def grasp_tests_of_file(db: Session, upload_file_id: int) -> Sequence[GraspTest]:
+    """The grasp tests that a file gave, of whatever session."""
+    return db.scalars(select(GraspTest).where(GraspTest.upload_file_id == upload_file_id, GraspTest.removed_at.is_(None))).all()
+
 
 MIN_COVERAGE = 0.9
 """Share of a session that minutes must cover. What they do not cover counts as time without tremor (the paper divides by the whole
@@ -118,7 +152,7 @@ def tremor_outcome(db: Session, session: StudySession) -> TremorOutcome | None:
         return None
     start = session.started_at.timestamp()
     stop_at = session.started_at + timedelta(seconds=session.duration_s)
-    series = of_files.tremor_series(db, session.visit.participant_id, session.started_at, stop_at)
+    series = tremor_series(db, session.visit.participant_id, session.started_at, stop_at)
     uploads = repository.uploads_of_files(db, [s.upload_file_id for s in series])
     names = {file: f"upload {upload}" for file, upload in uploads.items()}
     chosen = tremor.within(series, start, start + session.duration_s, names)
@@ -156,7 +190,7 @@ def grasp_outcome(db: Session, session: StudySession) -> GraspOutcome | None:
     with the symptoms, as in the paper. A test of the other hand alone gives no value until a person enters it. Only where nobody has
     stated the hand, the one contralateral to the session's hemisphere is taken, else the mean of both.
     """
-    rows = of_files.grasp_tests(db, session.id)
+    rows = grasp_tests(db, session.id)
     if not rows:
         return None
     newest = {row.hand: row for row in rows}
@@ -242,3 +276,45 @@ def _with_role(view: GraspView, newest: Mapping[Hemisphere | None, GraspTest], u
     if newest[view.row.hand] is not view.row:
         return replace(view, role="replaced by a newer test of this hand")
     return replace(view, role="counts", counts=True) if view.row.id in used else replace(view, role="the other hand counts")
+
+
+# What is asked about unusual values before they are kept: typed, and a person's word answers it.
+
+
+class Unusual(Invalid):
+    """Values that a person has to confirm; `questions` has them."""
+
+    def __init__(self, questions: Sequence[Question]) -> None:
+        super().__init__(fields.UNUSUAL, fields.UNUSUAL_HINT, questions=[_told(q) for q in questions])
+        self.questions = tuple(questions)
+
+
+def require_sure(
+    given: Mapping[str, Any], sure: Collection[str] | None, known: object = None, others: Mapping[str, Sequence[float]] | None = None
+) -> None:
+    """Raises Unusual for values outside the usual that nobody has confirmed; those that stand already are not asked about again.
+
+    Args:
+        given: name to value. known: the row with the present values.
+        sure: names that a person has confirmed; None where no person can be asked, as of a program's call: nothing is asked then.
+        others: by name, values of the visit's other sessions.
+    """
+    if sure is None:
+        return
+    asked = [
+        question(name, value, (others or {}).get(name, ()))
+        for name, value in given.items()
+        if (name in USUAL or name in FAR) and value != getattr(known, name, None)
+    ]
+    refuse(replace(q, confirmed=q.field in sure) for q in asked if q is not None)
+
+
+def refuse(asked: Iterable[Question]) -> None:
+    """Raises Unusual with all questions where one is not confirmed, so that an answer to one is not lost while another is open."""
+    found = list(asked)
+    if not all(q.confirmed for q in found):
+        raise Unusual(found)
+
+
+def _told(asked: Question) -> dict[str, Any]:
+    return {k: v for k, v in asdict(asked).items() if v is not None} | {"text": fields.unusual(asked)}

@@ -2,14 +2,118 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import datetime as dt
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
+from pydantic import Field
+from sqlalchemy import select
+from sqlalchemy.orm import Session, joinedload
+
 from app.platform.web.numbers import stated
+from app.platform.web.schemas import Model
 from app.tables.recordings import Recording
+from app.tables.sessions import StudySession
+from app.tables.visits import Visit
 from ml.formats import lead_in_words
 from ml.formats.rejection import REJECTED_WORDS, Rejected
+
+# API types of what a device keeps beside sessions.
+
+
+class TrendOut(Model):
+    """Averages over ten minutes of one side."""
+
+    side: str
+    unix_s: list[float] = Field(description="Times of the averages, Unix seconds.")
+    power: list[float | None] = Field(description="Sensed power, device units.")
+    amplitude_ma: list[float | None]
+
+
+class DeviceSpectrumOut(Model):
+    """A spectrum that the device made."""
+
+    side: str | None
+    at: datetime | None = Field(description="Of a snapshot; null of a survey.")
+    label: str = Field(description="The patient's event, a known word or a number.")
+    channel: str = Field(description="Contacts of a survey.")
+    artifact: str = Field(description="What the device says of artefacts in a survey.")
+    hz: list[float]
+    magnitude: list[float] = Field(description="uVp, as the device gives it.")
+
+
+class TherapyProgramOut(Model):
+    """One side's program of a therapy group; null where the report does not tell."""
+
+    side: str
+    amplitude_ma: float | None
+    lower_ma: float | None
+    upper_ma: float | None
+    rate_hz: float | None
+    pulse_width_us: float | None
+    contacts: str
+    sensing_hz: float | None
+
+
+class TherapyGroupOut(Model):
+    """A therapy group as it was at the end of a programming session."""
+
+    at: datetime | None
+    name: str
+    active: bool
+    programs: list[TherapyProgramOut]
+
+
+class DeviceEventOut(Model):
+    """An event that the patient marked or the device logged, an annotation or a symptom rating."""
+
+    at: datetime
+    kind: str = Field(description="patient, device, annotation or rating.")
+    label: str = Field(description="Known words, or the event's number: other names and texts are not stored.")
+    value: float | None = Field(description="Of a rating, 0 to 100 on the scale of the report; null of everything else.")
+
+
+class DeviceHistoryOut(Model):
+    """What one report tells of its device's own history; what it does not hold is empty."""
+
+    recording_id: int
+    device: str = Field(description="Pseudonym of the device.")
+    reported_at: datetime | None
+    trends: list[TrendOut]
+    snapshots: list[DeviceSpectrumOut]
+    surveys: list[DeviceSpectrumOut]
+    groups: list[TherapyGroupOut]
+    events: list[DeviceEventOut]
+    battery_percent: float | None
+    battery_months: float | None
+
+
+# Queries of what recordings say beside their traces.
+
+
+def histories(db: Session, participant_id: int) -> Sequence[Recording]:
+    """What devices of a participant told of their own history, the newest first."""
+    query = select(Recording).options(joinedload(Recording.device)).where(Recording.participant_id == participant_id)
+    query = query.where(Recording.details["settings"]["section"].astext == "history")
+    return db.scalars(query.order_by(Recording.started_at.desc().nulls_last(), Recording.id.desc())).all()
+
+
+def sealed_days(db: Session, participant_id: int) -> frozenset[dt.date]:
+    """Days (UTC) of a participant's visits whose blinded plan's key is sealed, and those on which their sessions were held."""
+    sealed = (Visit.participant_id == participant_id) & Visit.sealed
+    dated = db.scalars(select(Visit.date).where(sealed, Visit.date.is_not(None)))
+    began = db.scalars(select(StudySession.started_at).join(Visit).where(sealed, StudySession.started_at.is_not(None)))
+    return frozenset([*(d for d in dated if d), *(at.astimezone(dt.UTC).date() for at in began if at)])
+
+
+def with_battery(db: Session, participant_id: int) -> Sequence[Recording]:
+    """Recordings and reports that tell the charge or voltage of the stimulator's battery, the newest first."""
+    query = select(Recording).options(joinedload(Recording.device)).where(Recording.participant_id == participant_id)
+    query = query.where(Recording.details["settings"]["battery"].astext.is_not(None), Recording.superseded_by_id.is_(None))
+    return db.scalars(query.order_by(Recording.started_at.desc().nulls_last(), Recording.id.desc())).all()
+
 
 CLOCKS = {
     "pc": "clock of the PC that recorded (packet times)",

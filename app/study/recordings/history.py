@@ -5,12 +5,122 @@ Everything in it was reduced to numbers, times and known words before it was sto
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
+import numpy as np
+from sqlalchemy.orm import Session
+
+from app.study.recordings import facts
+from app.study.sessions.usable_steps import limits_and_policy
 from app.tables.recordings import Recording
+from app.tables.sessions import Controller
+
+# What stimulators told of their batteries: read from the device, and no assumption.
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One reading; None for what the device does not tell.
+
+    Attributes:
+        recording_id: the recording or report that holds it. at: its start. device: its kind and pseudonym. hemisphere: of the recording.
+        percent: charge. voltage_v: V. months_left: as the device itself estimates them.
+    """
+
+    recording_id: int
+    at: datetime | None
+    device: str
+    hemisphere: str | None
+    percent: float | None
+    voltage_v: float | None
+    months_left: float | None
+
+
+def readings(db: Session, participant_id: int) -> list[Reading]:
+    """Readings of a participant's stimulators, the newest first."""
+    found = []
+    for recording in facts.with_battery(db, participant_id):
+        battery = recording.details["settings"]["battery"]
+        device = f"{recording.device.kind.replace('_', ' ')} {recording.device.pseudonym}"
+        values = (battery.get(name) for name in ("percent", "voltage_v", "months_left"))
+        found.append(Reading(recording.id, recording.started_at, device, recording.hemisphere, *values))
+    return found
+
+
+# What the tablet took for its decisions, and of its battery, by the logs of its controller: measured there, and uploaded with the log.
+
+LEAST_FALL = 1.0
+"""Charge, %, that must have gone for a whole charge's hours to be told: what operating systems tell a charge in."""
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Time that one whole decision takes on the tablet, ms, as the paper's table has it.
+
+    Attributes:
+        mean, sd: over decisions. decisions: timed. sessions: with a log that tells.
+    """
+
+    mean: float
+    sd: float
+    decisions: int
+    sessions: int = 1
+
+
+@dataclass(frozen=True)
+class Battery:
+    """Charge of the tablet's own battery, %, at the first and the last row of a log that knows it, and the minutes between them."""
+
+    first: float
+    last: float
+    minutes: float
+
+    @property
+    def hours_of_a_charge(self) -> float | None:
+        """What a whole charge would last if it went on falling as in this session, hours; None where it hardly fell."""
+        fall = self.first - self.last
+        return self.minutes / 60 * 100 / fall if fall >= LEAST_FALL else None
+
+
+@dataclass(frozen=True)
+class Runtime:
+    """One session on its tablet; None where the log does not tell."""
+
+    latency: Latency | None
+    battery: Battery | None
+
+
+def of_recording(recording: Recording) -> Runtime | None:
+    """What a controller's log tells of its tablet; None for other recordings and for logs of before it was measured."""
+    said = limits_and_policy(recording)
+    if said is None:
+        return None
+    timed, charge, minutes = said.get("latency_us"), said.get("tablet_battery_percent"), said.get("tablet_battery_minutes")
+    latency = Latency(timed["mean"] / 1000, timed["std"] / 1000, int(timed["n"])) if timed else None
+    battery = Battery(float(charge[0]), float(charge[1]), float(minutes)) if charge and minutes else None
+    return Runtime(latency, battery) if latency or battery else None
+
+
+def by_controller(found: Iterable[tuple[Controller, Runtime | None]]) -> dict[Controller, Latency]:
+    """Latency by controller over sessions: the mean of all timed decisions, and their standard deviation, within and between sessions."""
+    each: Mapping[Controller, list[Latency]] = defaultdict(list)
+    for controller, runtime in found:
+        if runtime is not None and runtime.latency is not None:
+            each[controller].append(runtime.latency)
+    return {controller: _pooled(own) for controller, own in each.items()}
+
+
+def _pooled(own: list[Latency]) -> Latency:
+    n = np.array([one.decisions for one in own], dtype=np.float64)
+    means, sds = np.array([one.mean for one in own]), np.array([one.sd for one in own])
+    mean = float(np.sum(n * means) / n.sum())
+    variance = float(np.sum(n * (sds**2 + (means - mean) ** 2)) / n.sum())
+    return Latency(mean, variance**0.5, int(n.sum()), len(own))
+
 
 _CLOCKS = (timedelta(hours=-12), timedelta(0), timedelta(hours=14))
 """The latest, the middle and the earliest clock on earth against UTC: a day lies within what they call it."""

@@ -13,12 +13,12 @@ from app.platform.errors import Conflict, Invalid
 from app.study import blinding, repository
 from app.study.access import require
 from app.study.outcomes import service as outcomes
+from app.study.outcomes import values as values_rules
 from app.study.schemas import DerivedChoice, QocIn, SessionChange
-from app.study.sessions import repeated
+from app.study.sessions import designs
 from app.study.sessions.repository import other_values
 from app.study.traces import NO_CONTROL, control_programs
-from app.study.usual import questions
-from app.study.visits.service import require_unlocked
+from app.study.visits import require_unlocked
 from app.tables.outcomes import QocRevision
 from app.tables.sessions import Controller, StudySession
 from ml.outcomes import FIELDS, OUTCOMES, enumerated
@@ -44,7 +44,7 @@ def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller
     if known is None and all(value is None for value in merged.values()):
         raise Invalid("No outcome was given.", f"Enter at least one of {enumerated([o.label.lower() for o in OUTCOMES])}.")
     others = {o.field: other_values(db, session, o) for o in OUTCOMES if o.far is not None}
-    questions.require_sure(given, values.sure, known, others)
+    values_rules.require_sure(given, values.sure, known, others)
     same = {name for name, value in merged.items() if value == getattr(known, name, None)}
     kept = [name for name in (known.derived if known else ()) if name in same]
     followed = [name for name in (known.from_day if known else ()) if name in same]
@@ -75,7 +75,7 @@ def change_session(db: Session, session: StudySession, change: SessionChange, ca
         blinding.assign(session, controller, policy_id)
     check_control(db, session, given)
     if "excluded_reason" in given and not (given["excluded_reason"] or "").strip() and session.excluded_reason is not None:
-        repeated.refuse(db, session)
+        designs.refuse(db, session)
     stopped_before = session.stopped_reason
     for name, value in given.items():
         if name in ("excluded_reason", "stopped_reason"):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from app.platform.web.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, counted, figure, horizontal
 from app.platform.web.numbers import hover, number, stated
 from app.study.recordings.charts import TIME
-from app.study.sessions.data import SessionData
+from app.study.sessions.usable_steps import SessionData
 from app.study.traces import amplitude_program, session_offset_s
 from ml.mdp import AMPLITUDE_TOLERANCE
 

@@ -14,9 +14,9 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import access, blinding, repository
 from app.study.schemas import ConditionsChange, ConditionsFields
-from app.study.sessions import designs, logged, programming
+from app.study.sessions import designs, usable_steps
 from app.study.traces import StepTable, driving, step_table
-from app.study.visits.service import require_unlocked
+from app.study.visits import require_unlocked
 from app.tables.participants import SettingsVersion
 from app.tables.recordings import Recording
 from app.tables.sessions import Controller, SessionConditions, StudySession
@@ -102,7 +102,7 @@ def _steps(db: Session, session: StudySession) -> StepTable | None:
 def _of_recordings(db: Session, session: StudySession, table: StepTable | None) -> dict[str, Any]:
     """What recordings, visit and bundles tell of a session's conditions."""
     values: dict[str, Any] = dict(zip(("min_ma", "max_ma"), _limits(db, session) or (None, None), strict=True))
-    values["programming"] = [p.as_json() for p in programming.of_session(session)]
+    values["programming"] = [p.as_json() for p in designs.programs_of_session(session)]
     values["lead_amplitude_ma"] = lead_amplitude_ma(table) if table is not None else None
     values["cdbs_amplitude_ma"] = table.cdbs_ma if table is not None else None
     return values
@@ -141,7 +141,7 @@ def _add(db: Session, session: StudySession, values: dict[str, Any], origin: str
 def _limits(db: Session, session: StudySession) -> tuple[float, float] | None:
     """Amplitude limits in force, mA: the controller's by its log, else the device's for the controlled program, else the bundle's."""
     control = next((s.recording for s in session.segments if s.is_control), None)
-    said = logged.limits_and_policy(control) if control is not None else None
+    said = usable_steps.limits_and_policy(control) if control is not None else None
     if said is not None:
         return float(said["min_ma"]), float(said["max_ma"])
     found = _device_limits(db, session, control) if control is not None else None

@@ -1,4 +1,4 @@
-"""Where what was said of a session (visit, controller, side, start) is not what its recordings tell. Words: `app.study.wording`."""
+"""Where what was said of a session (visit, controller, side, start) is not what its recordings tell; words: `wording.py`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.platform.errors import Invalid
 from app.study import blinding
-from app.study.doses.since import disagreement_h
-from app.study.sessions import logged, repeated
+from app.study.doses import disagreement_h
+from app.study.sessions import designs, usable_steps
 from app.study.sessions.stimulation import SILENT_MA, Delivered, contradicts, delivered
 from app.study.traces import step_table
 from app.tables.recordings import Recording
@@ -89,7 +89,7 @@ def contradictions(db: Session, session: StudySession, visit_open: bool = False,
         facts = {"above": table.above_one, "steps": int(np.sum(table.t_s > 0)), "cdbs_ma": table.cdbs_ma}
         found.append(Contradiction(Kind.ABOVE_CDBS, facts))
     arm = blinding.stated_arm(session, SYSTEM)
-    ran = logged.of_recording(db, control_recording(session))
+    ran = usable_steps.of_recording(db, control_recording(session))
     if ran is not None:
         found += _of_log(ran, arm, table.cdbs_ma)
     found += _of_programs(sides)
@@ -119,7 +119,7 @@ def control_recording(session: StudySession) -> Recording:
 
 
 def _of_minutes(db: Session, session: StudySession) -> Iterator[Contradiction]:
-    for one in repeated.others(db, session):
+    for one in designs.others(db, session):
         facts = {"session": one.session_id, "recording": one.recording_id, "seconds": one.seconds, "counts": one.counts}
         yield Contradiction(Kind.REPEATED, facts | {"own": control_recording(session).id})
 
@@ -160,7 +160,7 @@ def _of_dose(session: StudySession) -> Iterator[Contradiction]:
         yield Contradiction(Kind.LAST_DOSE, {"stated": apart[0], "by_doses": apart[1]})
 
 
-def _of_log(ran: logged.Logged, arm: blinding.Arm | None, cdbs_ma: float | None) -> Iterator[Contradiction]:
+def _of_log(ran: usable_steps.Logged, arm: blinding.Arm | None, cdbs_ma: float | None) -> Iterator[Contradiction]:
     """Another policy than the one that wrote the log, or another cDBS amplitude than it was bounded by."""
     if ran.policy_id is None or (arm is not None and arm.policy_id != ran.policy_id):
         yield Contradiction(Kind.LOGGED_POLICY, {"logged": ran.policy_name, "number": ran.number})
@@ -171,11 +171,11 @@ def _of_log(ran: logged.Logged, arm: blinding.Arm | None, cdbs_ma: float | None)
 def _of_slot(db: Session, session: StudySession) -> Iterator[Contradiction]:
     """A log of a session that is planned at another visit, or nowhere any more; or of no session at all."""
     recording = control_recording(session)
-    if logged.rehearsed(recording):
+    if usable_steps.rehearsed(recording):
         yield Contradiction(Kind.BENCH)
-    elif logged.simulated(recording):
+    elif usable_steps.simulated(recording):
         yield Contradiction(Kind.SIMULATED)
-    slot = logged.slot_of_recording(db, recording)
+    slot = usable_steps.slot_of_recording(db, recording)
     if slot is None:
         return
     if slot.planned is None or slot.planned.plan_status != "approved":

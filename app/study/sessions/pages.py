@@ -19,25 +19,25 @@ from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.numbers import typed
 from app.platform.web.templates import render
 from app.study import access, repository
-from app.study.adverse_events.repository import events_of_session
-from app.study.adverse_events.words import EVENT_KINDS, EVENT_SEVERITIES
+from app.study.adverse_event_types import EVENT_KINDS, EVENT_SEVERITIES
+from app.study.adverse_events import events_of_session
 from app.study.blinding import CONTROLLER_NAMES, arm, may_know, require_known
-from app.study.data_queries.repository import not_closed_of_session
+from app.study.data_queries import not_closed_of_session
 from app.study.deps import CurrentSession, SessionViewed
-from app.study.doses.since import since_last_dose
-from app.study.form_changes import Shown, own_changes
-from app.study.recordings import tablet
+from app.study.doses import since_last_dose
+from app.study.recordings import history
 from app.study.schemas import ConditionsChange, DerivedChoice, QocIn, SessionChange
 from app.study.sessions import changes as study_changes
 from app.study.sessions import conditions, designs
 from app.study.sessions import view as session_view
 from app.study.sessions.charts import beta_by_amplitude, in_chart_table, notes, operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
-from app.study.sessions.data import SessionData, session_data
 from app.study.sessions.stimulation import beside, delivered
+from app.study.sessions.usable_steps import SessionData, session_data
 from app.study.sessions.wording import ACTIVITIES, drawn_words, sentences
+from app.study.settings_form import Shown, own_changes
 from app.study.traces import NO_CONTROL, control_programs, session_offset_s
-from app.study.visits.blinded import blinded_page
+from app.study.visits import blinded_page
 from app.tables.outcomes import QocRevision
 from app.tables.recordings import Recording
 from app.tables.sessions import StudySession
@@ -320,7 +320,7 @@ def _page(
         event_kinds=EVENT_KINDS,
         event_severities=EVENT_SEVERITIES,
         drawn=_drawn(db, session, data, caller),
-        ran_on=tablet.of_recording(control_recording(session)),
+        ran_on=history.of_recording(control_recording(session)),
         beside=_beside(db, session, data),
         ran_under=dict(_conditions_revisions(session)[-1].fields)
         | {"conditions_reason": ""}

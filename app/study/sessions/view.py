@@ -29,7 +29,7 @@ from app.study.recordings.facts import (
     valid_shares,
 )
 from app.study.sessions.charts import control_chart
-from app.study.sessions.data import SessionData
+from app.study.sessions.usable_steps import SessionData
 from app.study.traces import AMPLITUDE_STREAM, driving, session_offset_s, shown_table
 from app.tables.recordings import Recording, Trace
 from app.tables.sessions import StudySession

@@ -20,8 +20,7 @@ from app.main import create_app
 from app.platform.database import transaction
 from app.platform.migrate import migrate
 from app.settings import get_settings
-from app.study.enrolment.schemas import ParticipantIn
-from app.study.enrolment.service import enrol
+from app.study.participation import ParticipantIn, enrol
 from app.tables.accounts import Role
 
 RATE_HZ, LEAD_S = 250, 20

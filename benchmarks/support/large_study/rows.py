@@ -21,8 +21,7 @@ from app.learning.policies.baselines import constant_onnx, ensure_baselines
 from app.learning.snapshots.service import collect, take_snapshot
 from app.platform import files
 from app.study import blinding
-from app.study.enrolment.schemas import ParticipantIn
-from app.study.enrolment.service import enrol
+from app.study.participation import ParticipantIn, enrol
 from app.study.traces import pack
 from app.tables.accounts import Role
 from app.tables.jobs import Job, JobEvent, JobStatus, JobStep

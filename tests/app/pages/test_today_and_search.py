@@ -17,8 +17,7 @@ from app.overview.overview_web import SOON
 from app.overview.state import Actor, Task, states
 from app.platform.jobs import service as jobs
 from app.settings import get_settings
-from app.study.enrolment.schemas import ParticipantIn
-from app.study.enrolment.service import enrol
+from app.study.participation import ParticipantIn, enrol
 from app.study.repository import participant_by_code
 from app.tables.jobs import Job, JobStatus
 from app.tables.participants import Participant

@@ -26,8 +26,8 @@ from app.simulation.design import STATE_FILE, design
 from app.simulation.run import ACCOUNT, SIGNER, simulate
 from app.study import repository as study
 from app.study.blinding import arm
-from app.study.sessions.data import session_data
-from app.study.settings.service import mdp_settings
+from app.study.sessions.usable_steps import session_data
+from app.study.settings import mdp_settings
 from app.tables.audit import AuditEvent
 from app.tables.evaluations import Evaluation
 from app.tables.jobs import Job, JobStatus

@@ -10,13 +10,12 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.study import blinding, repository
-from app.study.enrolment import service as enrolment
-from app.study.enrolment.schemas import ParticipantIn
+from app.study import blinding, repository, visits
+from app.study import participation as enrolment
+from app.study.participation import ParticipantIn
 from app.study.schemas import VisitIn
-from app.study.settings.schemas import SettingsIn
+from app.study.settings_types import SettingsIn
 from app.study.traces import pack
-from app.study.visits import changes as visits
 from app.tables.participants import Hemisphere
 from app.tables.recordings import Device, Recording, Trace
 from app.tables.sessions import Controller, SessionSegment, StudySession

@@ -11,8 +11,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.platform.database import transaction
 from app.study import repository
-from app.study.margins.schemas import BOUNDS
-from app.study.margins.service import margins_of
+from app.study.margins import BOUNDS, margins_of
 from ml.qoc import Margins
 from tests.conftest import PASSWORD
 

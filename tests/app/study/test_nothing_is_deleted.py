@@ -14,8 +14,8 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
 from app.ingest.proposals import service as proposals
-from app.study.outcomes import repository as of_files
 from app.study.outcomes import service as outcomes
+from app.study.outcomes import values as of_files
 from app.tables.audit import AuditEvent
 from app.tables.outcomes import GraspTest, TremorSeries
 from app.tables.sessions import StudySession

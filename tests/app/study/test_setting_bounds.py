@@ -12,7 +12,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.platform.database import transaction
-from app.study.settings.schemas import SETTING_BOUNDS, SettingsFields
+from app.study.settings_types import SETTING_BOUNDS, SettingsFields
 from app.tables.participants import Participant, SettingsVersion
 from app.tables.visits import CdbsAmplitude
 from tests.app.conftest import Upload

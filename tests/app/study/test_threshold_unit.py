@@ -6,11 +6,11 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.study import settings
 from app.study.sessions.charts import control_chart
-from app.study.sessions.data import session_data
 from app.study.sessions.pages import summarise
-from app.study.settings import service as settings
-from app.study.settings.schemas import SettingsIn
+from app.study.sessions.usable_steps import session_data
+from app.study.settings_types import SettingsIn
 from app.tables.sessions import StudySession
 
 

@@ -18,7 +18,7 @@ from app.evaluation.ranking.results import driven_sessions
 from app.learning.gate.service import decide
 from app.learning.snapshots.service import collect, take_snapshot
 from app.study.repository import participant_by_code, sessions_of_participant
-from app.study.sessions.data import failed_qoc_of
+from app.study.sessions.usable_steps import failed_qoc_of
 from app.tables.learning import GateChoice
 from app.tables.sessions import Controller
 from ml.ope.scale import outcome_table

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from app.ingest.proposals.thumbnail import thumbnail
-from app.study.sessions.data import SessionData
+from app.study.sessions.usable_steps import SessionData
 
 
 def data(beta: np.ndarray[Any, Any], amplitude_ma: np.ndarray[Any, Any]) -> SessionData:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from app.study.adverse_events.words import EVENT_KINDS
+from app.study.adverse_event_types import EVENT_KINDS
 from ml.rl import MlpPolicy
 from tests.app.evaluations import judge as judge
 from tests.app.evaluations import judged

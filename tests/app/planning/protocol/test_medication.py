@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import time
 
 from app.planning.protocol.medication import due_before
-from app.study.characteristics.schemas import PlannedDose
+from app.study.characteristics import PlannedDose
 from app.tables.visits import Drug
 
 SCHEDULE = [PlannedDose(drug=Drug.LEVODOPA, mg=mg, at=at) for mg, at in ((100.0, "07:00"), (50.0, "09:20"), (100.0, "12:00"))]

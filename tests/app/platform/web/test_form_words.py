@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from app.platform.errors import Invalid
 from app.platform.web.charts import counted
 from app.platform.web.forms import parse
-from app.study.enrolment.schemas import ParticipantIn
+from app.study.participation import ParticipantIn
 from app.study.schemas import QocIn
 
 

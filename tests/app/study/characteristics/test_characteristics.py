@@ -13,8 +13,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.platform.errors import Conflict
-from app.study.characteristics import service
-from app.study.characteristics.schemas import CharacteristicsFields, Lead, Target
+from app.study import characteristics
+from app.study.characteristics import CharacteristicsFields, Lead, Target
 from app.study.outcomes import service as outcomes
 from app.tables.participants import Hemisphere, Participant
 from app.tables.sessions import StudySession
@@ -24,7 +24,7 @@ LEFT, RIGHT = Hemisphere.LEFT, Hemisphere.RIGHT
 
 
 def state(db: Session, participant: Participant, seen: int = 0, **fields: object) -> None:
-    service.change_characteristics(db, participant, seen, CharacteristicsFields(**fields), "asked", SYSTEM)  # type: ignore[arg-type]
+    characteristics.change_characteristics(db, participant, seen, CharacteristicsFields(**fields), "asked", SYSTEM)  # type: ignore[arg-type]
 
 
 def grasped(db: Session, session: StudySession, file: int, hand: str, hz: float) -> list[str]:
@@ -57,10 +57,10 @@ def test_a_test_of_the_other_hand_alone_is_questioned_and_gives_no_value(
 
 def test_the_suggested_hand_is_opposite_the_stimulated_side(db: Session, study_session: StudySession) -> None:
     participant = study_session.visit.participant
-    assert service.suggested_hand(db, participant) is RIGHT
+    assert characteristics.suggested_hand(db, participant) is RIGHT
     study_session.hemisphere = None
     state(db, participant, leads=[Lead(hemisphere=RIGHT, target=Target.STN), Lead(hemisphere=LEFT, target=Target.GPI, stimulating="C+2-")])
-    assert service.suggested_hand(db, participant) is RIGHT
+    assert characteristics.suggested_hand(db, participant) is RIGHT
 
 
 def test_versions_follow_each_other_and_two_writers_are_told(db: Session, study_session: StudySession) -> None:

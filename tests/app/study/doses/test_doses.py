@@ -16,10 +16,8 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.platform import files
 from app.platform.database import new_session
-from app.study.doses import service
-from app.study.doses.drugs import DRUGS, levodopa_equivalent_mg
-from app.study.doses.schemas import DoseIn
-from app.study.doses.since import disagreement_h, since_last_dose
+from app.study import doses
+from app.study.doses import DRUGS, DoseIn, disagreement_h, levodopa_equivalent_mg, since_last_dose
 from app.study.schemas import SessionChange
 from app.study.sessions import changes
 from app.study.sessions.contradictions import Kind, contradictions
@@ -35,7 +33,7 @@ Upload = Callable[..., int]
 
 def take(db: Session, session: StudySession, drug: Drug, hours_before: float, mg: float = 100.0) -> None:
     draft = DoseIn(drug=drug, mg=mg, taken_at=START - timedelta(hours=hours_before))
-    service.add_dose(db, session.visit, draft, SYSTEM)
+    doses.add_dose(db, session.visit, draft, SYSTEM)
 
 
 def test_the_newest_dose_before_the_start_counts(db: Session, study_session: StudySession) -> None:

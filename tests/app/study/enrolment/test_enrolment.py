@@ -10,7 +10,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 from app.platform.database import new_session
-from app.study.enrolment.codes import CodeQuestion, questions
+from app.study.participation import CodeQuestion, questions
 from app.tables.audit import AuditEvent
 
 TODAY = date(2026, 11, 22)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.study.recordings.tablet import Battery, Latency, by_controller, of_recording
+from app.study.recordings.history import Battery, Latency, by_controller, of_recording
 from app.tables.recordings import Recording
 from app.tables.sessions import Controller
 

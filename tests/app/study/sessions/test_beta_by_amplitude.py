@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from app.study.sessions.charts import beta_by_amplitude, notes
-from app.study.sessions.data import SessionData
+from app.study.sessions.usable_steps import SessionData
 
 
 def data(amplitude_ma: np.ndarray[Any, Any], beta: np.ndarray[Any, Any]) -> SessionData:

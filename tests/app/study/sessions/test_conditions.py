@@ -12,7 +12,7 @@ from sqlalchemy import text
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
-from app.study.sessions.programming import Program, differences
+from app.study.sessions.designs import Program, differences
 from app.tables.participants import Hemisphere
 from tests.app.ingest.conftest import device_zip, table
 

@@ -1,1 +1,0 @@
-"""The end of a study or of one of its sites, and opening it again."""

@@ -1,1 +1,0 @@
-"""Whether a participant takes part: active, completed, withdrawn."""

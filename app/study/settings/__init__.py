@@ -1,1 +1,0 @@
-"""Settings of a participant: the form and its page."""

@@ -1,1 +1,0 @@
-"""Values that can be, but seldom are: what is usual, and what is asked about the rest."""

@@ -1,1 +1,0 @@
-"""Visits: their pages and the form that corrects one."""
