@@ -112,7 +112,7 @@ def sniff(path: Source) -> FileKind:
     if zipped:
         return _kind_of_zip(path)
     for one in DEVICES:
-        if head.startswith(one.magic) if one.magic else one.code.begins(head):
+        if (not one.magic or head.startswith(one.magic)) and one.code.begins(head):
             return one.kind
     text = head.lstrip(b"\xef\xbb\xbf \t\r\n")
     if text and len(head) < HEAD and text.strip(b"\0 \t\r\n,[]{}") == b"":

@@ -54,7 +54,7 @@ class DeviceFormat:
         upload: what to send, as part of a sentence.
         package: that has its `CODE`.
         sources: of beta, with the name of each that no other format has.
-        magic: first bytes, any of which makes a file one of this format; its package is then not asked.
+        magic: first bytes, without any of which a file is none of this format, so that its package is not asked.
         zipped: whether a zip that cannot be read is taken for one of this format, whose decoder then reports why.
     """
 
@@ -99,6 +99,15 @@ DEVICES = (
         package="ml.formats.xdf",
         sources={},
         magic=(b"XDF:",),
+    ),
+    DeviceFormat(
+        kind="edf",
+        device="EDF",
+        file="EDF or BDF recording",
+        upload="an EDF, EDF+ or BDF recording",
+        package="ml.formats.edf",
+        sources={},
+        magic=(b"0       ", b"\xffBIOSEMI"),
     ),
 )
 BY_KIND = {one.kind: one for one in DEVICES}

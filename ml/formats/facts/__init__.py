@@ -1,6 +1,6 @@
 """Facts about a format that decide which amplitude was on and when: clocks, counters, fields without a reading, changes of the dose.
 
-Each package of a format has one `FACTS`, and docs/ingest/formats.md has them all as a table.
+Each package of a format has one `FACTS`, and docs/ingest/facts.md has them all as a table.
 """
 
 from __future__ import annotations

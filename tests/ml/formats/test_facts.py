@@ -1,4 +1,4 @@
-"""The table of facts in docs/ingest/formats.md: one row per fact that the formats' packages have, word for word."""
+"""The table of facts in docs/ingest/facts.md: one row per fact that the formats' packages have, word for word."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from ml.formats import DEVICES, DeviceFormat
 from ml.formats.facts import Facts
 
-DOCUMENT = Path(__file__).parents[3] / "docs/ingest/formats.md"
+DOCUMENT = Path(__file__).parents[3] / "docs/ingest/facts.md"
 
 
 def rows(name: str, facts: Facts) -> list[str]:

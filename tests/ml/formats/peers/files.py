@@ -50,5 +50,67 @@ def write_xdf(path: Path, rng: np.random.Generator) -> Written:
     return Written(truth, {n: n.replace(" 0", " +0").replace(" 1-", " +1-") for n in truth.channels})
 
 
-WRITERS: dict[str, Callable[[Path, np.random.Generator], Written]] = {"xdf": write_xdf}
+def write_edf(path: Path, rng: np.random.Generator) -> Written:
+    """Write EDF+ by edfio or pyedflib, or BDF+ by pyedflib; for an EDF+D the records that were lost are taken out of the bytes.
+
+    edfio writes no gaps, so the file is written whole and keeps the time-keeping annotations of the records that stay.
+    """
+    import edfio
+
+    rate, record = 250.0, 250
+    lossy = bool(rng.integers(2))
+    truth = make_truth(rng, rate_hz=rate, gaps=int(rng.integers(1, 5)) if lossy else 0, steps=int(rng.integers(0, 5)), block=record)
+    unit, scale = [("uV", 1.0), ("mV", 1e-3)][int(rng.integers(2))]
+    whole = {name: np.zeros(truth.total) for name in truth.channels}
+    at = np.rint(truth.t_s * rate).astype(int)
+    for name, x in truth.channels.items():
+        whole[name][at] = np.round(np.clip(x, -40, 40) / (100 / 65535)) * (100 / 65535)
+        truth.channels[name][:] = np.clip(x, -40, 40)
+    marks = [(t, str(rng.choice(WORDS)).format(a=a)) for t, a in truth.steps]
+    bdf = not lossy and bool(rng.integers(2))
+    if bdf:
+        _by_pyedflib(path, whole, marks, rate, scale, unit)
+    else:
+        signals = [
+            edfio.EdfSignal(scale * x, rate, label=n, physical_dimension=unit, physical_range=(-50 * scale, 50 * scale))
+            for n, x in whole.items()
+        ]
+        edfio.Edf(signals, data_record_duration=1.0, annotations=[edfio.EdfAnnotation(t, None, text) for t, text in marks]).write(path)
+    steps = truth.steps
+    if lossy:
+        gone = [g + k * record for g, size in truth.gaps for k in range(size // record)]
+        _take_records_out(path, {g // record for g in gone})
+        # an annotation is in the record of its time: one of a lost record is lost
+        steps = [(t, a) for t, a in truth.steps if int(t) * record not in gone]
+    names = {n: n.replace(" 0", " +0").replace(" 1-", " +1-") for n in truth.channels}
+    return Written(truth, names, 2 * 100 / 65535, pause=lossy, steps=steps)
+
+
+def _by_pyedflib(path: Path, whole: dict[str, np.ndarray], marks: list[tuple[float, str]], rate: float, scale: float, unit: str) -> None:
+    import pyedflib
+
+    with pyedflib.EdfWriter(str(path), len(whole), file_type=pyedflib.FILETYPE_BDFPLUS) as writer:
+        for i, name in enumerate(whole):
+            bounds = {"physical_min": -50 * scale, "physical_max": 50 * scale, "digital_min": -8388608, "digital_max": 8388607}
+            writer.setSignalHeader(
+                i, {"label": name, "dimension": unit, "sample_frequency": rate, "prefilter": "", "transducer": "", **bounds}
+            )
+        writer.writeSamples([scale * x for x in whole.values()])
+        for t, text in marks:
+            writer.writeAnnotation(t, -1, text)
+
+
+def _take_records_out(path: Path, numbers: set[int]) -> None:
+    raw = path.read_bytes()
+    count = int(raw[252:256])
+    size = 256 * (count + 1)
+    samples = [int(raw[256 + count * 216 + 8 * i : 264 + count * 216 + 8 * i]) for i in range(count)]
+    length = 2 * sum(samples)
+    records = [raw[size + k * length : size + (k + 1) * length] for k in range((len(raw) - size) // length)]
+    kept = [r for k, r in enumerate(records) if k not in numbers]
+    head = raw[:192] + b"EDF+D".ljust(44) + str(len(kept)).encode().ljust(8) + raw[244:size]
+    path.write_bytes(head + b"".join(kept))
+
+
+WRITERS: dict[str, Callable[[Path, np.random.Generator], Written]] = {"edf": write_edf, "xdf": write_xdf}
 """By kind."""
