@@ -94,6 +94,10 @@ class RawFile:
         key = self.key.read_bytes()
         return io.BufferedReader(_Encrypted(self.encrypted.open("rb", buffering=0), key), BUFFER)
 
+    def open_for_writing(self) -> BinaryIO:
+        """Open the file for plain bytes, which are encrypted as they are written."""
+        return _stream(self.encrypted.open("r+b", buffering=0), self.key.read_bytes())
+
     def sha256(self) -> str:
         """Compute the hash of the plain bytes, in hex."""
         with self.open() as stream:

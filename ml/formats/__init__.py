@@ -84,7 +84,10 @@ _OTHER_ARCHIVES = (
     ("RAR", 0, b"Rar!\x1a\x07"),
     ("tar", 257, b"ustar"),
 )
-"""Archives that are not unpacked: name, place and bytes of their mark. Sources: RFC 1952, POSIX, and the formats' specifications."""
+"""Archives that no decoder unpacks: name, place and bytes of their mark. An upload unpacks one layer of gzip and tar first.
+
+Sources: RFC 1952, POSIX, and the formats' specifications.
+"""
 
 
 _ZIPPED = next(one.kind for one in DEVICES if one.zipped)
@@ -106,7 +109,7 @@ def sniff(path: Source) -> FileKind:
     for archive, place, mark in _OTHER_ARCHIVES:
         if head.startswith(mark, place):
             hint = "Unpack it, zip the session's folder and upload that. A single report or table needs no archive."
-            raise UndecodableFile(f"this is a {archive} archive, and only zip archives are unpacked", "first bytes", hint)
+            raise UndecodableFile(f"this is a {archive} archive, which is not unpacked here", "first bytes", hint)
     if head.startswith(b"PAR1"):
         return "parquet"
     if zipped:

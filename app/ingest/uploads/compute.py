@@ -18,6 +18,7 @@ from ml import formats
 from ml.formats import ArchiveLimits, DecodeOptions, UndecodableFile, transfer
 from ml.formats.archive import reading_of_members
 from ml.formats.tables.mapping import TableMapping, find_mapping, preview_of, redact_mapped
+from ml.formats.unpacking import is_packed, unpack
 
 MAPPABLE = ("csv", "parquet", "tremor", "grasp")
 """Kinds of files that a column mapping may read."""
@@ -27,8 +28,8 @@ def clean(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
     """Take identity out of a file.
 
     Args:
-        params: `source` and `key` (paths of a `RawFile`), `target` (path), `secrets` (the folder of keys), `options`, `mappings` (the
-            study's column mappings).
+        params: `source` and an empty `room` to unpack it into (each the two paths of a `RawFile`), `target` (path), `secrets` (the folder
+            of keys), `options`, `mappings` (the study's column mappings).
         workdir: not used.
         report: takes the share that was read.
 
@@ -36,13 +37,19 @@ def clean(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
         `kind`, `redaction`, and `mapping`, the place of the column mapping that read it; or the `problem` that keeps it from being cleaned,
         what was `left_out` of its archive, if it is one, and the `preview` of a table.
     """
-    source, target = RawFile(Path(params["source"]), Path(params["key"])), Path(params["target"])
+    (source, room), target = (RawFile(*map(Path, params[name])) for name in ("source", "room")), Path(params["target"])
     options = options_of(params["options"])
     key = stored_secret(Path(params["secrets"]), "pseudonyms")
     mappings = [TableMapping.from_json(m) for m in params["mappings"]]
     kind: formats.FileKind | None = None
     mapping: int | None = None
+    unpacked: list[str] = []
+    ignored: list[str] = []
     try:
+        if is_packed(source):
+            with room.open_for_writing() as sink:
+                what, ignored = unpack(source, sink, options.archive)
+            source, unpacked = room, [f"{what} was unpacked"]
         kind = formats.sniff(source)
         mapping = find_mapping(source, mappings, key) if kind in MAPPABLE else None
         with reading_of_members(_told(report, "taking identity out")):
@@ -54,6 +61,7 @@ def clean(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
     except UndecodableFile as error:
         preview = preview_of(source, key) if mapping is not None or kind in MAPPABLE else None
         return {"problem": error.args_of(), "left_out": formats.left_out_of(source, options.archive), "preview": preview}
+    redaction.repaired[:0], redaction.ignored[:0] = unpacked, ignored
     return {"kind": kind, "redaction": asdict(redaction), "mapping": mapping}
 
 

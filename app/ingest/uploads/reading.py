@@ -14,7 +14,7 @@ from app.ingest import wording
 from app.platform import files
 from app.platform.jobs.children.child import Cause, ChildLimits
 from app.platform.jobs.children.limited import ChildEnded, run_limited
-from app.platform.raw_bytes import RawFile
+from app.platform.raw_bytes import RawFile, raw_file
 from app.settings import get_settings
 from ml.formats import DecodedFile, DecodeOptions, Redaction, UndecodableFile, transfer
 from ml.formats.tables.mapping import TableMapping
@@ -83,19 +83,23 @@ def clean(
         ReaderEnded: the child met a limit or was ended. ReaderFault: our decoder failed.
     """
     params = {
-        "source": os.path.abspath(source.encrypted),
-        "key": os.path.abspath(source.key),
+        "source": _paths_of(source),
         "target": os.path.abspath(target),
         "secrets": str(get_settings().data_dir.resolve() / "secrets"),
         "options": asdict(options),
         "mappings": [m.to_json() for m in mappings],
     }
     get_settings().secret("pseudonyms")  # made here, where it is missing: children only read it
-    found = _run(CLEAN, params, who, told)
+    with raw_file() as (_, room):
+        found = _run(CLEAN, {**params, "room": _paths_of(room)}, who, told)
     if "problem" in found:
         problem = UndecodableFile(*found["problem"])
         return Cleaned("unreadable", Redaction(ignored=found["left_out"]), problem, preview=found["preview"])
     return Cleaned(found["kind"], Redaction(**found["redaction"]), mapping=found["mapping"])
+
+
+def _paths_of(raw: RawFile) -> list[str]:
+    return [os.path.abspath(raw.encrypted), os.path.abspath(raw.key)]
 
 
 def decode(source: Path, kind: str, options: DecodeOptions, name: str, who: str = "", told: Told = lambda *_: None) -> DecodedFile:

@@ -13,10 +13,16 @@ from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
 from ml.formats.tables.columns import LFP_SCALE, TIME_SCALE, Columns, check_reach, checked_amplitude, compare_amplitudes
 from ml.formats.tables.numbers import known_unit
-from ml.signals import BRIDGE_S, Stretch, row_means
+from ml.signals import BRIDGE_S, Stretch, row_means, step_means
 
 GAP = 1.5
 """Two rows further apart than this many samples have a gap between them."""
+
+SPARSE = 0.5
+"""An amplitude in fewer rows than this share comes at its own, slower rate, as in tables that join streams of one device."""
+
+LONGEST_HOLD = 3.0
+"""After so many of its usual intervals without a new value the amplitude is unknown, as in the device's own log."""
 
 ROUND_RATE = 0.002
 """A rate this close to a whole number of Hz is that number: times are written with few decimals."""
@@ -195,8 +201,30 @@ def _amplitude(
         compare_amplitudes(given["amplitude_ma"], given.pop("amplitude_fraction"), report)
     out = []
     for role, values in given.items():
-        means, covered = row_means(np.maximum(t_s - t0_s, 0.0), values, np.full(t_s.size, 1.0 / rate), rows, options.period_s)
+        known = np.flatnonzero(np.isfinite(values))
+        if 1 < known.size < SPARSE * values.size:
+            means, covered = _sparse_means(t_s[known] - t0_s, values[known], rows, options.period_s)
+            report.flagged[:] = [text for text in report.flagged if not text.endswith(f"without a number in {role}: kept as gaps")]
+            every, longest = f"once in {round(values.size / known.size)} rows", f"{LONGEST_HOLD:g} intervals at most"
+            report.understood.append(f"{role} is given {every}: each value counts until the next, {longest}")
+        else:
+            means, covered = row_means(np.maximum(t_s - t0_s, 0.0), values, np.full(t_s.size, 1.0 / rate), rows, options.period_s)
         unit = "mA" if role == "amplitude_ma" else "fraction"
         details = {"column": columns.label(role)}
         out.append(step_trace(("amplitude", role, unit), "table", means, covered, options, details, t0_s + options.period_s))
     return out
+
+
+def _sparse_means(t_s: NDArray[np.float64], values: NDArray[np.float64], rows: int, period_s: float) -> tuple[NDArray[np.float64], ...]:
+    """Average per step values that each count from their time to the next one's; also compute the known share of each step.
+
+    Args:
+        t_s: of the values, from the first step's begin on, [n], n > 1. values: mA or fractions, [n], none missing.
+    """
+    steps = np.diff(t_s, append=np.inf)
+    usual = float(np.median(steps[:-1]))
+    silent = np.flatnonzero(steps > LONGEST_HOLD * usual)
+    times = np.concatenate((t_s, t_s[silent] + usual))
+    levels = np.concatenate((values, np.full(silent.size, np.nan)))
+    order = np.argsort(times, kind="stable")
+    return step_means(times[order], levels[order], float(times.max()), rows, period_s)

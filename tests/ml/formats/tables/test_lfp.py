@@ -214,3 +214,27 @@ def test_times_that_count_from_another_moment_are_asked_for(write, start_s):
 def test_a_session_whose_first_minutes_are_lost_is_read(write):
     text = "t_s,beta,amplitude_ma\n" + "".join(f"{130 + 2 * k},1,2\n" for k in range(100))
     assert decode(write(text)).recordings[0].duration_s == 328
+
+
+def combined(step_at=10.0, silent=(99.0, 99.0)):
+    """A table of 250 Hz that joins streams, as public toolboxes write it: an amplitude once in 125 rows, 1 mA and then 2 mA."""
+    out = ["t_s,lfp [uV],amplitude_ma"]
+    for k in range(20 * 250):
+        t = (k + 1) / 250
+        given = k % 125 == 0 and not silent[0] <= t < silent[1]
+        out.append(f"{t:.3f},{3 * np.sin(2 * np.pi * 20 * t):.4f},{(1.0 if t < step_at else 2.0) if given else 'NaN'}")
+    return "\n".join(out)
+
+
+def test_an_amplitude_once_in_125_rows_is_kept(write):
+    decoded = decode(write(combined()))
+    amplitude = trace(decoded, "amplitude")
+    np.testing.assert_allclose(amplitude.values, [1.0] * 5 + [2.0] * 5, atol=1e-6)
+    assert "amplitude_ma is given once in 125 rows" in repr(decoded.reports[0].understood)
+    assert "kept as gaps" not in repr(decoded.reports[0].flagged)
+
+
+def test_an_amplitude_that_falls_silent_is_unknown_until_it_is_given_again(write):
+    amplitude = trace(decode(write(combined(silent=(6.0, 12.0)))), "amplitude")
+    assert amplitude.valid.tolist() == [True] * 3 + [False] * 3 + [True] * 4
+    np.testing.assert_allclose(amplitude.values[amplitude.valid], [1.0] * 3 + [2.0] * 4, atol=1e-6)
