@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass, field
 from hashlib import sha256
 
-REDACTOR_VERSION = 6
+REDACTOR_VERSION = 7
 PSEUDONYM = re.compile(r"device-[0-9a-f]{16}")
 
 
@@ -37,3 +37,15 @@ def pseudonym(serial: str, key: bytes) -> str:
     if PSEUDONYM.fullmatch(serial):
         return serial
     return "device-" + hmac.new(key, serial.strip().upper().encode(errors="replace"), sha256).hexdigest()[:16]
+
+
+_NUMBER = re.compile(r"\s*([+-]?\d{1,6}(?:\.\d{1,12})?(?:[eE][+-]?\d{1,2})?)\s*", re.ASCII)
+
+
+def number_in(text: str) -> float | None:
+    """Read a number that is written as text, as some versions of a program do; None for anything else.
+
+    Longer whole numbers may be those of a person, and are not read.
+    """
+    found = _NUMBER.fullmatch(text)
+    return float(found[1]) if found else None

@@ -22,7 +22,7 @@ from ml.formats.percept.report import report_members
 from ml.formats.percept.report_json import HINT, SECTIONS, channel_names, moment, read_report
 from ml.formats.percept.words import EVENT_WORDS, cleaned
 from ml.formats.recording import UndecodableFile
-from ml.formats.redaction_record import Redaction, pseudonym
+from ml.formats.redaction_record import Redaction, number_in, pseudonym
 from ml.formats.source import Source
 
 EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -198,7 +198,7 @@ class _Scrubber:
             return shape.fullmatch(text) is not None
         if key.endswith(("DateTime", "Date", "date")):
             return moment(text) is not None
-        return is_known(text)
+        return is_known(text) or number_in(text) is not None
 
     def sentences(self) -> list[str]:
         """List what was removed, without showing any of it."""

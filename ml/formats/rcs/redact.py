@@ -27,7 +27,7 @@ from ml.formats.rcs.packets.json_elements import JsonNotes, read_elements
 from ml.formats.rcs.packets.scan import Batch, scan
 from ml.formats.rcs.settings import RECORDS_LOST
 from ml.formats.recording import FileReport, UndecodableFile
-from ml.formats.redaction_record import PSEUDONYM, Redaction, pseudonym
+from ml.formats.redaction_record import PSEUDONYM, Redaction, number_in, pseudonym
 from ml.formats.source import Source
 
 DEFLATE_LEVEL = 1
@@ -249,11 +249,13 @@ class _Scrubber:
         else:
             yield name, self.clean(item, name)
 
-    def _string(self, text: str, key: str) -> str:
+    def _string(self, text: str, key: str) -> str | int | float:
         if key == "DeviceId" and NAMED.fullmatch(text.strip()):
             return self.device(text)
         if (shape := TEXTS.get(key)) is not None and shape.fullmatch(text):
             return text
+        if key not in TEXTS and key != "DeviceId" and (number := number_in(text)) is not None:
+            return int(number) if number.is_integer() else number
         self._gone["text"] += 1
         return ""
 

@@ -170,6 +170,20 @@ def test_a_clock_ahead_or_behind_is_corrected_everywhere_and_told(percept, read,
     assert any("the implant's clock is" in text and "corrected" in text for text in told)
 
 
+def test_numbers_that_are_written_as_text_are_the_same_numbers(percept, read):
+    plain = report_of(percept, run(percept, 300, 100_000, ma=1.5))
+    written = json.loads(json.dumps(plain))
+    for row in written["BrainSenseLfp"][0]["LfpData"]:
+        row["TicksInMs"] = str(row["TicksInMs"])
+        for side in ("Left", "Right"):
+            row[side] = {name: str(value) for name, value in row[side].items()}
+    domain = written["BrainSenseTimeDomain"][0]
+    domain |= {"SampleRateInHz": "250", "TimeDomainData": [str(round(v, 6)) for v in domain["TimeDomainData"]]}
+    for stream in ("amplitude", "band_power", "beta"):
+        one, other = (trace(read(report).recordings[0], stream).values for report in (plain, written))
+        np.testing.assert_allclose(one, other, atol=1e-4)
+
+
 def test_the_spectra_of_a_survey_are_named_by_their_time_in_utc(percept, read):
     survey = percept.time_domain(RIGHT, percept.sine(20))
     survey["FirstPacketDateTime"] = (BEGIN + timedelta(seconds=2254 + 60)).isoformat()

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
+import re
 import zipfile
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from ml.formats import UndecodableFile, decode
 from ml.formats.rcs.redact import redact_rcs_zip
 from ml.formats.redaction_record import pseudonym
+from ml.formats.writers import RcsWorld, write_rcs
 
 KEY = b"a key of the clinic's own"
 REAL = ["stim_sweep", "embedded_adaptive", "montage_packet_loss", "empty_streams"]
@@ -160,3 +163,22 @@ def test_what_is_no_session_is_not_redacted_and_nothing_is_written(pack, tmp_pat
     with pytest.raises(UndecodableFile):
         redact_rcs_zip(pack({"x.txt": "Ada"}), target, KEY)
     assert not target.exists()
+
+
+def test_amplitudes_that_are_written_as_text_are_kept(tmp_path):
+    world = RcsWorld(began_ms=1_767_600_000_000, seconds=20, changes=((-1.0, 0, 1.5), (10.0, 0, 2.5)))
+    content, _ = write_rcs(world)
+    values = []
+    for text in (False, True):
+        source, target = tmp_path / f"{text}.zip", tmp_path / f"clean {text}.zip"
+        with zipfile.ZipFile(io.BytesIO(content)) as plain, zipfile.ZipFile(source, "w") as written:
+            for name in plain.namelist():
+                changed = plain.read(name).decode()
+                if text:
+                    changed = re.sub(r'("(?:AmplitudeInMilliamps|amplitudeInMilliamps|therapyStatus)": )([\d.]+)', r'\1"\2"', changed)
+                written.writestr(name, changed)
+        redact_rcs_zip(source, target, KEY)
+        (recording,) = decode(target).recordings
+        values.append(next(t for t in recording.traces if t.stream == "amplitude").values)
+    np.testing.assert_allclose(values[0], values[1])
+    np.testing.assert_allclose(values[1][[1, -1]], [1.5, 2.5], atol=1e-6)
