@@ -52,7 +52,7 @@ def unpack(source: Source, sink: BinaryIO, limits: ArchiveLimits) -> tuple[str, 
         gzipped = stream.read(len(GZIP)) == GZIP
         stream.seek(0)
         plain = cast("IO[bytes]", opened.enter_context(gzip.GzipFile(fileobj=stream)) if gzipped else stream)
-        bounded = io.BufferedReader(_Bounded(plain, size, limits), CHUNK)
+        bounded: io.BufferedReader = io.BufferedReader(_Bounded(plain, size, limits), CHUNK)
         try:
             if bounded.peek(TAR_AT + len(TAR))[TAR_AT:].startswith(TAR):
                 return "a tar archive", _members(bounded, sink, limits)
@@ -107,5 +107,4 @@ def _members(stream: io.BufferedReader, sink: BinaryIO, limits: ArchiveLimits) -
                 with archive.open(info, "w", force_zip64=True) as out:
                     while chunk := content.read(CHUNK):
                         out.write(chunk)
-            tar.members = []  # a stream keeps every member that it has passed
     return [f"{n} file{'s' if n > 1 else ''}: {reason}" for reason, n in sorted(ignored.items()) if n]

@@ -41,6 +41,7 @@ TIME_FORMATS = (
     ("unix_ms", "Unix time, milliseconds"),
     ("unix_us", "Unix time, microseconds"),
     ("unix_ns", "Unix time, nanoseconds"),
+    ("excel", "spreadsheet day numbers (Excel)"),
     ("iso", "date and time, year first: 2026-03-02 10:00:00"),
     ("dmy", "date and time, day first: 02.03.2026 10:00:00"),
     ("mdy", "date and time, month first: 03/02/2026 10:00:00"),

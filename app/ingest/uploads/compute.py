@@ -37,7 +37,8 @@ def clean(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
         `kind`, `redaction`, and `mapping`, the place of the column mapping that read it; or the `problem` that keeps it from being cleaned,
         what was `left_out` of its archive, if it is one, and the `preview` of a table.
     """
-    (source, room), target = (RawFile(*map(Path, params[name])) for name in ("source", "room")), Path(params["target"])
+    source, room = (RawFile(Path(params[name][0]), Path(params[name][1])) for name in ("source", "room"))
+    target = Path(params["target"])
     options = options_of(params["options"])
     key = stored_secret(Path(params["secrets"]), "pseudonyms")
     mappings = [TableMapping.from_json(m) for m in params["mappings"]]

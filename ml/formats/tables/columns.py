@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import FileReport, UndecodableFile
 from ml.formats.source import Source
+from ml.formats.tables.dates import written_s, zone_named
 from ml.formats.tables.delimited import TextTable, read_delimited, read_head, rows_behind
-from ml.formats.tables.numbers import MISSING, column_name, iso_time, known_unit, shown, unit_name
+from ml.formats.tables.numbers import MISSING, column_name, known_unit, shown, unit_name
 from ml.formats.tables.plain import read_plain
 
 TIME_NAMES = ("t_s", "t", "time_s", "time", "seconds", "t_sec", "timestamp", "datetime", "date_time", "time_utc")
@@ -223,6 +224,8 @@ def _header_unit(role: str, unit: str | None, header: str, notes: list[str]) -> 
             raise _unknown_unit(role, unit, header)
         return unit_name(unit)
     if role == "t_s":
+        if zone_named(unit) is not None:
+            return None  # times count from the first row, whatever their zone
         if unit.lower() not in TIME_SCALE:
             raise _unknown_unit(role, unit, header)
         return unit.lower()
@@ -280,12 +283,12 @@ def _dates(table: TextTable, column: int, first_s: float) -> NDArray[np.float64]
     """Read a column of ISO 8601 dates as seconds, [rows], of which the first is `first_s`. NaN for empty cells, None where it has no
     dates."""
     first = next((row[column] for row in table.rows if row[column].strip().lower() not in MISSING), "")
-    if iso_time(first) is None:
+    if written_s(first) is None:
         return None
     out = np.full(len(table.rows), np.nan)
     for i, row in enumerate(table.rows):
         cell = row[column].strip()
-        moment = iso_time(cell)
+        moment = written_s(cell)
         if moment is None and cell.lower() not in MISSING:
             where, hint = (
                 f"line {table.lines[i]}, column {table.headers[column].strip()}",

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from datetime import UTC, datetime
 
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "inf", "+inf", "-inf", "infinity", "+infinity", "-infinity"})
 _POINT = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _COMMA = re.compile(r"[+-]?(?:\d+,?\d*|,\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-_DATE = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}", re.ASCII)
 _COLUMN = re.compile(r"^(?P<name>.*?)\s*[\(\[]\s*(?P<unit>[^\)\]]*?)\s*[\)\]]\s*$")
 _SPELLING = str.maketrans({"\u00b5": "u", "\u03bc": "u", "\u00b2": "2"})
 _ELECTRIC = re.compile(r"(?P<prefix>[num]?)(?P<base>[va])(?:\^|\*\*)?(?P<square>2?)(?P<density>/hz)?")
@@ -104,18 +102,6 @@ class Grouping:
         if self.decimal or self.marked is None:
             return False
         return self.plain or (delimiter, self._mark) in ((";", "."), (",", ","))
-
-
-def iso_time(cell: str) -> float | None:
-    """Parse an ISO 8601 date and time to Unix time, s; one without a zone counts as UTC. None for anything else."""
-    text = cell.strip()
-    if _DATE.match(text) is None:
-        return None
-    try:
-        moment = datetime.fromisoformat(text)
-        return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp()
-    except (ValueError, OverflowError):
-        return None
 
 
 def column_name(header: str) -> tuple[str, str | None]:

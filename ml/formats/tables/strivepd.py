@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import TREMOR_CLASSES, DecodedFile, FileReport, TremorLog, UndecodableFile
 from ml.formats.source import Source
+from ml.formats.tables.dates import ChangedClocks, in_zone, named_month, spreadsheet_date, zone_of_header
 from ml.formats.tables.delimited import TextTable, read_delimited
 from ml.formats.tables.numbers import NotANumber, column_name, parse_number, shown
 from ml.formats.tables.removed import removed_columns
@@ -111,14 +112,15 @@ def _wide(table: TextTable, columns: dict[str, int], time: int, report: FileRepo
     if count := int(off.sum()):
         report.flagged.append(f"{count} minutes whose fractions do not add up to 1: kept as they are")
     any_tremor = np.where(np.isfinite(stated), stated, fractions[:, 2:].sum(axis=1))
-    return _in_order(start, _lengths(table, columns, start), fractions, any_tremor, report)
+    return _in_order(start, _lengths(table, columns, time, start), fractions, any_tremor, report)
 
 
-def _lengths(table: TextTable, columns: dict[str, int], start: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lengths(table: TextTable, columns: dict[str, int], time: int, start: NDArray[np.float64]) -> NDArray[np.float64]:
     """Compute the length of each row's minute, s: stated, or up to its end; 60 where the table lacks it."""
     end = next((columns[key] for key in END_NAMES if key in columns), None)
     if "duration_s" not in columns and end is not None:
-        ends = np.array([_unix_s(row[end], line)[0] for row, line in zip(table.rows, table.lines, strict=True)], dtype=np.float64)
+        zone = zone_of_header(table.headers[end]) or zone_of_header(table.headers[time])
+        ends = np.array([_unix_s(row[end], line, zone)[0] for row, line in zip(table.rows, table.lines, strict=True)], dtype=np.float64)
         if (odd := np.flatnonzero((ends <= start) | (ends - start > LONGEST_S))).size:
             where = f"line {table.lines[odd[0]]}, column {table.headers[end].strip()}"
             what, hint = (
@@ -144,7 +146,7 @@ def _by_class(table: TextTable, columns: dict[str, int], time: int, of_class: in
             what = "no class of tremor"
             raise UndecodableFile(f"{shown(name)} is {what}", where, f"Write one of {WANTED}.", what, f"line {line}, column class")
         fractions[i, TREMOR_CLASSES.index(name)] = 1.0
-    return _in_order(start, _lengths(table, columns, start), fractions, fractions[:, 2:].sum(axis=1), report)
+    return _in_order(start, _lengths(table, columns, time, start), fractions, fractions[:, 2:].sum(axis=1), report)
 
 
 def _long(table: TextTable, columns: dict[str, int], time: int, report: FileReport) -> TremorLog:
@@ -197,35 +199,51 @@ def _starts(table: TextTable, time: int, report: FileReport) -> NDArray[np.float
     """Read Unix times of the rows, [n]; reports where a zone had to be assumed."""
     zoneless = 0
     out = np.empty(len(table.rows))
+    zone = zone_of_header(table.headers[time])
     for i, (row, line) in enumerate(zip(table.rows, table.lines, strict=True)):
-        out[i], assumed = _unix_s(row[time], line)
+        out[i], assumed = _unix_s(row[time], line, zone)
         zoneless += assumed
     if zoneless:
         report.flagged.append(f"{zoneless} times without a zone were read as UTC: check that they are")
     return out
 
 
-def _unix_s(cell: str, line: int) -> tuple[float, bool]:
-    """Parse the Unix time of an ISO date, or of a number in s, ms, us or ns; and whether its zone was assumed."""
+def _unix_s(cell: str, line: int, zone: tzinfo | None) -> tuple[float, bool]:
+    """Parse the Unix time of a date, of a spreadsheet's day number, or of a number in s, ms, us or ns; and whether its zone was assumed.
+
+    Args:
+        cell: of the table. line: that it is in. zone: that the header states; it holds for dates without one.
+    """
     where, hint = f"line {line}, column time", "Give the time as ISO 8601 with its zone, or as Unix time."
     try:
         value = parse_number(cell)
     except NotANumber:
         try:
-            moment = datetime.fromisoformat(cell.strip())
-            zoned = moment.tzinfo is not None
-            value = (moment if zoned else moment.replace(tzinfo=UTC)).timestamp()
+            moment = named_month(cell) or datetime.fromisoformat(cell.strip())
+            value, assumed = _in_utc(moment, zone)
+        except ChangedClocks as error:
+            what = "a time that the clocks of its zone show twice or never"
+            raise UndecodableFile(f"{shown(cell)} is {what}", where, "Write the times with their offset from UTC.", what) from error
         except (ValueError, OverflowError) as error:
             raise UndecodableFile(f"{shown(cell)} is no time", where, hint, "a cell holds no time") from error
         if not EARLIEST_UNIX_S <= value < LATEST_UNIX_S:
             raise UndecodableFile("a time before any watch measured tremor", where, hint) from None
-        return value, not zoned
+        return value, assumed
     if value is None or value <= 0:
         raise UndecodableFile("a minute has no time", where, hint)
+    if (day := spreadsheet_date(value)) is not None:
+        return _in_utc(day, zone)
     for unit in (1.0, 1e3, 1e6, 1e9):
         if EARLIEST_UNIX_S <= value / unit < LATEST_UNIX_S:
             return value / unit, False
     raise UndecodableFile(f"{value:g} is no date", where, hint, "a number that is no date")
+
+
+def _in_utc(moment: datetime, zone: tzinfo | None) -> tuple[float, bool]:
+    """Convert a moment to Unix time, s; True where it has no zone and none is stated, so that it counts as UTC."""
+    if moment.tzinfo is None and zone is not None:
+        moment = in_zone(moment, zone)
+    return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp(), moment.tzinfo is None
 
 
 def _in_order(

@@ -15,13 +15,13 @@ Holds = Literal["steps", "lfp", "tremor", "grasp"]
 """What a table holds: steps of beta, samples of LFP, minutes of tremor, times of open fists."""
 
 TimeFormat = Literal[
-    "seconds", "milliseconds", "microseconds", "minutes", "samples", "unix_s", "unix_ms", "unix_us", "unix_ns", "iso", "dmy", "mdy"
+    "seconds", "milliseconds", "microseconds", "minutes", "samples", "unix_s", "unix_ms", "unix_us", "unix_ns", "iso", "dmy", "mdy", "excel"
 ]
 RELATIVE: Mapping[str, float] = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "minutes": 60.0}
 """Seconds per unit of times that count from the session's start; `samples` count too, by the stated rate."""
 UNIX: Mapping[str, float] = {"unix_s": 1.0, "unix_ms": 1e-3, "unix_us": 1e-6, "unix_ns": 1e-9}
-WRITTEN = ("iso", "dmy", "mdy")
-"""Dates and times as people write them: year first, day first, month first. Their zone must be stated."""
+WRITTEN = ("iso", "dmy", "mdy", "excel")
+"""Dates and times as people write them: year, day or month first, or the day numbers of a spreadsheet. Their zone must be stated."""
 
 SIGNALS = ("beta", "beta_power", "lfp")
 AMPLITUDES = ("amplitude_ma", "amplitude_fraction")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from datetime import UTC, datetime
 from zoneinfo import ZoneInfo
 
@@ -10,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.recording import UndecodableFile
+from ml.formats.tables.dates import ChangedClocks, in_zone, named_month, spreadsheet_date
 from ml.formats.tables.delimited import TextTable
 from ml.formats.tables.mapping.model import RELATIVE, UNIX, WRITTEN, TableMapping, TimeFormat
-from ml.formats.tables.numbers import MISSING, shown
+from ml.formats.tables.numbers import MISSING, NotANumber, parse_number, shown
 
 _WRITTEN = re.compile(r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})[T ,]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,6}))?)?", re.ASCII)
 _SPAN_S = (datetime(1990, 1, 1, tzinfo=UTC).timestamp(), datetime(2200, 1, 1, tzinfo=UTC).timestamp())
-EXAMPLES = {"iso": "2026-03-02 10:00:00", "dmy": "02.03.2026 10:00:00", "mdy": "03/02/2026 10:00:00"}
+EXAMPLES = {"iso": "2026-03-02 10:00:00", "dmy": "02.03.2026 10:00:00", "mdy": "03/02/2026 10:00:00", "excel": "46083.4166667"}
 
 
 def is_absolute(time_format: TimeFormat) -> bool:
@@ -49,13 +51,13 @@ def _moment(cell: str, table: TextTable, row: int, column: int, mapping: TableMa
     if text.lower() in MISSING:
         return float("nan")
     try:
-        found = datetime.fromisoformat(text) if mapping.time_format == "iso" else _day_or_month_first(text, mapping.time_format)
+        found = _READ[mapping.time_format](text)
         if found.tzinfo is None:
             assert mapping.zone is not None
-            found = found.replace(tzinfo=ZoneInfo(mapping.zone), fold=0)
-            if found.utcoffset() != found.replace(fold=1).utcoffset():
-                raise _changed_clocks(text, table.lines[row], column, mapping.zone)
+            found = in_zone(found, ZoneInfo(mapping.zone))
         return found.timestamp()
+    except ChangedClocks as error:
+        raise _changed_clocks(text, table.lines[row], column, mapping.zone or "") from error
     except (ValueError, OverflowError) as error:
         what = f"is no date and time written like {EXAMPLES[mapping.time_format]}"
         where = f"line {table.lines[row]}, column {column + 1}"
@@ -70,10 +72,32 @@ def _changed_clocks(text: str, line: int, column: int, zone: str) -> Undecodable
 
 
 def _day_or_month_first(text: str, which: str) -> datetime:
-    """Parse a date with the year last. Raises ValueError."""
+    """Parse a date with the year last, or with the name of its month. Raises ValueError."""
+    if (named := named_month(text)) is not None:
+        return named
     match = _WRITTEN.fullmatch(text)
     if match is None:
         raise ValueError("no date of this format")
     first, second, year, hour, minute, sec, part = match.groups()
     day, month = (first, second) if which == "dmy" else (second, first)
     return datetime(int(year), int(month), int(day), int(hour), int(minute), int(sec or 0), int((part or "0").ljust(6, "0")))
+
+
+def _day_number(text: str) -> datetime:
+    """Convert the day number of a spreadsheet. Raises ValueError."""
+    try:
+        days = parse_number(text, "," if "," in text else ".")
+    except NotANumber as error:
+        raise ValueError("no number") from error
+    found = None if days is None else spreadsheet_date(days)
+    if found is None:
+        raise ValueError("no day number of this century")
+    return found
+
+
+_READ: dict[str, Callable[[str], datetime]] = {
+    "iso": datetime.fromisoformat,
+    "dmy": lambda text: _day_or_month_first(text, "dmy"),
+    "mdy": lambda text: _day_or_month_first(text, "mdy"),
+    "excel": _day_number,
+}

@@ -76,6 +76,15 @@ def test_times_before_and_after_clocks_are_changed_and_those_with_an_offset_are_
     assert np.diff(times(iso, "2026-10-25 02:30:00+02:00", "2026-10-25 02:30:00+01:00")).tolist() == [3600]
 
 
+def test_day_numbers_of_a_spreadsheet_and_names_of_months_are_moments_in_the_stated_zone() -> None:
+    excel = replace(DATES, time_format="excel")
+    assert times(excel, "46086,6319444444", "46086.6319675926") == pytest.approx(
+        times(DATES, "05.03.2026 15:10:00", "05-Mar-2026 15:10:02")
+    )
+    with pytest.raises(UndecodableFile, match="46083.4166667"):
+        times(excel, "1772719800")
+
+
 def test_whole_numbers_that_may_name_a_person_are_not_shown() -> None:
     rows = "".join(f"{2 * k};{700 + k};{8100 + k};{1950 + k % 2};4711;{k + 0.5}\n" for k in range(1, 9))
     shown = preview_of(InMemory(("time;left counts;FallNr;geb;sample;x7\n" + rows).encode()), KEY)
