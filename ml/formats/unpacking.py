@@ -66,8 +66,8 @@ def unpack(source: Source, sink: BinaryIO, limits: ArchiveLimits) -> tuple[str, 
 class _Bounded(io.RawIOBase):
     """Unpacked bytes, counted against the bounds as they are read."""
 
-    def __init__(self, stream: IO[bytes], packed: int, limits: ArchiveLimits) -> None:
-        self._stream, self._packed, self._limits, self._total = stream, packed, limits, 0
+    def __init__(self, stream: IO[bytes], size: int, limits: ArchiveLimits) -> None:
+        self._stream, self._size, self._limits, self._total = stream, size, limits, 0
 
     def readable(self) -> bool:
         return True
@@ -79,7 +79,7 @@ class _Bounded(io.RawIOBase):
         if self._total > limits.total_bytes:
             what = f"unpacked the archive has more than {limits.total_bytes / 1e6:.0f} MB"
             raise UndecodableFile(what, "archive", "Upload fewer sessions at once.")
-        if self._total > limits.ratio_applies_above_bytes and self._total > limits.ratio * max(1, self._packed):
+        if self._total > limits.ratio_applies_above_bytes and self._total > limits.ratio * max(1, self._size):
             what = f"the archive unpacks to more than {limits.ratio:.0f} times its size"
             raise UndecodableFile(what, "archive", f"Pack the original files again. {HINT}")
         buffer[: len(content)] = content

@@ -28,8 +28,8 @@ def clean(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
     """Take identity out of a file.
 
     Args:
-        params: `source` and an empty `room` to unpack it into (each the two paths of a `RawFile`), `target` (path), `secrets` (the folder
-            of keys), `options`, `mappings` (the study's column mappings).
+        params: `source` and an empty `room` to unpack it into, each as the two paths of a `RawFile`. Also `target` (path), `secrets` (the
+            folder of keys), `options`, and `mappings`, the study's column mappings.
         workdir: not used.
         report: takes the share that was read.
 

@@ -49,9 +49,9 @@ def named_month(text: str) -> datetime | None:
 
 
 def written_s(cell: str) -> float | None:
-    """Read a date and time, in ISO 8601 or with the name of its month, as Unix time in s; one without a zone counts as UTC.
+    """Read a date and time, in ISO 8601 or with the name of its month, as Unix time in s.
 
-    None for anything else.
+    One without a zone counts as UTC. None for anything else.
     """
     text = cell.strip()
     try:

@@ -209,7 +209,8 @@ def _starts(table: TextTable, time: int, report: FileReport) -> NDArray[np.float
 
 
 def _unix_s(cell: str, line: int, zone: tzinfo | None) -> tuple[float, bool]:
-    """Parse the Unix time of a date, of a spreadsheet's day number, or of a number in s, ms, us or ns; and whether its zone was assumed.
+    """Parse the Unix time of a date, of a spreadsheet's day number, or of a number in s, ms, us or ns. Also return whether its zone
+    was assumed.
 
     Args:
         cell: of the table. line: that it is in. zone: that the header states; it holds for dates without one.

@@ -216,8 +216,8 @@ def test_a_session_whose_first_minutes_are_lost_is_read(write):
     assert decode(write(text)).recordings[0].duration_s == 328
 
 
-def combined(step_at=10.0, silent=(99.0, 99.0)):
-    """A table of 250 Hz that joins streams, as public toolboxes write it: an amplitude once in 125 rows, 1 mA and then 2 mA."""
+def join_streams(step_at=10.0, silent=(99.0, 99.0)):
+    """Write a table of 250 Hz as public toolboxes do: with an amplitude once in 125 rows, 1 mA and then 2 mA."""
     out = ["t_s,lfp [uV],amplitude_ma"]
     for k in range(20 * 250):
         t = (k + 1) / 250
@@ -227,7 +227,7 @@ def combined(step_at=10.0, silent=(99.0, 99.0)):
 
 
 def test_an_amplitude_once_in_125_rows_is_kept(write):
-    decoded = decode(write(combined()))
+    decoded = decode(write(join_streams()))
     amplitude = trace(decoded, "amplitude")
     np.testing.assert_allclose(amplitude.values, [1.0] * 5 + [2.0] * 5, atol=0.01)
     assert "amplitude_ma is given once in 125 rows" in repr(decoded.reports[0].understood)
@@ -235,6 +235,6 @@ def test_an_amplitude_once_in_125_rows_is_kept(write):
 
 
 def test_an_amplitude_that_falls_silent_is_unknown_until_it_is_given_again(write):
-    amplitude = trace(decode(write(combined(silent=(6.0, 12.0)))), "amplitude")
+    amplitude = trace(decode(write(join_streams(silent=(6.0, 12.0)))), "amplitude")
     assert amplitude.valid.tolist() == [True] * 3 + [False] * 3 + [True] * 4
     np.testing.assert_allclose(amplitude.values[amplitude.valid], [1.0] * 3 + [2.0] * 4, atol=0.01)
