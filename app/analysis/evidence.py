@@ -17,7 +17,7 @@ from app.platform.kept import keep, recalled
 from app.study import blinding
 from app.study import repository as study
 from app.study.adverse_events import late_stops
-from app.study.sessions.repository import fingerprints
+from app.study.sessions.repository import fingerprints, policy_shares
 from app.study.sessions.usable_steps import failed_qoc_of
 from app.tables.participants import Participant
 from app.tables.recordings import Recording, Trace
@@ -130,10 +130,11 @@ def of_all(db: Session, participants: Sequence[Participant], caller: Caller, key
         sessions = sessions_of(db, [participants[i].id for i in some])
         everything = [session for held in sessions.values() for session in held]
         late = late_stops(db, [participants[i].id for i in some])
+        shares = policy_shares(db, [session.id for session in everything])
         traces = study.traces_of_recordings(db, {s.recording_id for session in everything for s in session.segments})
         held = _recordings_of_several_sides(db, everything, traces)
         for i in some:
-            result = _read(participants[i], sessions.get(participants[i].id, []), traces, caller, keys[i], late)
+            result = _read(participants[i], sessions.get(participants[i].id, []), traces, caller, keys[i], late, shares)
             found[i] = keep(keys[i], result)
         del held  # until here the segments found theirs without a query each
     return [known for known in found if known is not None]
@@ -154,6 +155,7 @@ def _read(
     caller: Caller,
     key: Hashable,
     late: Collection[int],
+    shares: Mapping[int, float],
 ) -> Evidence:
     counted: list[Facts] = []
     excluded: list[Excluded] = []
@@ -167,7 +169,8 @@ def _read(
             excluded.append(Excluded(*place, LeftOut.SEALED if session.visit.sealed else LeftOut.HIDDEN, ""))
         else:
             try:
-                counted.append(read(session, arm, lambda i: traces.get(i, []), late_stop=session.id in late))
+                facts = read(session, arm, lambda i: traces.get(i, []), late_stop=session.id in late, policy_share=shares.get(session.id))
+                counted.append(facts)
             except Invalid as error:
                 excluded.append(Excluded(*place, LeftOut.UNREADABLE, error.detail, arm, session.duration_s))
     settings = participant.current_settings

@@ -90,6 +90,7 @@ class Facts:
         stopped: it was stopped for the patient's sake, for the reason given. late_stop: so, but known only after its visit was locked:
             it counts as measured. medication_h: hours since the last dose, where known.
         created_at: when the record of the session came into being. visit_date: of its visit, where stated.
+        policy_share: of its decisions that followed policy or schedule; None without a log.
     """
 
     session_id: int
@@ -110,6 +111,7 @@ class Facts:
     medication_h: float | None
     visit_date: date | None = None
     late_stop: bool = False
+    policy_share: float | None = None
 
     def began_after(self, moment: datetime) -> bool:
         """Return whether the session is known to have begun after a moment: by its start, else by the day of its visit."""
@@ -139,7 +141,7 @@ class Excluded:
     duration_s: float = 0.0
 
 
-def read(session: StudySession, arm: Arm, traces: TracesOf, *, late_stop: bool = False) -> Facts:
+def read(session: StudySession, arm: Arm, traces: TracesOf, *, late_stop: bool = False, policy_share: float | None = None) -> Facts:
     """Return the facts of one session.
 
     Raises:
@@ -174,6 +176,7 @@ def read(session: StudySession, arm: Arm, traces: TracesOf, *, late_stop: bool =
         medication_h=hours_since_dose(session),
         visit_date=session.visit.date,
         late_stop=late_stop,
+        policy_share=policy_share,
     )
 
 

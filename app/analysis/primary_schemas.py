@@ -126,6 +126,7 @@ class VerdictOut(Model):
     outcomes: list[OutcomeVerdictOut]
     energy_saving_percent: AverageOut | None
     stopped_session_ids: list[int]
+    policy_shares: list[float] = Field(description="Of decisions by the policy, in the sessions with a log.")
     late_stop_session_ids: list[int] = Field(description="Stopped too, but known only after the lock of the visit: counted as measured.")
 
 
@@ -256,6 +257,7 @@ def verdict_out(result: VerdictResult) -> VerdictOut:
         basis=primary_words.verdict_kind(result),
         margins=margins_out(result.locked),
         visits=list(result.visits),
+        policy_shares=list(result.policy_shares),
         more_visits=a.verdict.more_visits if a and isinstance(a.verdict, Inconclusive) else None,
         outcomes=outcomes,
         energy_saving_percent=saving_out(a.saving) if a else None,

@@ -60,6 +60,7 @@ class VerdictResult:
         left_to_exploration: visits of before the lock.
         margin: by outcome, in its unit. stopped: sessions of the controller that were stopped for the patient's sake.
         late_stops: so, but known only after their visit was locked: they count as measured.
+        policy_shares: of decisions by the policy, in the sessions with a log.
     """
 
     controller: Controller
@@ -73,6 +74,7 @@ class VerdictResult:
     margin: dict[str, float]
     stopped: tuple[int, ...]
     late_stops: tuple[int, ...] = ()
+    policy_shares: tuple[float, ...] = ()
 
 
 def opened_at(session: Facts) -> datetime:
@@ -177,6 +179,7 @@ def _judge(
         {o.name: o.margin for o in outcomes if o is not None},
         tuple(s.session_id for s in sessions if tested(s) and s.stopped is not None),
         tuple(s.session_id for s in sessions if tested(s) and s.late_stop),
+        tuple(s.policy_share for s in sessions if tested(s) and s.policy_share is not None),
     )
 
 

@@ -138,6 +138,16 @@ def late_stops(sessions: Sequence[int]) -> str:
     return f"{of} for the participant's sake, which became known after the visit was locked: counted here as measured, not as failures."
 
 
+def policy_shares(shares: Sequence[float]) -> str:
+    """Say how often the policy decided in the sessions with a log; empty without any."""
+    if not shares:
+        return ""
+    low, high = f"{100 * min(shares):.0f}", f"{100 * max(shares):.0f}"
+    return (
+        f"The policy decided in {low if low == high else f'{low} to {high}'} % of the periods of {counted(len(shares), 'logged session')}."
+    )
+
+
 def verdict_sentence(name: str, found: Verdict, visits: int, *, planned: bool) -> str:
     """A verdict over so many visits, in one sentence. `planned`: whether it was asked how many further visits would settle it."""
     over = f"over {counted(visits, 'visit')}"

@@ -27,6 +27,7 @@ from app.study import access, blinding
 from app.study import repository as study
 from app.study.characteristics import CharacteristicsOut
 from app.study.doses import hours_since_dose, levodopa_equivalent_mg
+from app.study.sessions.repository import policy_shares
 from app.study.sessions.usable_steps import session_data
 from app.study.settings_types import SettingsOut
 from app.tables.learning import Policy
@@ -91,9 +92,11 @@ def _sessions(
     db: Session, participant: Participant, caller: Caller, found: Primary, day: Days
 ) -> tuple[list[tuple[Any, ...]], list[tuple[Any, ...]]]:
     compared = {s.session_id for s in found.sessions if "mean_beta" in s.values}
+    held = blinding.unsealed(study.sessions_of_participant(db, participant.id))
+    shares = policy_shares(db, [s.id for s in held])
     sessions: list[tuple[Any, ...]] = []
     steps: list[tuple[Any, ...]] = []
-    for session in blinding.unsealed(study.sessions_of_participant(db, participant.id)):
+    for session in held:
         arm, qoc = blinding.arm(session, caller), session.qoc
         try:
             table, problem = session_data(db, session).table, None
@@ -104,7 +107,7 @@ def _sessions(
             (session.id, session.visit.number, session.ordinal, arm.controller.value, arm.policy_id, session.hemisphere,
              day.of(session.started_at), day.of(session.created_at), session.duration_s, beta and beta.unit, beta and beta.source,
              session.id in compared, table and table.cdbs_ma, table and table.above_one, session.excluded_reason, session.stopped_reason,
-             hours_since_dose(session), session.activity,
+             shares.get(session.id), hours_since_dose(session), session.activity,
              *(qoc and qoc.value(o) for o in OUTCOMES), qoc and qoc.revision, problem)
         )  # fmt: skip
         if table is not None:

@@ -78,6 +78,7 @@ FIELDS: dict[str, tuple[Field, ...]] = {
         steps_above_cdbs integer Steps above the cDBS amplitude.
         excluded_reason string Why somebody excluded it; such a session counts in no analysis.
         stopped_reason string Why it was stopped for the patient's sake; a failure of its controller.
+        policy_share number Share of its decisions that followed policy or schedule, by the tablet's log; empty without one.
         hours_since_dose number Hours from the last dose to its start, as stated, else by doses.csv.
         activity string What the participant did in the half hour before: rest, light, exercise, meal or sleep.
         {_VALUES}

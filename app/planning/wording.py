@@ -295,6 +295,7 @@ DEVIATIONS: dict[Deviation, str] = {
     Deviation.OTHER_DAY: "held on another day than the visit's",
     Deviation.OTHER_TIME: "began at another time than the clinic day says: one of the two clocks is wrong",
     Deviation.OTHER_PLAN: "its log is of a session of another plan",
+    Deviation.ABORTED: "an aborted start of a planned session: its controller never decided",
     Deviation.SECOND_RUN: "its log is of a slot that another session fills: a second run, or a second record of the same one",
 }
 

@@ -31,6 +31,7 @@ from app.study.recordings import history
 from app.study.schemas import CdbsAmplitudeModel, VisitChange, VisitIn
 from app.study.sessions import pages as session_pages
 from app.study.sessions.contradictions import control_recording
+from app.study.sessions.repository import policy_shares
 from app.study.sessions.usable_steps import session_data
 from app.study.settings_form import Shown, own_changes, reason_of
 from app.study.traces import TracesOf, traces_of
@@ -228,6 +229,7 @@ def shown_visit(
         rows=[_session_row(db, s, traces, caller) for s in sessions],
         told=told,
         latencies=history.by_controller(ran),
+        shares=policy_shares(db, [s.id for s in sessions]) if told else {},
         slots=make_part(Part.SLOTS_OF_VISIT, db, visit, caller),
         may_upload=may(caller, can.UPLOAD, visit.participant) and not visit.locked,
         limit_mb=get_settings().upload_limit_mb,

@@ -21,6 +21,7 @@ from app.platform.errors import Conflict, Invalid
 from app.study import access, blinding, data_queries
 from app.study import repository as study
 from app.study.sessions import conditions, usable_steps
+from app.study.sessions import wording as session_wording
 from app.study.sessions.changes import POLICY_CONTROLLERS
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.wording import sentences
@@ -129,7 +130,21 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
     sessions.count(db, session)
     kept_as_fractions = sessions.fix_milliamperes(db, session)
     conditions.record(db, session, caller.label)
-    return [*kept_as_fractions, *sentences(contradictions(db, session)), *outcomes_intake.derive(db, session)]
+    return [
+        *_exclude_where_not_run(session),
+        *kept_as_fractions,
+        *sentences(contradictions(db, session)),
+        *outcomes_intake.derive(db, session),
+    ]
+
+
+def _exclude_where_not_run(session: StudySession) -> list[str]:
+    """Exclude a session in which its policy or schedule decided too seldom. Returns the reason, a sentence, where it did."""
+    share = usable_steps.policy_share(control_recording(session)) if session.segments else None
+    if share is None or share >= usable_steps.LEAST_SHARE or session.excluded_reason is not None:
+        return []
+    session.excluded_reason = session_wording.seldom_decided(share, usable_steps.LEAST_SHARE)
+    return [session_wording.excluded_as_seldom_decided(session.id, session.excluded_reason)]
 
 
 def split(db: Session, session: StudySession, version: int, parts: Sequence[PartIn], caller: Caller) -> list[StudySession]:

@@ -40,6 +40,8 @@ class Deviation(StrEnum):
     """A controller's log of a session of another plan."""
     SECOND_RUN = "second_run"
     """A controller's log of a slot that another session fills: two tablets ran it, or one whose notes were lost."""
+    ABORTED = "aborted"
+    """A controller's log of an attempt at a slot that ended before policy or schedule decided."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,8 @@ class Done:
     """The slot of which its controller's log says it is; NO_SLOT where that is none of this participant's."""
     bench: bool = False
     """Its controller's log is of a trial on a bench, which fills no slot."""
+    aborted: bool = False
+    """By its log the policy or schedule never decided: the slot is free for another attempt."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,7 @@ def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) 
     pairs: dict[int, Done] = {s.filled: s for s in sessions if s.filled is not None}
     known = {p.item_id for p in slots}
     for session in sessions:
-        if session.filled is None and session.logged in known:
+        if session.filled is None and session.logged in known and not session.aborted:
             pairs.setdefault(session.logged, session)
     taken = {s.session_id for s in pairs.values()}
     open_slots = [p for p in slots if p.item_id not in pairs]
@@ -117,7 +121,9 @@ def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) 
 
 
 def _beside(session: Done, known: Collection[int]) -> Deviation:
-    """Why a session stands beside the plan."""
+    """Return why a session fills no slot."""
+    if session.logged in known and session.aborted:
+        return Deviation.ABORTED
     if session.logged is None:
         return Deviation.UNPLANNED
     return Deviation.SECOND_RUN if session.logged in known else Deviation.OTHER_PLAN

@@ -194,6 +194,7 @@ def _done(db: Session, session: StudySession) -> Done:
         session.plan_item_id,
         of_log,
         usable_steps.rehearsed(recording),
+        usable_steps.policy_share(recording) == 0.0,
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from app.study.recordings import facts
-from app.study.sessions.usable_steps import limits_and_policy
+from app.study.sessions.usable_steps import limits_and_policy, policy_share
 from app.tables.recordings import Recording
 from app.tables.sessions import Controller
 
@@ -88,10 +88,11 @@ class Battery:
 
 @dataclass(frozen=True)
 class Runtime:
-    """One session on its tablet; None where the log does not tell."""
+    """One session on its tablet: time and battery, and the share of decisions by policy or schedule; None where the log does not tell."""
 
     latency: Latency | None
     battery: Battery | None
+    policy_share: float | None = None
 
 
 def of_recording(recording: Recording) -> Runtime | None:
@@ -102,7 +103,8 @@ def of_recording(recording: Recording) -> Runtime | None:
     timed, charge, minutes = said.get("latency_us"), said.get("tablet_battery_percent"), said.get("tablet_battery_minutes")
     latency = Latency(timed["mean"] / 1000, timed["std"] / 1000, int(timed["n"])) if timed else None
     battery = Battery(float(charge[0]), float(charge[1]), float(minutes)) if charge and minutes else None
-    return Runtime(latency, battery) if latency or battery else None
+    share = policy_share(recording)
+    return Runtime(latency, battery, share) if latency or battery or share is not None else None
 
 
 def by_controller(found: Iterable[tuple[Controller, Runtime | None]]) -> dict[Controller, Latency]:

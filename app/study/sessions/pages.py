@@ -33,7 +33,7 @@ from app.study.sessions import view as session_view
 from app.study.sessions.charts import beta_by_amplitude, in_chart_table, notes, operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.stimulation import beside, delivered
-from app.study.sessions.usable_steps import SessionData, session_data
+from app.study.sessions.usable_steps import LEAST_SHARE, SessionData, session_data
 from app.study.sessions.wording import ACTIVITIES, drawn_words, sentences
 from app.study.settings_form import Shown, own_changes
 from app.study.traces import NO_CONTROL, control_programs, session_offset_s
@@ -321,6 +321,7 @@ def _page(
         event_severities=EVENT_SEVERITIES,
         drawn=_drawn(db, session, data, caller),
         ran_on=history.of_recording(control_recording(session)),
+        least_share=LEAST_SHARE,
         beside=_beside(db, session, data),
         ran_under=dict(_conditions_revisions(session)[-1].fields)
         | {"conditions_reason": ""}

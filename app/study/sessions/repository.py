@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from sqlalchemy import (
     ARRAY,
     BindParameter,
+    Float,
     Integer,
     Select,
     String,
@@ -180,6 +181,18 @@ def same_minutes(db: Session, recording: Recording, begin: datetime, end: dateti
         .order_by(StudySession.id)
     )
     return [SameMinutes(i, r, float(seconds), bool(counting)) for i, r, seconds, counting in db.execute(query)]
+
+
+def policy_shares(db: Session, session_ids: Collection[int]) -> dict[int, float]:
+    """Read the share of decisions that followed policy or schedule, by session with a log."""
+    told = Recording.details["settings"]["controller"]
+    query = (
+        select(SessionSegment.session_id, cast(told["policy_share"].astext, Float))
+        .join(Recording, Recording.id == SessionSegment.recording_id)
+        .where(SessionSegment.session_id.in_(session_ids), SessionSegment.is_control)
+        .where(told["purpose"].astext == "session", told["policy_share"].astext.is_not(None))
+    )
+    return {row[0]: row[1] for row in db.execute(query)}
 
 
 def repeated_sessions(db: Session, participant_id: int) -> set[int]:

@@ -68,6 +68,8 @@ def failed_qoc_of(sessions: Iterable[StudySession]) -> Qoc:
 
 # What the log of a controller says of its session: which policy decided, within which limits, and for which slot of a signed plan.
 
+LEAST_SHARE = 0.7
+"""Share of decisions by its policy or schedule below which a session counts for none; ours, as the least coverage of a step."""
 CONTROLLER_OF_KIND = {"distilled": Controller.DISTILLED, "baseline": Controller.OTHER}
 """Controllers of policies by their kind; those of every other kind are RL."""
 
@@ -143,6 +145,14 @@ def slot_of_recording(db: Session, recording: Recording) -> LoggedSlot | None:
     return LoggedSlot(
         int(said["slot_id"]), int(said["plan_id"]), int(said["position"]), int(said["visit_number"]), str(said["visit_date"]), planned
     )
+
+
+def policy_share(recording: Recording) -> float | None:
+    """Return the share of a session's decisions that followed its policy or schedule; None without a session's log."""
+    said = limits_and_policy(recording)
+    if said is None or said.get("purpose") != "session" or said.get("policy_share") is None:
+        return None
+    return float(said["policy_share"])
 
 
 def rehearsed(recording: Recording) -> bool:

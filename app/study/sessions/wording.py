@@ -119,6 +119,21 @@ def _no_slot(f: Mapping[str, Any]) -> str:
     )
 
 
+def share_decided(share: float) -> str:
+    """Say how often a session's policy or schedule decided."""
+    return f"its controller decided in {100 * share:.0f} % of the periods, cDBS stood in for the rest"
+
+
+def seldom_decided(share: float, least: float) -> str:
+    """Say why a session counts for no controller."""
+    return f"{share_decided(share)}; below {100 * least:.0f} % a session counts for no controller"
+
+
+def excluded_as_seldom_decided(session_id: int, why: str) -> str:
+    """Report that a session was excluded for it."""
+    return f"Session {session_id} is excluded: {why}."
+
+
 _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.DAY: _day,
     Kind.START: _start,

@@ -111,11 +111,22 @@ def decode_log(path: Source, options: DecodeOptions, name: str | None = None) ->
 
 
 def _of_rows(log: Log) -> dict[str, Any]:
-    """Summarise the rows of a log of version 3 for the whole session: its end, what was drawn and delivered, the tablet's battery."""
+    """Summarise the rows of a log of version 3 for the whole session: its end, what was drawn and delivered, the tablet's battery.
+
+    `policy_share` is the share of decisions that followed policy or schedule, from the take-over on.
+    """
     known = np.flatnonzero(np.isfinite(log.battery_percent))
     charge = log.battery_percent[known[[0, -1]]].tolist() if known.size else None
     minutes = float(log.t_s[known[-1]] - log.t_s[known[0]]) / 60 if known.size else None
-    return {"ended": log.ended, "holds": delivered_holds(log), "tablet_battery_percent": charge, "tablet_battery_minutes": minutes}
+    decided = log.followed[(log.due_s >= log.zero_s) & (np.arange(log.due_s.size) < log.due_s.size - (log.ended is not None))]
+    share = float(decided.mean()) if decided.size else 0.0
+    return {
+        "ended": log.ended,
+        "policy_share": share,
+        "holds": delivered_holds(log),
+        "tablet_battery_percent": charge,
+        "tablet_battery_minutes": minutes,
+    }
 
 
 def delivered_holds(log: Log) -> list[dict[str, Any]]:

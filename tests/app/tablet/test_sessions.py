@@ -60,6 +60,7 @@ def test_a_whole_session_runs_in_closed_loop_and_its_log_says_whose_it_is(tmp_pa
     said = recording.settings["controller"]
     assert (said["slot_id"], said["plan_id"], said["controller"], said["ended"], said["purpose"]) == (7, 1, "rl", "complete", "session")
     assert said["manifest_sha256"] == verified(of_slot(tmp_path), PUBLIC).manifest_sha256
+    assert said["policy_share"] == 1.0, "from the take-over on"
     assert said["latency_us"]["n"] == 200
     assert recording.started_at == MORNING + timedelta(seconds=20)
 

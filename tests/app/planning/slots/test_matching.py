@@ -114,3 +114,14 @@ def test_length_and_day_are_held_against_the_plan() -> None:
 def test_what_somebody_confirmed_stays() -> None:
     held = [Done(1, Controller.CDBS, None, 600.0, None, filled=4), done(2, Controller.CDBS)]
     assert filled(match(PLAN, held, DAY)) == [None, 2, None, 1, None]
+
+
+def test_an_attempt_that_ended_before_its_policy_decided_leaves_the_slot_to_the_next_one() -> None:
+    early = Done(1, Controller.RL, 7, 14.0, NINE, logged=1, aborted=True)
+    found = match(PLAN, [early], DAY)
+    assert filled(found) == [None] * 5
+    assert found[-1] == Match(None, 1, (Deviation.ABORTED,))
+    again = Done(2, Controller.RL, 7, 600.0, NINE + timedelta(minutes=3), logged=1)
+    found = match(PLAN, [early, again], DAY)
+    assert filled(found) == [2, None, None, None, None]
+    assert found[-1] == Match(None, 1, (Deviation.ABORTED,))
