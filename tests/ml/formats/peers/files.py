@@ -114,3 +114,27 @@ def _take_records_out(path: Path, numbers: set[int]) -> None:
 
 WRITERS: dict[str, Callable[[Path, np.random.Generator], Written]] = {"edf": write_edf, "xdf": write_xdf}
 """By kind."""
+
+
+def large_edf(path: Path, megabytes: int) -> None:
+    """Write an EDF+ of eight channels at 1 kHz."""
+    import edfio
+
+    n = megabytes * 1_000_000 // 16 // 1000 * 1000
+    rng = np.random.default_rng(0)
+    names = [f"LFP L {k}-{k + 2}" for k in range(8)]
+    edfio.Edf(
+        [edfio.EdfSignal(rng.normal(0, 3, n), 1000.0, label=x, physical_dimension="uV", physical_range=(-50, 50)) for x in names]
+    ).write(path)
+
+
+def large_xdf(path: Path, megabytes: int) -> None:
+    """Write an XDF of eight channels at 1 kHz, in chunks of 100 samples."""
+    n = megabytes * 1_000_000 // 41
+    x = np.random.default_rng(0).normal(0, 3, (n, 8))
+    names = [f"LFP L {k}-{k + 2}" for k in range(8)]
+    xdf.write(path, [xdf.Stream("LFP", "LFP", 1000.0, 100.0 + np.arange(n) / 1000, x, names, ["uV"] * 8, per_chunk=100)])
+
+
+LARGE = {"edf": large_edf, "xdf": large_xdf}
+"""Large files by kind, for what reading takes."""
