@@ -4,7 +4,7 @@
 
 The files are those of `tests/ml/formats/peers`: written by another library or by the specification, with known samples, bursts, gaps and
 steps. Nothing may be wrong, at least 95 % of what a perfect reader could use must be usable. A large file is then read by the format's
-reader and by the library alone, each in a process of its own: CPU seconds, and the peak of memory above that of the imports.
+reader and by the library alone, each in a process of its own. CPU is in seconds; memory is the peak above that of the imports.
 """
 
 from __future__ import annotations
@@ -114,7 +114,8 @@ def main() -> None:
             cpu, cpu_own = (min(r[0] for r in runs) for runs in (theirs, own))
             memory, memory_own = (max(r[1] for r in runs) / size for runs in (theirs, own))
             sys.stdout.write(
-                f"| {kind} | {size / 1e6:.0f} MB | {cpu:.2f} s | {cpu_own:.2f} s | {cpu_own / cpu:.2f} | {memory:.1f} x file | {memory_own:.1f} x file |\n"
+                f"| {kind} | {size / 1e6:.0f} MB | {cpu:.2f} s | {cpu_own:.2f} s | {cpu_own / cpu:.2f} | "
+                f"{memory:.1f} x file | {memory_own:.1f} x file |\n"
             )
     sys.stdout.write("".join(f"{fault}\n" for fault in faults[:40]))
 

@@ -109,6 +109,14 @@ DEVICES = (
         sources={},
         magic=(b"0       ", b"\xffBIOSEMI"),
     ),
+    DeviceFormat(
+        kind="brainvision",
+        device="BrainVision",
+        file="BrainVision recording",
+        upload="the three files of a BrainVision recording",
+        package="ml.formats.brainvision",
+        sources={},
+    ),
 )
 BY_KIND = {one.kind: one for one in DEVICES}
 DEVICE_NAMES = {one.kind: one.device for one in DEVICES}

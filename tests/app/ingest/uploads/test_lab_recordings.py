@@ -10,6 +10,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from tests.app.ingest.uploads.test_uploads_of_formats import stored_text, upload
+from tests.ml.formats.brainvision.test_brainvision import three
 from tests.ml.formats.peers.xdf import Stream, write
 
 NAME = "Plantedname"
@@ -46,3 +47,19 @@ def test_a_lab_s_recording_is_one_session_of_both_sides_without_a_name(
     assert sum(b is not None for b in trace["beta"]) >= 29
     assert NAME.encode() not in stored_text(client, body)
     assert NAME not in repr(client.get(f"/api/v1/uploads/{body['id']}").json())
+
+
+def test_three_loose_files_of_one_recording_are_put_together(client: TestClient, participant_code: str) -> None:
+    files = [("file", (name, content)) for name, content in three().items()]
+    data = {"participant": "P1", "visit": "1", "controller": "other"}
+    answer = client.post("/api/v1/uploads", data=data, files=files)
+    assert answer.status_code == 201, answer.json()
+    assert [s["duration_s"] for s in answer.json()["sessions"]] == [40.0]
+
+
+def test_a_recording_without_its_marker_file_waits_encrypted_with_what_to_send(client: TestClient, participant_code: str) -> None:
+    files = [("file", (name, content)) for name, content in three().items() if not name.endswith(".vmrk")]
+    answer = client.post("/api/v1/uploads", data={"participant": "P1"}, files=files)
+    said = repr(answer.json())
+    assert "no gap can be seen" in said
+    assert ".vhdr, .vmrk and .eeg" in said

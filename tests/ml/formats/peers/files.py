@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import tempfile
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
+import pybv
 
 from tests.ml.formats.peers import xdf
 from tests.ml.formats.peers.truth import Truth, make_truth
@@ -112,7 +116,36 @@ def _take_records_out(path: Path, numbers: set[int]) -> None:
     path.write_bytes(head + b"".join(kept))
 
 
-WRITERS: dict[str, Callable[[Path, np.random.Generator], Written]] = {"edf": write_edf, "xdf": write_xdf}
+def write_brainvision(path: Path, rng: np.random.Generator) -> Written:
+    """Write the three files by pybv, zipped; segments after a loss begin with a dated New Segment marker, as the recorder writes it."""
+    rate = float(rng.choice([250.0, 500.0]))
+    truth = make_truth(rng, rate_hz=rate, gaps=int(rng.integers(0, 5)), steps=int(rng.integers(0, 5)))
+    form, lsb = [("binary_float32", 1e-5), ("binary_int16", 0.01)][int(rng.integers(2))]
+    start = datetime(2026, 3, 2, 9, 30)
+    inside = [(t, a) for t, a in truth.steps if np.min(np.abs(truth.t_s - t)) < 1 / rate]
+    events: list[dict[str, object]] = [
+        {"onset": int(np.searchsorted(truth.t_s, t)), "duration": 1, "type": "Comment", "description": str(rng.choice(WORDS)).format(a=a)}
+        for t, a in inside
+    ]
+    with tempfile.TemporaryDirectory() as name:
+        pybv.write_brainvision(
+            data=1e-6 * np.stack(list(truth.channels.values())), sfreq=rate, ch_names=list(truth.channels), fname_base="file",
+            folder_out=name, events=events, fmt=form, resolution=0.01 if "int" in form else 1e-3, unit="µV", meas_date=start,
+        )  # fmt: skip
+        marks = Path(name, "file.vmrk")
+        text = marks.read_text("utf-8")
+        for k, (begin, _) in enumerate(truth.pieces()[1:]):
+            date = (start + timedelta(seconds=float(truth.t_s[begin] - truth.t_s[0]))).strftime("%Y%m%d%H%M%S%f")
+            text += f"Mk{len(events) + k + 2}=New Segment,,{begin + 1},1,0,{date}\n"
+        marks.write_text(text, "utf-8")
+        with zipfile.ZipFile(path, "w") as archive:
+            for file in sorted(Path(name).iterdir()):
+                archive.write(file, f"visit/{file.name}")
+    names = {n: n.replace(" 0", " +0").replace(" 1-", " +1-") for n in truth.channels}
+    return Written(truth, names, 2 * lsb, pause=True, steps=inside)
+
+
+WRITERS: dict[str, Callable[[Path, np.random.Generator], Written]] = {"brainvision": write_brainvision, "edf": write_edf, "xdf": write_xdf}
 """By kind."""
 
 
