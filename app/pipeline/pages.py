@@ -120,6 +120,7 @@ def all_jobs_page(request: Request, db: Db, caller: CurrentCaller, paging: Pagin
 def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Show one job: progress, learning curves, log."""
     events = jobs.events_after(db, found.job.id, 0, SHOWN_EVENTS)
+    live, workers = not JobStatus(found.job.status).ended, jobs.live_workers(db, job_service.STALE_S)
     steps = list(zip(found.job.steps, numbered([s.title for s in found.job.steps]), strict=True))
     page = render(
         request,
@@ -127,14 +128,15 @@ def job_page(request: Request, found: CurrentJob, db: Db, caller: CurrentCaller)
         participant=found.participant,
         job=found.job,
         title=_titles().get(found.job.kind, found.job.kind),
-        live=not JobStatus(found.job.status).ended,
+        live=live,
         steps=steps,
         failed=failure(found.job.error, {s.key: title for s, title in steps}) if found.job.error else "",
         curves=charts.job_curves(found.job, [e for e in events if e.kind == "points"]),
         log=[e for e in events if e.kind == "log"][-LOG_LINES:],
         params=_in_words(found.job.params),
         refresh_s=REFRESH_S,
-        workers=len(jobs.live_workers(db, job_service.STALE_S)),
+        workers=len(workers),
+        beyond=job_service.NEWER_WORKER if live and workers and found.job.protocol > max(w.protocol for w in workers) else "",
         in_queue=_in_queue(db, found.job),
         may_run=may(caller, can.RUN_JOBS, found.participant),
     )

@@ -8,10 +8,12 @@ from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
+from alembic.script import ScriptDirectory
 from alembic.util import CommandError
 from psycopg.errors import InsufficientPrivilege
 from sqlalchemy import Connection, Engine, NullPool, create_engine, make_url, text
 from sqlalchemy.exc import ProgrammingError
+from sqlalchemy.orm import Session
 
 from app.platform import service_role
 from app.platform.database import database_url, get_engine, owner_url
@@ -67,3 +69,17 @@ def _one_at_a_time(engine: Engine) -> Iterator[Connection]:
     with engine.begin() as connection:
         connection.execute(text("select pg_advisory_xact_lock(:key)"), {"key": _LOCK})
         yield connection
+
+
+def newest_revision() -> str:
+    """Read the schema that this betaloop needs."""
+    config = Config(str(ROOT / "alembic.ini"))
+    config.set_main_option("script_location", str(ROOT / "migrations"))
+    return ScriptDirectory.from_config(config).get_current_head() or ""
+
+
+def revision(db: Session) -> str:
+    """Read the schema that the database has."""
+    if db.scalar(text("select to_regclass('alembic_version')")) is None:
+        return ""
+    return db.scalar(text("select version_num from alembic_version")) or ""

@@ -61,6 +61,8 @@ class Job(Base):
     result: Mapped[dict[str, Any] | None]
     error: Mapped[str | None] = mapped_column(Text)
     code_version: Mapped[str] = mapped_column(String(80))
+    protocol: Mapped[int] = mapped_column(server_default="0")
+    """Version of the job protocol (`app.platform.jobs.engine`) that a worker must speak at least."""
     repeats: Mapped[str | None] = mapped_column(ForeignKey("job.id"))
     """The job that had ended and that this one repeats."""
     urgency: Mapped[int] = mapped_column(server_default="50")
@@ -131,5 +133,7 @@ class Worker(Base):
     id: Mapped[str] = mapped_column(String(100), primary_key=True)
     host: Mapped[str] = mapped_column(String(255))
     pid: Mapped[int]
+    protocol: Mapped[int]
+    code_version: Mapped[str] = mapped_column(String(80))
     started_at: Mapped[datetime] = mapped_column(server_default=func.now())
     seen_at: Mapped[datetime] = mapped_column(server_default=func.now())

@@ -6,7 +6,7 @@ import sqlalchemy as sa
 from alembic import op
 from sqlalchemy.dialects import postgresql
 
-revision = "first_0ab072eb"
+revision = "first_d67afdff"
 down_revision = None
 branch_labels = None
 depends_on = None
@@ -312,6 +312,8 @@ def upgrade() -> None:
         sa.Column("id", sa.String(length=100), nullable=False),
         sa.Column("host", sa.String(length=255), nullable=False),
         sa.Column("pid", sa.Integer(), nullable=False),
+        sa.Column("protocol", sa.Integer(), nullable=False),
+        sa.Column("code_version", sa.String(length=80), nullable=False),
         sa.Column("started_at", sa.DateTime(timezone=True), server_default=sa.text("now()"), nullable=False),
         sa.Column("seen_at", sa.DateTime(timezone=True), server_default=sa.text("now()"), nullable=False),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_worker")),
@@ -516,6 +518,7 @@ def upgrade() -> None:
         sa.Column("finished_at", sa.DateTime(timezone=True), nullable=True),
         sa.Column("updated_at", sa.DateTime(timezone=True), server_default=sa.text("now()"), nullable=False),
         sa.Column("cancel_requested_at", sa.DateTime(timezone=True), nullable=True),
+        sa.Column("protocol", sa.Integer(), server_default="0", nullable=False),
         sa.Column("repeats", sa.String(length=36), nullable=True),
         sa.Column("urgency", sa.Integer(), server_default="50", nullable=False),
         sa.Column("place", sa.Integer(), server_default="0", nullable=False),

@@ -30,7 +30,7 @@ from app.tables.visits import CdbsAmplitude
 
 COMMANDS = (
     "serve", "worker", "demo", "migrate", "user add", "token create", "import", "pipeline", "rank", "export", "control",
-    "ingest redecode", "ingest resume", "study simulate", "where", "backup-key", "backup", "restore", "doctor",
+    "ingest redecode", "ingest resume", "study simulate", "where", "take-back-jobs", "backup-key", "backup", "restore", "doctor",
     "next-generation", "audit verify", "audit seal", "study add", "study site", "user role",
 )  # fmt: skip
 TABLE = "t_s,beta,amplitude_fraction\n0,1,1\n2,1,0.5\n4,2,0.5\n"

@@ -68,7 +68,7 @@ FAULTS = [
     ),
     *_of(
         "platform/upkeep/doctor",
-        ("the doctor finds jobs that nobody works on", "    stuck = bool(live) and not workers\n", "    stuck = False\n",
+        ("the doctor finds jobs that nobody works on", "    if live and not workers:\n", "    if False:\n",
          f"{DOCTOR}::test_jobs_that_nobody_works_on_are_found"),
         ("the doctor finds a disk that is nearly full", "    ok = free >= LEAST_FREE_MB\n", "    ok = True\n",
          f"{DOCTOR}::test_a_disk_that_is_nearly_full_is_found"),

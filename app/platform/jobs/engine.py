@@ -2,8 +2,8 @@
 
 Every job is one workflow `betaloop.job(job_id)` on one queue, in the schema `dbos` of our own PostgreSQL. DBOS keeps the queue, says which
 executor owns a workflow and starts it again after a crash. It records no step: status, steps and results are stored once, in our own tables
-(`ledger`). The library leaves three things to us: detect dead executors (`recover`), move waiting jobs to a new protocol
-(`adopt_older_protocols`), and delete old finished jobs (`delete_finished`).
+(`ledger`). The library leaves three things to us: detect dead executors (`recover`), move jobs to another protocol
+(`adopt_older_protocols`, `take_back`), and delete old finished jobs (`delete_finished`).
 """
 
 from __future__ import annotations
@@ -11,19 +11,20 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from dbos import DBOS, DBOSClient, DBOSConfig, EnqueueOptions
-from dbos._serialization import Serializer
+from dbos import DBOS, DBOSClient, DBOSConfig, EnqueueOptions, Serializer
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.platform.jobs.registry import Priority
 
-PROTOCOL = "4"
-"""Version of the job protocol: raise it when orchestrations change the keys of their steps or the meaning of recorded results."""
+PROTOCOL = 4
+"""Version of the job protocol. Raise it when orchestrations change the keys of their steps, the meaning of recorded results or the params
+of a kind. A worker runs jobs of its own protocol, and adopts those of older ones that no live worker speaks.
+"""
 
 MAX_RECOVERIES = 3
 """A job whose worker dies this many times after the first is given up: it is likely what kills them."""
@@ -89,10 +90,10 @@ def enqueue(db: Session, job_id: str, urgency: int, place: int = 0) -> None:
     Args:
         urgency: a `Priority`. place: order among jobs of one urgency; the smaller begins first.
     """
-    # no app_version: a job runs on the newest protocol that any worker speaks
     queue = QUEUE if urgency > Priority.INTERACTIVE else URGENT_QUEUE
     order = urgency * MOST_PLACES + min(place, MOST_PLACES - 1)
     options: EnqueueOptions = {"workflow_name": WORKFLOW, "queue_name": queue, "workflow_id": job_id, "priority": order}
+    options["app_version"] = str(PROTOCOL)
     # the insert must reach the rows that the session holds back, in order
     db.flush()
     client = _client(db.connection().engine.url.render_as_string(hide_password=False))
@@ -145,7 +146,7 @@ def launch(url: str, executor_id: str, jobs_at_once: int, runner: Callable[[str]
         "name": APPLICATION,
         "system_database_url": url,
         "dbos_system_schema": SCHEMA,
-        "application_version": PROTOCOL,
+        "application_version": str(PROTOCOL),
         "executor_id": executor_id,
         "serializer": JsonSerializer(),
         "log_level": "WARNING",
@@ -200,20 +201,31 @@ def ended(db: Session, job_ids: Sequence[str]) -> dict[str, str]:
     return {i: known.get(i, "GONE") for i in job_ids if known.get(i) not in {"ENQUEUED", "DELAYED", "PENDING"}}
 
 
-def adopt_older_protocols(db: Session) -> int:
-    """Move unfinished jobs of older protocol versions to ours, at start-up; returns how many. Those of newer ones wait for their workers.
+def adopt_older_protocols(db: Session, live: Collection[int]) -> list[str]:
+    """Move unfinished jobs of older protocols to ours, but those that a live worker speaks; returns their ids. Never the other way.
 
     DBOS would leave them waiting for ever for a worker of their version. Their finished steps are found by their keys in `job_step`.
     """
+    return _move(db, back=False, live=live)
+
+
+def take_back(db: Session) -> list[str]:
+    """Move unfinished jobs of newer protocols to ours, after an upgrade that was given up; returns their ids."""
+    return _move(db, back=True)
+
+
+def _move(db: Session, *, back: bool, live: Collection[int] = ()) -> list[str]:
     rows = db.execute(
         text(
-            "update dbos.workflow_status set application_version = :version"
-            " where name = :name and status in ('ENQUEUED', 'DELAYED', 'PENDING')"
-            " and cast(application_version as int) < cast(:version as int) returning workflow_uuid"
+            "update dbos.workflow_status s set application_version = :own from"
+            " (select workflow_uuid, cast(application_version as int) as version from dbos.workflow_status"
+            " where name = :name and status in ('ENQUEUED', 'DELAYED', 'PENDING')) as found"
+            " where found.workflow_uuid = s.workflow_uuid and version <> all(cast(:live as int[]))"
+            " and case when :back then version > cast(:own as int) else version < cast(:own as int) end returning s.workflow_uuid"
         ),
-        {"version": PROTOCOL, "name": WORKFLOW},
+        {"own": str(PROTOCOL), "name": WORKFLOW, "back": back, "live": list(live)},
     )
-    return len(rows.all())
+    return list(rows.scalars())
 
 
 def forgive_attempt(db: Session, executor_id: str) -> None:

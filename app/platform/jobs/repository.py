@@ -176,17 +176,19 @@ def ended_before(db: Session, job_ids: Sequence[str], days: float) -> set[str]:
     return set(job_ids) - set(db.scalars(keep))
 
 
-def beat(db: Session, worker_id: str, host: str, pid: int) -> float:
+def beat(db: Session, worker_id: str, host: str, pid: int, protocol: int, code_version: str) -> float:
     """Record a worker's heartbeat; returns the seconds since its last one by the database's clock (0 for a new worker)."""
     row = db.execute(
         text(
             "with old as (select seen_at from worker where id = :id)"
-            " insert into worker (id, host, pid, started_at, seen_at) values (:id, :host, :pid, clock_timestamp(), clock_timestamp())"
-            " on conflict (id) do update set host = :host, pid = :pid, seen_at = clock_timestamp(),"
+            " insert into worker (id, host, pid, protocol, code_version, started_at, seen_at)"
+            " values (:id, :host, :pid, :protocol, :code_version, clock_timestamp(), clock_timestamp())"
+            " on conflict (id) do update set host = :host, pid = :pid, protocol = :protocol, code_version = :code_version,"
+            " seen_at = clock_timestamp(),"
             " started_at = case when worker.pid = :pid then worker.started_at else clock_timestamp() end"
             " returning coalesce(extract(epoch from clock_timestamp() - (select seen_at from old)), 0)"
         ),
-        {"id": worker_id, "host": host, "pid": pid},
+        {"id": worker_id, "host": host, "pid": pid, "protocol": protocol, "code_version": code_version},
     )
     return float(row.scalar_one())
 
@@ -199,6 +201,23 @@ def leave(db: Session, worker_id: str) -> None:
 def live_workers(db: Session, stale_s: float) -> list[Worker]:
     """List the workers seen within the last `stale_s` seconds, by the database's clock."""
     return list(db.scalars(select(Worker).where(Worker.seen_at > func.clock_timestamp() - _seconds(stale_s)).order_by(Worker.id)))
+
+
+def set_protocol(db: Session, job_ids: Collection[str], protocol: int) -> None:
+    """Record that other workers than before run these jobs."""
+    db.execute(update(Job).where(Job.id.in_(job_ids)).values(protocol=protocol))
+
+
+def count_unserved(db: Session, stale_s: float) -> tuple[int, int, int]:
+    """Count the jobs that have not ended and that no live worker may run, with their newest protocol and that of the workers.
+
+    Zeros where no worker lives at all, which is another matter.
+    """
+    spoken = max((worker.protocol for worker in live_workers(db, stale_s)), default=None)
+    if spoken is None:
+        return 0, 0, 0
+    count, newest = db.execute(select(func.count(), func.max(Job.protocol)).where(Job.status.in_(LIVE), Job.protocol > spoken)).one()
+    return count, newest or 0, spoken
 
 
 def forget_workers(db: Session, stale_s: float) -> None:

@@ -22,6 +22,11 @@ from app.tables.jobs import Job, JobEvent, JobStatus
 STALE_S = 60.0
 """A worker that is silent for longer is taken for dead."""
 
+NEWER_WORKER = (
+    "Start a worker of the newer version. To go on with the older version instead, run its `betaloop take-back-jobs`."
+    " Finished steps are kept."
+)
+
 _ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -70,6 +75,7 @@ def submit(
         message="",
         params=checked,
         code_version=code_version(),
+        protocol=engine.PROTOCOL,
         created_by=created_by,
         repeats=None if repeats is None else repeats.id,
         urgency=urgency,
@@ -90,6 +96,19 @@ def in_queue(db: Session, job: Job) -> tuple[int, float | None]:
     workers = max(1, len(repository.live_workers(db, STALE_S)))
     known = [seconds for seconds in times if seconds is not None]
     return len(waiting), sum(known) / workers if len(known) == len(times) else None
+
+
+def take_back(db: Session) -> int:
+    """Let this version run the unfinished jobs of newer ones, after an upgrade that was given up; returns how many.
+
+    Raises:
+        Conflict: a worker of a newer version lives.
+    """
+    if newer := [worker.id for worker in repository.live_workers(db, STALE_S) if worker.protocol > engine.PROTOCOL]:
+        raise Conflict(f"A worker of a newer version lives: {', '.join(newer)}.", "Stop it first, and wait a minute if it was killed.")
+    moved = engine.take_back(db)
+    repository.set_protocol(db, moved, engine.PROTOCOL)
+    return len(moved)
 
 
 def live_of(db: Session, participant_id: int, kind: str | None = None, params: BaseModel | None = None) -> list[Job]:

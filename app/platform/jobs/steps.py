@@ -186,6 +186,7 @@ class JobRunner:
         try:
             if job.cancel_requested_at is not None:
                 raise JobCancelled
+            service.checked_params(job.kind, job.params)  # a newer version may have asked for it
             result = _as_json(registry.kind(job.kind).run(context), f"the result of job kind {job.kind!r}")
             requests.check()
             ledger.close(JobStatus.SUCCEEDED, result=result)

@@ -20,7 +20,7 @@ from sqlalchemy.exc import DBAPIError
 from app.platform import kept
 from app.platform.database import database_url, get_engine, new_session, set_actor, transaction
 from app.platform.files import prune_copies_beside
-from app.platform.jobs import engine, repository
+from app.platform.jobs import engine, repository, service
 from app.platform.jobs.steps import JobRunner
 from app.settings import get_settings
 from app.tables.jobs import JobStatus
@@ -135,7 +135,7 @@ class WorkerMonitor:
         """Say that we live."""
         self._identity.keep()
         with transaction(_ACTOR) as db:
-            silent_s = repository.beat(db, self._identity.id, self._host, self._pid)
+            silent_s = repository.beat(db, self._identity.id, self._host, self._pid, engine.PROTOCOL, service.code_version())
         if silent_s > self._pace.stale_s:
             # the machine slept: other workers of this machine did too, and need a moment to show that they live
             self._may_reap_at = time.monotonic() + self._pace.stale_s
@@ -167,10 +167,19 @@ class WorkerMonitor:
                     log.warning("job %s was taken over by %s", job_id, owners[job_id])
                     self._runner.abandon(job_id)
 
+    def adopt(self) -> None:
+        """Take the jobs of older protocols that no live worker speaks."""
+        with transaction(_ACTOR) as db:
+            spoken = {worker.protocol for worker in repository.live_workers(db, self._pace.stale_s)}
+            if moved := engine.adopt_older_protocols(db, spoken):
+                repository.set_protocol(db, moved, engine.PROTOCOL)
+                log.warning("moved %d jobs to job protocol %d", len(moved), engine.PROTOCOL)
+
     def _reap(self) -> None:
         """Put the jobs of dead workers back on the queue, and jobs of our own that have not run here since the last look."""
         if time.monotonic() < self._may_reap_at:
             return
+        self.adopt()
         with new_session() as db:
             live = {worker.id for worker in repository.live_workers(db, self._pace.stale_s)}
             owners = engine.owners(db)
@@ -229,10 +238,8 @@ def run_worker(slots: int, stop_event: threading.Event, pace: Pace | None = None
     worker_id = identity.claim()
     runner = JobRunner(worker_id, slots)
     monitor = WorkerMonitor(identity, runner, pace)
-    with transaction(_ACTOR) as db:
-        if moved := engine.adopt_older_protocols(db):
-            log.warning("moved %d waiting jobs to job protocol %s", moved, engine.PROTOCOL)
     monitor.beat()  # before the first job, or others would take it for a dead worker's
+    monitor.adopt()
     engine.launch(database_url(), worker_id, slots, runner.run)
     log.info("worker %s takes jobs, %d at a time", worker_id, slots)
     try:

@@ -7,11 +7,13 @@ from typing import Annotated
 
 import typer
 
-from app.platform.database import database_place
+from app.platform.database import database_place, transaction
+from app.platform.jobs.service import take_back
 from app.platform.migrate import migrate as bring_up_to_date
 from app.platform.terminal import AsJson, print_line, show
 from app.platform.upkeep import backup as backups
 from app.platform.upkeep.doctor import examine
+from app.platform.web.charts import counted
 from app.settings import get_settings
 
 app = typer.Typer(no_args_is_help=True)
@@ -35,6 +37,14 @@ def where(as_json: AsJson = False) -> None:
     result = {"data_folder": str(data_dir), "database": database_place()}
     result |= {"files": str(data_dir / "files"), "keys": str(data_dir / "secrets")}
     show(result, as_json, "\n".join(f"{name.replace('_', ' ')}: {value}" for name, value in result.items()))
+
+
+@app.command("take-back-jobs", epilog="Example: betaloop take-back-jobs")
+def take_back_jobs() -> None:
+    """Let this version run the unfinished jobs of a newer one, after an upgrade that was given up. Stop the newer workers first."""
+    with transaction("command line") as db:
+        moved = take_back(db)
+    print_line(f"{counted(moved, 'job')} of a newer version will run in this one.")
 
 
 @app.command("backup-key", epilog="Example: betaloop backup-key /media/key/betaloop.key")

@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from alembic.config import Config
-from alembic.script import ScriptDirectory
 from sqlalchemy import or_, select, text
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
@@ -18,14 +16,14 @@ from app.platform.audit.chain import verify
 from app.platform.bucket import StoreAway, bucket
 from app.platform.database import new_session, now
 from app.platform.jobs import repository as jobs
-from app.platform.jobs.service import STALE_S
+from app.platform.jobs.service import NEWER_WORKER, STALE_S
+from app.platform.migrate import newest_revision, revision
 from app.platform.service_role import excess
 from app.platform.web.charts import counted
 from app.settings import get_settings
 from app.tables import METADATA
 from app.tables.uploads import StoredFile
 
-ROOT = Path(__file__).resolve().parents[3]
 LEAST_FREE_MB = 1024
 MOST_NAMED = 20
 MOST_CLOCK_DIFFERENCE_S = 2.0
@@ -56,20 +54,6 @@ def examine(hashes: bool = False) -> list[Finding]:
         reason = str(getattr(error, "orig", error)).strip().splitlines()
         detail = f"it does not answer: {reason[0] if reason else type(error).__name__}"
         return [*found, Finding("database", False, detail, "Start it, or correct BETALOOP_DATABASE_URL; `betaloop where` says which one.")]
-
-
-def newest_revision() -> str:
-    """Read the schema that this betaloop needs."""
-    config = Config(str(ROOT / "alembic.ini"))
-    config.set_main_option("script_location", str(ROOT / "migrations"))
-    return ScriptDirectory.from_config(config).get_current_head() or ""
-
-
-def revision(db: Session) -> str:
-    """Read the schema that the database has."""
-    if db.scalar(text("select to_regclass('alembic_version')")) is None:
-        return ""
-    return db.scalar(text("select version_num from alembic_version")) or ""
 
 
 def _schema(db: Session) -> Finding:
@@ -138,9 +122,16 @@ def _owners_of(db: Session, bad: list[str]) -> str:
 
 def _jobs(db: Session) -> Iterator[Finding]:
     live, workers = jobs.live_ids(db), jobs.live_workers(db, STALE_S)
-    stuck = bool(live) and not workers
-    hint = "Start one with `betaloop worker`; jobs go on where they were." if stuck else ""
-    yield Finding("jobs", not stuck, f"{len(live)} waiting or running, {len(workers)} live workers", hint)
+    detail, hint = f"{len(live)} waiting or running, {len(workers)} live workers", ""
+    if len(versions := sorted({worker.code_version for worker in workers})) > 1:
+        detail += f" of versions {', '.join(versions)}"
+    beyond, newest, spoken = jobs.count_unserved(db, STALE_S)
+    if live and not workers:
+        hint = "Start one with `betaloop worker`; jobs go on where they were."
+    elif beyond:
+        detail += f"; {beyond} need a newer worker: job protocol {newest}, and the live workers speak {spoken}"
+        hint = NEWER_WORKER
+    yield Finding("jobs", not hint, detail, hint)
 
 
 def _disk() -> Finding:

@@ -17,13 +17,16 @@ from fastapi.routing import iter_route_contexts
 from prometheus_client import Counter, Histogram
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.middleware.base import RequestResponseEndpoint
 from starlette.requests import ClientDisconnect
 from starlette.routing import compile_path
 
-from app.platform.errors import BetaloopError, Conflict, EntriesOfAnother, Forbidden, StorageFull, Unauthorized, passing
+from app.platform.database import new_session
+from app.platform.errors import BetaloopError, Conflict, DatabaseAway, EntriesOfAnother, Forbidden, StorageFull, Unauthorized, passing
 from app.platform.json_members import UniqueMembers
+from app.platform.migrate import newest_revision, revision
 from app.platform.web.body_limit import BodyLimit, Judge
 from app.platform.web.compression import Compression
 from app.platform.web.error_pages import ADDRESS_ALONE, advised, input_in_words, kept_entries, send_again_to, writer_of
@@ -207,11 +210,26 @@ async def _fault_beneath(request: Request, error: Exception) -> Response:
     state = getattr(getattr(error, "orig", None), "sqlstate", None)
     if state in _FIRST:
         return await _second(request, error)
-    if (known := passing(error)) is None:
+    if (known := passing(error)) is None and (known := await run_in_threadpool(_other_schema)) is None:
         return await _unknown_error(request, error)
     tell = log.error if isinstance(known, StorageFull) else log.warning
     tell("a request met a fault that passes", told=known.title, path=request.url.path, error=type(error).__name__, sqlstate=state)
     return await _answer(request, known)
+
+
+def _other_schema() -> BetaloopError | None:
+    """Return an error in words where the database has another schema than this version needs, as during an upgrade."""
+    try:
+        with new_session() as db:
+            has, needs = revision(db), newest_revision()
+    except (DBAPIError, PoolTimeout):
+        return None
+    if has == needs:
+        return None
+    return DatabaseAway(
+        f"The database has schema {has or 'none'}, and this version needs {needs}: it is being upgraded. Nothing was stored.",
+        "Try again in some minutes. If it stays so, ask your administrator to bring this service to the version of the database.",
+    )
 
 
 async def _second(request: Request, error: Exception) -> Response:

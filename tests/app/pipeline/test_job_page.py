@@ -14,7 +14,7 @@ from app.evaluation.estimates.compute import evaluate_method, fit_dlsm
 from app.learning.schemas import Aim, Anchor, Preset
 from app.pipeline.charts import job_curves
 from app.pipeline.pages import VALUE_NAMES
-from app.platform.jobs import StepReport
+from app.platform.jobs import StepReport, engine, repository
 from app.tables.jobs import Job, JobEvent, JobStep
 from ml.ope.dlmm import DlmmConfig
 from tests.app.evaluation.estimates.test_compute import buffer_of, call, sessions
@@ -68,6 +68,19 @@ def test_the_page_names_methods_in_words(client: TestClient, upload: Callable[..
     assert "dual_dice" not in asked_for
     for name, value in (("Size", "quick: for a first look"), ("Critics see past amplitudes", "yes"), ("Seed", "0")):
         assert f"<dt>{name}</dt><dd>{value}</dd>" in asked_for
+
+
+def test_the_page_says_when_no_worker_of_the_newest_version_lives(client: TestClient, db: Session, upload: Callable[..., int]) -> None:
+    upload("random")
+    job = client.post("/api/v1/participants/P1/jobs", json={"kind": "pipeline", "preset": "quick"}).json()["id"]
+    repository.beat(db, "here-0", "here", 1, engine.PROTOCOL, "x")
+    db.commit()
+    assert "newest version" not in client.get(f"/jobs/{job}").text
+    repository.set_protocol(db, [job], engine.PROTOCOL + 1)
+    db.commit()
+    page = client.get(f"/jobs/{job}").text
+    assert "No worker of the newest version is running" in page
+    assert "betaloop take-back-jobs" in page
 
 
 def test_every_answer_to_a_question_of_the_form_has_its_words() -> None:

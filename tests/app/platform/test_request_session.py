@@ -112,3 +112,19 @@ def test_a_change_is_noticed_however_it_is_made(service: FastAPI, statement: str
 
     assert browser(service).post("/change").status_code == 200
     assert studies() == ["S2"]
+
+
+def test_a_newer_schema_is_served_where_it_can_be_and_refused_in_words_where_not(
+    client: TestClient, participant_code: str, owner_db: Session
+) -> None:
+    owner_db.execute(text("alter table visit add column room text not null default ''"))
+    owner_db.execute(text("alter table visit alter column room drop default"))
+    owner_db.execute(text("update alembic_version set version_num = 'newer'"))
+    owner_db.commit()
+    assert client.get(f"/participants/{participant_code}").status_code == 200
+    answer = client.post(f"/api/v1/participants/{participant_code}/visits", json={"number": 7})
+    assert answer.status_code == 503
+    assert "has schema newer, and this version needs first_" in answer.json()["detail"]
+    assert int(answer.headers["Retry-After"]) > 0
+    owner_db.rollback()
+    assert owner_db.scalar(text("select count(*) from visit where number = 7")) == 0

@@ -1,7 +1,9 @@
-"""What we rely on in the workflow engine, its private recovery call included: fails when a new version behaves differently."""
+"""Contract of the workflow engine, its private recovery call included: fails when a new version behaves differently."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 import threading
 import time
@@ -13,7 +15,7 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.platform.database import get_engine, new_session, transaction
-from app.platform.jobs import engine
+from app.platform.jobs import engine, registry
 from app.platform.jobs.errors import WorkerStopping
 
 
@@ -69,9 +71,9 @@ def test_the_version_is_one_that_these_tests_were_written_for():
 
 def test_recovery_requeues_jobs_of_dead_executors_and_no_others(ran):
     ids, _, launch = ran
-    _enqueue("dead", status="PENDING", executor_id="gone", application_version=engine.PROTOCOL)
-    _enqueue("alive", status="PENDING", executor_id="other", application_version=engine.PROTOCOL)
-    _enqueue("cancelled", status="CANCELLED", executor_id="gone", application_version=engine.PROTOCOL)
+    _enqueue("dead", status="PENDING", executor_id="gone", application_version=str(engine.PROTOCOL))
+    _enqueue("alive", status="PENDING", executor_id="other", application_version=str(engine.PROTOCOL))
+    _enqueue("cancelled", status="CANCELLED", executor_id="gone", application_version=str(engine.PROTOCOL))
     launch()
     assert engine.recover(["gone"]) == ["dead"]
     assert engine.recover(["gone"]) == []
@@ -83,7 +85,7 @@ def test_recovery_requeues_jobs_of_dead_executors_and_no_others(ran):
 
 def test_a_restarted_executor_takes_its_own_interrupted_jobs_again(ran):
     ids, _, launch = ran
-    _enqueue("mine", status="PENDING", executor_id="live", application_version=engine.PROTOCOL, recovery_attempts=1)
+    _enqueue("mine", status="PENDING", executor_id="live", application_version=str(engine.PROTOCOL), recovery_attempts=1)
     launch()
     _wait(lambda: ids == ["mine"])
     assert _row("mine", "recovery_attempts") == (2,)
@@ -110,19 +112,43 @@ def test_what_a_person_waits_for_runs_beside_as_many_other_jobs_as_a_worker_take
     assert ids == []
 
 
-def test_a_job_without_a_version_runs_and_one_of_another_version_waits_until_it_is_adopted(ran):
+def test_a_worker_runs_its_own_protocol_and_adopts_older_ones_that_no_live_worker_speaks(ran):
     ids, _, launch = ran
-    _enqueue("new")
-    _enqueue("old", application_version="0")
-    _enqueue("newer", application_version=str(int(engine.PROTOCOL) + 1))
-    assert _row("new", "application_version") == (None,)
+    _enqueue("own")
+    _enqueue("old", application_version=str(engine.PROTOCOL - 1))
+    _enqueue("newer", application_version=str(engine.PROTOCOL + 1))
     launch()
-    _wait(lambda: ids == ["new"])
+    _wait(lambda: ids == ["own"])
     with transaction("test") as db:
-        assert engine.adopt_older_protocols(db) == 1
-        assert engine.adopt_older_protocols(db) == 0
-    _wait(lambda: ids == ["new", "old"])
-    assert _row("newer", "status", "application_version") == ("ENQUEUED", str(int(engine.PROTOCOL) + 1)), "it is for newer workers"
+        assert engine.adopt_older_protocols(db, {engine.PROTOCOL - 1, engine.PROTOCOL}) == []
+        assert engine.adopt_older_protocols(db, {engine.PROTOCOL}) == ["old"]
+        assert engine.adopt_older_protocols(db, {engine.PROTOCOL}) == []
+    _wait(lambda: ids == ["own", "old"])
+    assert _row("newer", "status", "application_version") == ("ENQUEUED", str(engine.PROTOCOL + 1)), "it is for newer workers"
+    with transaction("test") as db:
+        assert engine.take_back(db) == ["newer"]
+    _wait(lambda: ids == ["own", "old", "newer"])
+
+
+def test_the_start_of_a_newer_worker_strands_no_later_job_of_this_version(ran, fresh_database, monkeypatch):
+    ids, _, launch = ran
+    with monkeypatch.context() as newer:
+        newer.setattr(engine, "PROTOCOL", engine.PROTOCOL + 1)
+        launch("newer")
+        engine.shutdown()
+    launch()
+    _enqueue("later")
+    _wait(lambda: ids == ["later"])
+
+
+def test_params_of_a_kind_change_with_the_protocol():
+    schemas = {
+        name: kind.params.model_json_schema() for name, kind in sorted(registry.kinds().items()) if kind.orchestration.startswith("app.")
+    }
+    digest = hashlib.sha256(json.dumps(schemas, sort_keys=True).encode()).hexdigest()[:12]
+    assert (engine.PROTOCOL, digest) == (4, "62ab31bfbb7e"), (
+        "a worker of before cannot run these params: raise engine.PROTOCOL, and note both here"
+    )
 
 
 def test_a_stopping_worker_leaves_its_job_pending_and_takes_back_the_attempt(ran):

@@ -150,7 +150,7 @@ def test_jobs_of_an_older_protocol_are_moved_and_their_finished_steps_kept(jobs)
     assert jobs.counted(job_id) == [0, 1]
     with new_session() as db:
         version = db.scalar(text("select application_version from dbos.workflow_status where workflow_uuid = :id"), {"id": job_id})
-    assert version == engine.PROTOCOL
+    assert version == str(engine.PROTOCOL)
 
 
 @pytest.mark.slow
@@ -211,7 +211,7 @@ def test_a_worker_runs_a_job_again_that_is_its_own_and_does_not_run(jobs):
     with transaction("test") as db:
         job_id = service.submit(db, "count", None, {"parts": 1, "numbers": 1}, "test").id
         mine = "update dbos.workflow_status set status = 'PENDING', executor_id = :worker, application_version = :version"
-        db.execute(text(f"{mine} where workflow_uuid = :id"), {"worker": worker.id, "version": engine.PROTOCOL, "id": job_id})
+        db.execute(text(f"{mine} where workflow_uuid = :id"), {"worker": worker.id, "version": str(engine.PROTOCOL), "id": job_id})
     job = jobs.ended(job_id)
     assert (job.status, jobs.counted(job_id)) == ("succeeded", [0])
 

@@ -313,11 +313,11 @@ def test_a_worker_name_is_held_by_one_and_free_again_when_its_connection_ends(jo
 
 def test_a_sign_of_life_tells_how_long_the_worker_was_silent(jobs):
     with transaction("test") as db:
-        assert repository.beat(db, "w", "host", 1) == 0.0
+        assert repository.beat(db, "w", "host", 1, 4, "x") == 0.0
     with transaction("test") as db:
         db.execute(text("update worker set seen_at = seen_at - interval '70 seconds'"))
         assert repository.live_workers(db, 60.0) == []
-        assert repository.beat(db, "w", "host", 1) == pytest.approx(70, abs=5)
+        assert repository.beat(db, "w", "host", 1, 4, "x") == pytest.approx(70, abs=5)
         assert [w.id for w in repository.live_workers(db, 60.0)] == ["w"]
         repository.leave(db, "w")
         assert repository.live_workers(db, 60.0) == []

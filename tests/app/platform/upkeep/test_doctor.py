@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from app.cli import app as command_line
 from app.platform.database import now, transaction
-from app.platform.jobs import JobKind, register, registry, service
+from app.platform.jobs import JobKind, engine, register, registry, service
 from app.platform.jobs.service import STALE_S
 from app.platform.upkeep import doctor
 from app.settings import get_settings
@@ -66,19 +66,19 @@ class Nothing(BaseModel):
     """Asked for of the job that waits."""
 
 
-def submitted(monkeypatch: pytest.MonkeyPatch) -> None:
+def submitted(monkeypatch: pytest.MonkeyPatch) -> str:
     """A job that waits for a worker."""
     monkeypatch.setattr(registry, "_kinds", dict(registry.kinds()))
     register(JobKind(name="wait", title="Wait", params=Nothing, orchestration="nowhere:never"))
     with transaction("test") as db:
-        service.submit(db, "wait", None, {}, "test")
+        return service.submit(db, "wait", None, {}, "test").id
 
 
 def seen(ago_s: float) -> None:
     """A worker that gave its last sign of life so long ago."""
     with transaction("test") as db:
         moment = now() - timedelta(seconds=ago_s)
-        db.merge(Worker(id="one", pid=1, host="here", started_at=moment, seen_at=moment))
+        db.merge(Worker(id="one", pid=1, host="here", protocol=engine.PROTOCOL, code_version="x", started_at=moment, seen_at=moment))
 
 
 def test_jobs_that_nobody_works_on_are_found(fresh_database: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,6 +91,32 @@ def test_jobs_that_nobody_works_on_are_found(fresh_database: str, monkeypatch: p
     assert found(exit_code=0)["jobs"]["detail"] == "1 waiting or running, 1 live workers"
     seen(ago_s=STALE_S + 60)
     assert not_in_order(found(exit_code=1)) == ["jobs"], "a worker that gives no sign of life is none"
+
+
+def test_jobs_that_need_a_newer_worker_are_found_and_the_command_mends_it(fresh_database: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as newer:
+        newer.setattr(engine, "PROTOCOL", engine.PROTOCOL + 1)
+        job = submitted(monkeypatch)
+    seen(ago_s=0)
+    stuck = found(exit_code=1)
+    assert not_in_order(stuck) == ["jobs"]
+    assert f"1 need a newer worker: job protocol {engine.PROTOCOL + 1}" in stuck["jobs"]["detail"]
+    assert "betaloop take-back-jobs" in stuck["jobs"]["hint"]
+    done = CliRunner().invoke(command_line, ["take-back-jobs"])
+    assert (done.exit_code, done.output) == (0, "1 job of a newer version will run in this one.\n")
+    found(exit_code=0)
+    with transaction("test") as db:
+        version = db.scalar(text("select application_version from dbos.workflow_status where workflow_uuid = :id"), {"id": job})
+    assert version == str(engine.PROTOCOL)
+
+
+def test_jobs_are_not_taken_back_from_a_newer_worker_that_lives(fresh_database: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as newer:
+        newer.setattr(engine, "PROTOCOL", engine.PROTOCOL + 1)
+        seen(ago_s=0)
+    done = CliRunner().invoke(command_line, ["take-back-jobs"])
+    assert done.exit_code == 1
+    assert "A worker of a newer version lives: one. Stop it first" in str(done.exception)
 
 
 @pytest.mark.parametrize("apart_s", [90, -90])
