@@ -40,6 +40,8 @@ class Deviation(StrEnum):
     """A controller's log of a session of another plan."""
     SECOND_RUN = "second_run"
     """A controller's log of a slot that another session fills: two tablets ran it, or one whose notes were lost."""
+    EARLIER_PLAN = "earlier_plan"
+    """A session that was put into a slot of the plan that was signed before this one."""
     ABORTED = "aborted"
     """A controller's log of an attempt at a slot that ended before policy or schedule decided."""
 
@@ -93,15 +95,15 @@ def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) 
     Args:
         slots: in the plan's order. sessions: in the order in which they were held. day: of the visit; None where it has no date.
     """
-    pairs: dict[int, Done] = {s.filled: s for s in sessions if s.filled is not None}
     known = {p.item_id for p in slots}
+    pairs: dict[int, Done] = {s.filled: s for s in sessions if s.filled in known and s.filled is not None}
     for session in sessions:
         if session.filled is None and session.logged in known and not session.aborted:
             pairs.setdefault(session.logged, session)
     taken = {s.session_id for s in pairs.values()}
     open_slots = [p for p in slots if p.item_id not in pairs]
     # a log that names its slot fills that one or none, and one of a bench never any
-    free = [s for s in sessions if s.session_id not in taken and s.logged is None and not s.bench]
+    free = [s for s in sessions if s.session_id not in taken and s.filled is None and s.logged is None and not s.bench]
     in_order = _by_clock(open_slots, free)
     pairs |= in_order
     taken |= {s.session_id for s in in_order.values()}
@@ -122,6 +124,8 @@ def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) 
 
 def _beside(session: Done, known: Collection[int]) -> Deviation:
     """Return why a session fills no slot."""
+    if session.filled is not None:
+        return Deviation.EARLIER_PLAN
     if session.logged in known and session.aborted:
         return Deviation.ABORTED
     if session.logged is None:

@@ -80,7 +80,7 @@ def _facts(found: service.Comparison, caller: Caller) -> dict[str, Any]:
         "asks_about_day": bool(found.asks_about_day),
         "due": due,
         "policies": {line.policy.id: line.policy.name for line in found.view.lines if line.policy},
-        "summary": wording.slots_summary(found.planned, shown.missing, due),
+        "summary": wording.slots_summary(found.planned, shown.missing, due, found.carry_over),
         "deviation_words": wording.DEVIATIONS,
         "may_confirm": may(caller, can.WRITE_STUDY, visit.participant) and not visit.locked,
     }

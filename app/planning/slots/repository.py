@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
 
-from sqlalchemy import false, func, select
+from sqlalchemy import false, func, or_, select
 from sqlalchemy.orm import Session
 
 from app.tables.plans import Plan, PlanItem
@@ -39,7 +39,10 @@ class Filled:
 
 
 def slots_filled(db: Session, participant_ids: Sequence[int]) -> list[Filled]:
-    """Of every visit whose approved plan has limits in mA, by participant and visit number; plans of earlier versions have none."""
+    """Count slots of every visit whose approved plan has limits in mA, by participant and visit number; older plans have none.
+
+    Slots of a plan that was signed before count where a confirmed session fills them.
+    """
     confirmed = StudySession.status == "confirmed"
     filled = func.count(StudySession.id).filter(confirmed)
     tested = func.count(StudySession.id).filter(confirmed & PlanItem.policy_id.is_not(None))
@@ -50,7 +53,9 @@ def slots_filled(db: Session, participant_ids: Sequence[int]) -> list[Filled]:
         .join(Plan, Plan.visit_id == Visit.id)
         .join(PlanItem, PlanItem.plan_id == Plan.id)
         .outerjoin(StudySession, StudySession.plan_item_id == PlanItem.id)
-        .where(Visit.participant_id.in_(participant_ids), Plan.status == "approved", PlanItem.max_ma.is_not(None))
+        .where(Visit.participant_id.in_(participant_ids), PlanItem.max_ma.is_not(None))
+        .where(Visit.id.in_(select(Plan.visit_id).where(Plan.status == "approved")))
+        .where(or_(Plan.status == "approved", Plan.approved_at.is_not(None) & confirmed))
         .group_by(Visit.participant_id, Visit.id, Visit.number, Visit.date)
         .order_by(Visit.participant_id, Visit.number)
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from app.planning import wording
 from app.planning.plans.view import shown
+from app.planning.slots.matching import Deviation
 from app.planning.slots.schemas import SlotRowOut, VisitComparisonOut
 from app.planning.slots.service import Comparison, Row
 from app.tables.sessions import Controller
@@ -26,7 +27,7 @@ def _row(row: Row, names: dict[int, str], sealed: bool) -> SlotRowOut:
     known = item is not None and not sealed
     return SlotRowOut(
         position=item.position if item else None,
-        name=names[item.position] if item else "not planned",
+        name=names[item.position] if item else "planned before" if Deviation.EARLIER_PLAN in row.deviations else "not planned",
         controller=Controller(item.controller) if item is not None and known else None,
         policy_id=item.policy_id if item is not None and known else None,
         session_id=row.session.id if row.session else None,

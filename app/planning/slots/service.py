@@ -77,6 +77,11 @@ class Comparison:
         return sum(r.line is not None and r.session is not None for r in self.rows)
 
     @property
+    def carry_over(self) -> int:
+        """Number of sessions of a plan that this one replaced."""
+        return sum(Deviation.EARLIER_PLAN in r.deviations for r in self.rows)
+
+    @property
     def missing(self) -> list[PlanLine]:
         """Slots that nothing fills."""
         return [r.line for r in self.rows if r.line is not None and r.session is None]
@@ -205,7 +210,8 @@ def _row(db: Session, found: Match, lines: dict[int, PlanLine], sessions: dict[i
         line,
         session,
         found.deviations,
-        confirmed=session is not None and line is not None and session.plan_item_id == line.item.id,
+        confirmed=session is not None
+        and (Deviation.EARLIER_PLAN in found.deviations or (line is not None and session.plan_item_id == line.item.id)),
         proposed=session is not None and session.status == "proposed",
         predicted=_predicted(line),
         done=_shown(db, session) if session is not None else {},

@@ -10,6 +10,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from app.planning.slots.repository import slots_filled
 from app.tables.sessions import StudySession
 from tests.app.words import flat
 
@@ -23,7 +24,7 @@ def recording(seed: int, controlled: bool) -> str:
 
 
 @pytest.fixture
-def planned(client: TestClient, study_world: Any, sign_plan: Callable[..., Any]) -> list[dict[str, Any]]:
+def plan(client: TestClient, study_world: Any, sign_plan: Callable[..., Any]) -> list[dict[str, Any]]:
     assert client.patch(f"/api/v1/visits/{study_world.visit}", json={"date": DAY, "reason": "agreed"}).status_code == 200
     body = {"policy_ids": list(study_world.policies[:2]), "order": "stated", "repeats": 2, "seed": 1}
     assert client.post(f"/api/v1/visits/{study_world.visit}/plan", json=body).status_code == 201
@@ -41,10 +42,10 @@ def send(client: TestClient, number: int, minute: int, *, day: str = DAY, contro
 
 
 def test_uploads_of_the_day_are_found_in_their_slots_and_confirmed_in_one_step(
-    client: TestClient, study_world: Any, planned: list[dict[str, Any]], db: Session
+    client: TestClient, study_world: Any, plan: list[dict[str, Any]], db: Session
 ) -> None:
     path = f"/api/v1/visits/{study_world.visit}/slots"
-    for i, slot in enumerate(planned):
+    for i, slot in enumerate(plan):
         if i == 3:
             continue  # the second cDBS session was not uploaded
         known = {"controller": slot["controller"]} | ({"policy": slot["policy"]} if slot["policy"] else {})
@@ -71,7 +72,33 @@ def test_uploads_of_the_day_are_found_in_their_slots_and_confirmed_in_one_step(
     assert (again.status_code, "has nothing to confirm" in again.json()["detail"]) == (409, True)
 
 
-def test_sessions_of_another_year_are_asked_about(client: TestClient, study_world: Any, planned: list[dict[str, Any]]) -> None:
+def test_a_plan_that_is_signed_anew_keeps_what_was_done_that_day(
+    client: TestClient, study_world: Any, plan: list[dict[str, Any]], sign_plan: Callable[..., Any], db: Session
+) -> None:
+    path = f"/api/v1/visits/{study_world.visit}/slots"
+    for i, slot in enumerate(plan[:3]):
+        known = {"controller": slot["controller"]} | ({"policy": slot["policy"]} if slot["policy"] else {})
+        send(client, i, 8 * i, controlled=slot["controller"] == "rl", **known)
+    confirmed = client.post(f"{path}/confirm", json={}).json()["comparison"]["rows"]
+    held = {r["session_id"]: r["done"] for r in confirmed if r["session_id"]}
+    assert len(held) == 3
+    again = {"policy_ids": [study_world.policies[1]], "order": "stated", "seed": 1, "reason": "the device was refused"}
+    drafted = client.post(f"/api/v1/visits/{study_world.visit}/plan", json=again)
+    assert drafted.status_code == 201, drafted.text
+    assert sign_plan(study_world.visit).status_code == 200
+    found = client.get(path).json()
+    slots = len(drafted.json()["sessions"])
+    assert (found["planned"], found["found"]) == (slots, 0), "the new plan asks for sessions of its own"
+    kept = [r for r in found["rows"] if r["position"] is None]
+    assert {r["session_id"]: r["done"] for r in kept} == held
+    assert all(r["confirmed"] and r["deviations"] == ["earlier_plan"] and r["name"] == "planned before" for r in kept)
+    page = flat(client.get(f"/visits/{study_world.visit}", headers=PAGE).text)
+    assert f"0 of {slots} planned sessions found; 3 sessions of the plan signed before are kept" in page
+    (progress,) = slots_filled(db, [1])
+    assert (progress.slots, progress.filled) == (slots + 3, 3)
+
+
+def test_sessions_of_another_year_are_asked_about(client: TestClient, study_world: Any, plan: list[dict[str, Any]]) -> None:
     send(client, 1, 0, day="2024-04-06", controller="rl", policy="rl-01")
     path = f"/visits/{study_world.visit}/slots"
     asked = client.post(f"/api/v1{path}/confirm", json={})
