@@ -90,8 +90,8 @@ class TestedBefore(_Means):
     __test__ = False
 
 
-Decision = Literal["test", "test_with_care", "same_as_cdbs", "unsafe", "cannot_tell"]
-Standing = Literal["test", "test_with_care", "same_as_cdbs", "unsafe", "not_advised", "cannot_tell"]
+Decision = Literal["test", "test_with_care", "same_as_cdbs", "undecided", "likely_worse", "unsafe", "cannot_tell"]
+Standing = Literal["test", "test_with_care", "same_as_cdbs", "undecided", "likely_worse", "unsafe", "not_advised", "cannot_tell"]
 
 
 class GainOut(Model):

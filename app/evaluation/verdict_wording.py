@@ -17,6 +17,8 @@ STANDING_NAMES: dict[Standing, str] = {
     "test": "test",
     "test_with_care": "test with care",
     "same_as_cdbs": "same as cDBS",
+    "undecided": "undecided",
+    "likely_worse": "likely worse",
     "unsafe": "unsafe",
     "not_advised": "not advised",
     "cannot_tell": "cannot tell",
@@ -153,6 +155,9 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "stopped": lambda f: f"{count_stops(f)}, not cleared by a clinician",
     "nearly_off": lambda f: f"nearly off {percent(f.value)} of the time",
     "beyond_margin": lambda f: (
+        f"{chance(number(f))} likely that {ANY} is worse by more than twice its margin, most often {OUTCOME_NAMES[f.fact('outcome')]}"
+    ),
+    "likely_beyond_margin": lambda f: (
         f"{chance(number(f))} likely that {ANY} is worse by more than its margin, most often {OUTCOME_NAMES[f.fact('outcome')]}"
     ),
     "all_below_zero": lambda f: "its whole expected gain lies below that of cDBS",

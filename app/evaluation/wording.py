@@ -229,8 +229,12 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "stopped": lambda f: f"{count_stops(f)}, and no clinician has cleared {'it' if f.value == 1 else 'them'}",
     "nearly_off": lambda f: f"nearly off, below 20 % of the cDBS amplitude, {percent(f.value)} of the time (at most {percent(f.limit)})",
     "beyond_margin": lambda f: (
-        f"{chance(number(f))} likely beyond a margin of {ANY}, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
+        f"{chance(number(f))} likely beyond twice a margin of {ANY}, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
         f"(unsafe from {percent(f.limit)})"
+    ),
+    "likely_beyond_margin": lambda f: (
+        f"{chance(number(f))} likely beyond a margin of {ANY}, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
+        f"(likely worse from {percent(f.limit)})"
     ),
     "extrapolates": lambda f: (
         f"it would hold {percent(f.value)} of the cDBS amplitude on average; the lowest that two sessions held is {percent(f.limit)}"

@@ -17,7 +17,7 @@ from app.tables.evaluations import Evaluation
 from app.tables.participants import Participant
 from app.tables.plans import Plan
 
-_STRICTEST_FIRST = ("unsafe", "test_with_care")
+_STRICTEST_FIRST = ("unsafe", "likely_worse", "test_with_care")
 
 
 @dataclass(frozen=True)

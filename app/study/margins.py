@@ -43,7 +43,7 @@ class MarginsFields(StatedMargins):
 
     test_within: Number = Field(0.8, description="Probability of keeping all outcomes within the margins from which a test is proposed.")
     test_saves: Number = Field(0.9, description="Probability of using less energy than cDBS from which a test is proposed.")
-    unsafe_beyond: Number = Field(0.5, description="Probability that an outcome lies beyond its margin from which a policy is unsafe.")
+    unsafe_beyond: Number = Field(0.9, description="Probability of an outcome beyond twice its margin from which a policy is unsafe.")
     nearly_off_share: Number = Field(0.2, description="Share of steps below 0.2 of the cDBS amplitude above which a policy is unsafe.")
 
 

@@ -70,7 +70,7 @@ GROUPS = (
     SettingGroup(
         "When a policy is unsafe",
         (
-            SettingField("unsafe_beyond", "Beyond a margin with", "Probability that any outcome lies beyond its margin.", "probability"),
+            SettingField("unsafe_beyond", "Harm with", "Probability that any outcome is beyond twice its margin.", "probability"),
             SettingField("nearly_off_share", "Nearly off in", "Largest share of steps below 0.2 of the cDBS amplitude.", "of steps"),
         ),
     ),

@@ -84,7 +84,7 @@ class MarginsVersion(Base):
     """By how much an outcome may be worse than under cDBS, and how sure a proposal must be of it. Never changed, only followed.
 
     One column per margin of `ml.outcomes`. A policy is proposed for a test if it keeps all outcomes within the margins with probability
-    `test_within` and saves energy with probability `test_saves`. It is unsafe if an outcome is beyond its margin with probability
+    `test_within` and saves energy with probability `test_saves`. It is unsafe if an outcome is beyond twice its margin with probability
     `unsafe_beyond`, or if more than `nearly_off_share` of its steps are nearly off.
     """
 

@@ -16,6 +16,7 @@ from app.learning.policies.baselines import constant_onnx, ensure_baselines
 from app.learning.snapshots.service import collect, take_snapshot
 from app.study.repository import participant_by_code
 from ml.ope.estimate import Estimate
+from ml.ope.posterior import verdict
 from ml.ope.support.coverage import thin
 from tests.ml.ope.posterior.draws import cdbs, constructed
 
@@ -60,8 +61,9 @@ def policies(client: TestClient, upload: Upload, begin_with: Callable[[str, Call
 
 
 @pytest.fixture
-def judge(db: Session, policies: list[int]) -> Callable[..., int]:
-    """Store an evaluation with the posterior of policies by id, and that of cDBS beside them."""
+def judge(db: Session, policies: list[int], monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Store an evaluation with the posterior of policies by id and that of cDBS; chances are the shares of their constructed draws."""
+    monkeypatch.setattr(verdict, "CALIBRATION", ((0.0, 0.0), (1.0, 1.0)))
 
     def store(
         posterior: dict[int, dict[str, Any]],

@@ -15,7 +15,7 @@ from app.tables.evaluations import Evaluation
 from ml.ope import SAME_AMPLITUDE, BehaviourMap, Estimate, chance_within, interval, outcome_draws
 from ml.outcomes import FIELDS
 
-ORDER = ("test", "test_with_care", "cannot_tell", "not_advised", "unsafe", "same_as_cdbs")
+ORDER = ("test", "test_with_care", "undecided", "cannot_tell", "likely_worse", "not_advised", "unsafe", "same_as_cdbs")
 """Rows by what to do with them; within a verdict as the ranking has them."""
 
 MAP = "map"
@@ -91,7 +91,10 @@ class Row:
     @property
     def may_be_picked(self) -> bool:
         """Whether a visit may be planned with it, without a clinician's reason, and would show anything."""
-        return self.decided.standing not in ("unsafe", "not_advised", "same_as_cdbs") and self.one.policy.retired_reason is None
+        return (
+            self.decided.standing not in ("unsafe", "likely_worse", "not_advised", "same_as_cdbs")
+            and self.one.policy.retired_reason is None
+        )
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,7 @@ class Answer:
     @property
     def undecided(self) -> list[Row]:
         """What may be run and yet is not worth a visit now."""
-        return [r for r in self.rows if r.decided.standing == "cannot_tell" and r.one.policy.retired_reason is None]
+        return [r for r in self.rows if r.decided.standing in ("undecided", "cannot_tell") and r.one.policy.retired_reason is None]
 
     @property
     def pickable(self) -> bool:

@@ -19,7 +19,7 @@ from app.tables.participants import Participant, SettingsVersion
 from ml.ope import POSTERIOR, Estimate, Flag, rank_policies
 from ml.ope.posterior.further_sessions import Place
 
-_LAST = ("unsafe",)
+_LAST = ("unsafe", "likely_worse")
 """Verdicts that come last whatever is estimated, beside policies that the data do not support."""
 
 

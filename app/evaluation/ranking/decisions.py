@@ -62,12 +62,12 @@ class Decided:
     @property
     def needs_override(self) -> bool:
         """Whether it may only be planned with a clinician's stated reason."""
-        return self.decision == "unsafe" or bool(self.hazards)
+        return self.decision in ("unsafe", "likely_worse") or bool(self.hazards)
 
     @property
     def standing(self) -> Standing:
         """The verdict as a page shows it: what is dangerous is not advised, also where the data cannot tell the rest."""
-        return "not_advised" if self.needs_override and self.decision != "unsafe" else self.decision
+        return "not_advised" if self.hazards and self.decision != "unsafe" else self.decision
 
     @property
     def limit(self) -> float | None:
@@ -106,7 +106,8 @@ def decide(
         return Decided("unsafe", (*harms, *known.reasons)) if harms else known
     reference, levels = cdbs.get(POSTERIOR), levels_of(given.levels)
     found = verdict(own, reference, margins_of(given.margins), levels, harms=harms, unchecked=given.unchecked)
-    if found.code != "cannot_tell" or found.reasons[0].code not in SETTLED_BY_SESSIONS:
+    ordered = all(reason.code != "no_ordering_skill" for reason in found.reasons)
+    if found.code != "undecided" or found.reasons[0].code not in SETTLED_BY_SESSIONS or not ordered:
         return Decided(found.code, found.reasons, found)
     if not given.noise:
         return Decided(found.code, found.reasons, found)  # how much a session tells is not known

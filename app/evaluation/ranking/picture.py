@@ -20,7 +20,8 @@ from ml.outcomes import OUTCOMES
 MOST = 8
 """Behaviours that have a line in their colour, with their name; more would hide each other, and are thin. Every candidate has its dot."""
 
-TONES = {"test": "good", "test_with_care": "warn", "unsafe": "bad", "not_advised": "bad", "cannot_tell": "accent", "same_as_cdbs": "muted"}
+TONES = {"test": "good", "test_with_care": "warn", "undecided": "accent", "cannot_tell": "accent"}
+TONES |= {"likely_worse": "bad", "unsafe": "bad", "not_advised": "bad", "same_as_cdbs": "muted"}
 LIGHTEST, DARKEST = 0.10, 0.40
 """Opacity of a cell of one recorded step, and of the one with most; over the darkest every line still has three times its luminance."""
 DASHES = ("", "8 4", "2 4", "10 3 2 3")

@@ -137,6 +137,10 @@ def baselines(params: dict[str, Any], workdir: Path, report: StepReport) -> dict
     return {"rows": rows, "best_constant": best, "held_out_sessions": [s.session_id for s in watched]}
 
 
+PROBABLY = 0.5
+"""Least probability of keeping the margins of an amplitude that policies are kept near."""
+
+
 def best_supported(constants: Mapping[str, PosteriorGain], level: float) -> float | None:
     """Find the amplitude with the largest expected saving, by names such as `0.70`; None without one.
 
@@ -160,9 +164,9 @@ def known_tests(tested: Mapping[str, Any] | None, buffer: ReplayBuffer) -> Tests
 
 def supported_best(buffer: ReplayBuffer, margins: Mapping[str, float] | None, tests: Tests | None = None) -> float | None:
     """Apply `best_supported` to twentieths that are probably within the margins; `margins` as `_judged_by` takes them."""
-    limits, levels = _judged_by(margins)
+    limits, _ = _judged_by(margins)
     constants = _gains(buffer, {f"{a:.2f}": ConstantPolicy(a) for a in CONSTANT_GRID}, limits, tests)
-    return best_supported(constants, 1 - levels.unsafe_beyond)
+    return best_supported(constants, PROBABLY)
 
 
 def _judged_by(margins: Mapping[str, float] | None) -> tuple[Margins, Levels]:
@@ -225,7 +229,7 @@ def stored_gains(
 
 
 def _stored(one: PosteriorGain, levels: Levels) -> dict[str, Any]:
-    beyond = None if one.within is None else 1 - one.within >= levels.unsafe_beyond
+    beyond = None if one.within is None else 1 - one.within >= levels.test_within
     told = {"by": "posterior", "supported": one.supported, "told": one.told, "beyond_margin": beyond}
     return asdict(one.gain) | told | {"within": one.within, "saves": one.saves, "expected_saving": one.expected_saving}
 

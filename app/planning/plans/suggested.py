@@ -49,11 +49,11 @@ def held_in(found: Judged | None, slots: int, place: Place) -> tuple[Held, ...]:
 
 
 def suggested(found: Judged | None, slots: int) -> tuple[Suggested, ...]:
-    """The policies that teach most in a visit with so many slots, each behaviour once; none where the data cannot order policies.
+    """Return the policies that teach most in a visit with so many slots, each behaviour once.
 
     Only candidates whose verdict is *test* or *test with care* are asked, and at most one of the latter is taken.
     """
-    if found is None or not found.answer.ordered:
+    if found is None:
         return ()
     return found.kept(("suggested", slots), lambda: _portfolio(found.with_draws, slots))
 

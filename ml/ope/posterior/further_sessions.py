@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ml.designs import NEAR_SPREAD, Bound, near_doses
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.support import FEWEST_SESSIONS, FEWEST_VISITS, NEAR
-from ml.ope.posterior.verdict import Levels, outcome_draws, slacks
+from ml.ope.posterior.verdict import Levels, calibrate, outcome_draws, slacks
 from ml.outcomes import PREDICTED
 from ml.qoc import Margins, Qoc
 from ml.returns import actual_return
@@ -239,7 +239,7 @@ def sessions_to_tell(
     supported: bool = True,
     seed: int = 0,
 ) -> Needed | None:
-    """Find the fewest further sessions near the policy's dose that would show it as a test or as unsafe.
+    """Find the fewest further sessions near the policy's dose that would show it as a test or as likely worse.
 
     Args:
         gaps: by how much each outcome keeps within its margin, draw by draw (`verdict.slacks`), [draws].
@@ -314,7 +314,7 @@ def _told(
     for truth, chance in zip(truths, futures, strict=True):
         said = seen[:, truth : truth + 1] + sd * chance[:, None]
         moved = asked + gain @ (said - seen - sd * own)
-        within = float(np.mean((moved[:outcomes] >= 0).all(0)))
+        within = calibrate(float(np.mean((moved[:outcomes] >= 0).all(0))))
         saves = float(np.mean(moved[outcomes:] > 0)) if len(moved) > outcomes else 1.0
-        told += (within >= levels.test_within and saves >= levels.test_saves) or 1 - within >= levels.unsafe_beyond
+        told += (within >= levels.test_within and saves >= levels.test_saves) or 1 - within >= levels.test_within
     return told / len(truths)

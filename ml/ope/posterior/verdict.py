@@ -1,8 +1,9 @@
-"""Verdict on a candidate: worth a test, a test with care, the same as cDBS, unsafe, or open. It is a pure function of posterior draws.
+"""Verdict on a candidate: worth a test, a test with care, the same as cDBS, likely worse, unsafe, or open.
 
-Every probability is a share of draws that are aligned between the policy and cDBS. A common error of the posterior cancels. The order of
-precedence is safety first: `unsafe`, `cannot_tell`, `same_as_cdbs`, `test_with_care`, `test`. Where the data cannot order policies at all,
-every verdict is `cannot_tell`. A danger that does not depend on the data (`HAZARDS`) is still among its reasons.
+It is a pure function of posterior draws and of what is known besides. Draws are aligned between the policy and cDBS, so that a common error
+of the posterior cancels. What is known more surely comes first: hazards, what the policy does by itself, and then chances. A chance is a
+share of draws, calibrated on virtual patients (`calibrate`). Whether the data can order policies is a reason among the others: it may hide
+an order, never a verdict.
 
 The verdict asks for non-inferiority of the outcomes and for less energy, because that is what a test is for. Superiority is for
 conclusions, which rest on visits and not on estimates.
@@ -23,7 +24,7 @@ from ml.outcomes import PREDICTED
 from ml.qoc import Margins
 
 Floats = NDArray[np.float64]
-Code = Literal["test", "test_with_care", "same_as_cdbs", "unsafe", "cannot_tell"]
+Code = Literal["test", "test_with_care", "same_as_cdbs", "undecided", "likely_worse", "unsafe", "cannot_tell"]
 
 NEARLY_OFF = 0.2
 """Amplitudes below this fraction of the cDBS amplitude are nearly off."""
@@ -38,7 +39,26 @@ HAZARDS = frozenset({"adverse_event", "stopped", "nearly_off", "beyond_margin"})
 """Codes of reasons for which a policy is not to be run without a clinician's word, whatever the verdict."""
 
 SETTLED_BY_SESSIONS = frozenset({"undecided", "few_near_sessions", "few_near_visits"})
-"""Deciding reasons of `cannot_tell` that more sessions near a policy may settle; whether they would is simulated."""
+"""Deciding reasons that more sessions near a policy may settle; whether they would is simulated."""
+
+HARM = 2.0
+"""An outcome that is worse than under cDBS by more than this many margins is harm."""
+
+CALIBRATION: tuple[tuple[float, float], ...] = (
+    (0.0, 0.01),
+    (0.03, 0.1),
+    (0.11, 0.19),
+    (0.23, 0.33),
+    (0.38, 0.48),
+    (0.51, 0.69),
+    (0.64, 0.8),
+    (0.74, 0.86),
+    (0.83, 0.92),
+    (0.9, 0.96),
+    (1.0, 0.99),
+)
+"""Share of draws in which all outcomes are within their margins, and the share of candidates of which that was true. Linear between.
+Measured on the 720 candidates of part A of the second population (`python benchmarks/answer.py --calibrate`)."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +66,10 @@ class Levels:
     """Certainty that a verdict needs; the defaults are those of the study's settings.
 
     Attributes:
-        test_within: least probability that all outcomes lie within their margins for a test.
+        test_within: least probability that all outcomes are within their margins for a test; with so much of the contrary it is likely
+            worse.
         test_saves: least probability of less energy than cDBS for a test.
-        unsafe_beyond: probability of an outcome beyond its margin from which a policy is unsafe.
+        unsafe_beyond: probability of harm, an outcome beyond `HARM` margins, from which a policy is unsafe.
         nearly_off_share: share of steps below `NEARLY_OFF` of cDBS above which a policy is unsafe.
 
     Raises:
@@ -57,7 +78,7 @@ class Levels:
 
     test_within: float = 0.8
     test_saves: float = 0.9
-    unsafe_beyond: float = 0.5
+    unsafe_beyond: float = 0.9
     nearly_off_share: float = 0.2
 
     def __post_init__(self) -> None:
@@ -72,7 +93,7 @@ class Verdict:
     Attributes:
         code: the verdict.
         reasons: what it rests on, the deciding finding first.
-        within: probability that all known outcomes lie within their margins of cDBS; None where no outcome is known.
+        within: calibrated probability that all known outcomes are within their margins of cDBS; None where no outcome is known.
         saves: probability of less energy than cDBS; None where energy is not predicted.
         limit: for `test_with_care` alone: lowest amplitude (fraction of cDBS) of the envelope under which it may be tested.
     """
@@ -95,7 +116,13 @@ class Verdict:
 
 
 def verdict(
-    own: Estimate, cdbs: Estimate | None, margins: Margins, levels: Levels, *, harms: Sequence[Flag] = (), unchecked: str | None = None
+    own: Estimate,
+    cdbs: Estimate | None,
+    margins: Margins,
+    levels: Levels,
+    *,
+    harms: Sequence[Flag] = (),
+    unchecked: str | None = None,
 ) -> Verdict:
     """Decide the verdict on a candidate.
 
@@ -107,42 +134,43 @@ def verdict(
         unchecked: why what the data cover could not be checked; None where it was.
     """
     gaps = slacks(own, cdbs, margins) if cdbs is not None else {}
-    within = _share_within(gaps)
+    share = _share_within(gaps)
+    within = None if share is None else calibrate(share)
     saves = _saves(own, cdbs) if cdbs is not None else None
-    chances = _chances(within, saves, levels)
-    hazards = [*harms, *_hazards(own, gaps, levels)]
-
-    def told(code: Code, *reasons: Flag, limit: float | None = None) -> Verdict:
-        return Verdict(code, (*reasons, *chances), within, saves, limit)
-
     skill: Mapping[str, Any] = own.details.get("skill") or {}
-    if not skill.get("told", False):
-        unskilled = Flag.of(
-            "no_ordering_skill", skill.get("held_out_correlation"), None, "correlation", reasons=tuple(skill.get("reasons", ()))
-        )
-        return told("cannot_tell", unskilled, *hazards)
+    noted = [*_chances(within, saves, levels), *_want_of_skill(skill)]
+
+    def conclude(code: Code, *reasons: Flag, limit: float | None = None) -> Verdict:
+        return Verdict(code, (*reasons, *noted), within, saves, limit)
+
+    hazards = [*harms, *_hazards(own, slacks(own, cdbs, margins, HARM) if cdbs is not None else {}, levels)]
     if hazards:
-        return told("unsafe", *hazards)
+        return conclude("unsafe", *hazards)
     doubt = _cannot_tell(own, cdbs, gaps, saves, unchecked)
     if doubt is not None:
-        return told("cannot_tell", doubt)
-    promising = _promising(within, saves, levels)
-    lowest = _support(own).get("lowest_supported")
-    if not own.supported and not (promising and lowest is not None):
-        return told("cannot_tell", _unsupported(own))
+        return conclude("cannot_tell", doubt)
     distance = (own.details.get("behaviour") or {}).get("closeness_to_cdbs")
     if distance is not None and distance <= SAME_AMPLITUDE:
-        return told("same_as_cdbs", Flag("acts_like_cdbs", float(distance), SAME_AMPLITUDE, "of cDBS"))
-    if not own.supported and lowest is not None:
+        return conclude("same_as_cdbs", Flag("acts_like_cdbs", float(distance), SAME_AMPLITUDE, "of cDBS"))
+    lowest = _support(own).get("lowest_supported")
+    if within is not None and 1 - within >= levels.test_within:
+        return conclude("likely_worse", _likely_worse(gaps, within, levels))
+    if _promising(within, saves, levels) and own.supported:
+        return conclude("test")
+    if _promising(within, saves, levels) and lowest is not None:
         limit = float(lowest)
-        return told("test_with_care", Flag("extrapolates", _support(own).get("dose"), limit, "of cDBS"), _unsupported(own), limit=limit)
-    if promising:
-        return told("test")
-    return told("cannot_tell", Flag("undecided"))
+        return conclude("test_with_care", Flag("extrapolates", _support(own).get("dose"), limit, "of cDBS"), _unsupported(own), limit=limit)
+    return conclude("undecided", Flag("undecided") if own.supported else _unsupported(own))
 
 
-def slacks(own: Estimate, cdbs: Estimate, margins: Margins) -> dict[str, Floats]:
-    """Compute by how much each known outcome keeps within its margin of cDBS, draw by draw, [draws]; below 0 it is beyond.
+def calibrate(share: float) -> float:
+    """Correct a share of draws to the share of virtual patients of part A in which outcomes are truly within their margins; monotone."""
+    said, true = zip(*CALIBRATION, strict=True)
+    return float(np.interp(share, said, true))
+
+
+def slacks(own: Estimate, cdbs: Estimate, margins: Margins, times: float = 1.0) -> dict[str, Floats]:
+    """Compute by how much each known outcome keeps within so many of its margins of cDBS, draw by draw, [draws]; below 0 it is beyond.
 
     Raises:
         ValueError: draws of the policy and of cDBS that are not aligned.
@@ -155,12 +183,22 @@ def slacks(own: Estimate, cdbs: Estimate, margins: Margins) -> dict[str, Floats]
             continue
         if ours.size != theirs.size:
             raise ValueError(f"draws of {name} are not aligned: {ours.size} of the policy, {theirs.size} of cDBS")
-        found[name] = outcome.slack(ours, theirs, margins.of(outcome))
+        found[name] = outcome.slack(ours, theirs, times * margins.of(outcome))
     return found
 
 
 def chance_within(own: Estimate, cdbs: Estimate, margins: Margins) -> float | None:
-    """Compute the probability that every known outcome keeps within its margin of cDBS, all together; None where none is known.
+    """Compute the calibrated probability that every known outcome keeps within its margin of cDBS; None where none is known.
+
+    Raises:
+        ValueError: draws of the policy and of cDBS that are not aligned.
+    """
+    share = share_within(own, cdbs, margins)
+    return None if share is None else calibrate(share)
+
+
+def share_within(own: Estimate, cdbs: Estimate, margins: Margins) -> float | None:
+    """Compute the share of draws in which every known outcome keeps within its margin of cDBS, as they are; None where none is known.
 
     Raises:
         ValueError: draws of the policy and of cDBS that are not aligned.
@@ -227,9 +265,24 @@ def _hazards(own: Estimate, gaps: Mapping[str, Floats], levels: Levels) -> list[
     if gaps:
         beyond = 1 - float(np.mean(_all_within(gaps)))
         if beyond >= levels.unsafe_beyond:
-            worst = max(gaps, key=lambda name: float(np.mean(gaps[name] < 0)))
-            found.append(Flag.of("beyond_margin", beyond, levels.unsafe_beyond, "probability", outcome=worst))
+            found.append(Flag.of("beyond_margin", beyond, levels.unsafe_beyond, "probability", outcome=_worst(gaps)))
     return found
+
+
+def _worst(gaps: Mapping[str, Floats]) -> str:
+    return max(gaps, key=lambda name: float(np.mean(gaps[name] < 0)))
+
+
+def _likely_worse(gaps: Mapping[str, Floats], within: float, levels: Levels) -> Flag:
+    return Flag.of("likely_beyond_margin", 1 - within, levels.test_within, "probability", outcome=_worst(gaps))
+
+
+def _want_of_skill(skill: Mapping[str, Any]) -> tuple[Flag, ...]:
+    """Return the finding that the data cannot order policies; nothing where they can."""
+    if skill.get("told", False):
+        return ()
+    reasons = tuple(skill.get("reasons", ()))
+    return (Flag.of("no_ordering_skill", skill.get("held_out_correlation"), None, "correlation", reasons=reasons),)
 
 
 def _cannot_tell(

@@ -24,7 +24,7 @@ def test_it_shows_what_the_policy_does_and_where_it_comes_from(
     db.commit()
     page = client.get(f"/participants/P1/policies/{b}")
     words = above_fold(page.text)
-    assert "is worse by more than its margin, most often tremor" in words
+    assert "is worse by more than twice its margin, most often tremor" in words
     assert "Amplitude (mA)" in words
     assert f'href="/participants/P1/compare?policy={b}&amp;policy={a}"' in page.text
     assert methods_named(words) == []

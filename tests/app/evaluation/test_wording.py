@@ -39,7 +39,7 @@ def test_reworded_sentences_change_no_rank_support_or_decision(
     a, b, c = policies
     judge({a: judged(60.0), b: judged(50.0, supported=False, support={"lowest_supported": None}), c: judged(30.0, behaviour=NEARLY_OFF)})
     before = client.get(RANKING).json()
-    assert [p["decision"] for p in before["policies"]] == ["test", "cannot_tell", "unsafe"]
+    assert [p["decision"] for p in before["policies"]] == ["test", "undecided", "unsafe"]
     page = client.get("/participants/P1/ranking").text
     for words in (wording, verdict_wording):
         for name, _ in inspect.getmembers(words, inspect.isfunction):
@@ -143,7 +143,7 @@ def test_the_strongest_reason_stands_first() -> None:
     )
     without = verdict(own, cdbs(), Margins(0.1, 1.0, 10.0), Levels())
     assert verdict_wording.plainly(without.hazards) == (
-        "nearly off 42 % of the time; > 99 % likely that grasp, rating or tremor is worse by more than its margin, most often tremor"
+        "nearly off 42 % of the time; > 99 % likely that grasp, rating or tremor is worse by more than twice its margin, most often tremor"
     )
 
 

@@ -26,7 +26,7 @@ def test_a_lock_is_signed_over_its_values(client: TestClient, participant_code: 
     assert (locked["signature_state"], locked["signature"]["signer"]) == ("stands", "admin@clinic.example")
     assert locked["signature"]["meaning"] == "margins fixed before the sessions that they judge"
     content = db.scalars(select(Signature)).one().content
-    assert (content["grasp_share"], content["unsafe_beyond"], content["version"]) == (0.1, 0.5, 1)
+    assert (content["grasp_share"], content["unsafe_beyond"], content["version"]) == (0.1, 0.9, 1)
     page = client.get("/participants/P1/margins", headers=PAGE).text
     assert (locked["signature"]["sha256"] in page, BROKEN in page) == (True, False)
 
@@ -44,7 +44,7 @@ def test_a_wrong_password_locks_nothing(client: TestClient, participant_code: st
     "change",
     [
         "update margins_version set tremor_points = 50",
-        "update margins_version set unsafe_beyond = 0.9",
+        "update margins_version set unsafe_beyond = 0.8",
         "update margins_version set created_by = 'somebody else'",
         "update margins_lock set reason = 'another'",
         "update margins_lock set created_by = 'somebody else'",

@@ -18,7 +18,7 @@ from tests.conftest import PASSWORD
 HTML = {"Accept": "text/html", "Sec-Fetch-Site": "same-origin"}
 PATH = "/api/v1/participants/P1/margins"
 DEFAULTS = {
-    "grasp_share": 0.1, "rating_points": 1.0, "tremor_points": 10.0, "test_within": 0.8, "test_saves": 0.9, "unsafe_beyond": 0.5,
+    "grasp_share": 0.1, "rating_points": 1.0, "tremor_points": 10.0, "test_within": 0.8, "test_saves": 0.9, "unsafe_beyond": 0.9,
     "nearly_off_share": 0.2,
 }  # fmt: skip
 

@@ -41,7 +41,7 @@ def test_where_nothing_is_worth_a_test_random_and_cdbs_sessions_are_planned_at_a
 ) -> None:
     judge({policies[0]: judged(50.0)})
     assert "Plan random and cDBS sessions" not in client.get(PAGE).text
-    judge({policies[0]: judged(50.0, told=False)}, cdbs(told=False).to_json())
+    judge({policies[0]: judged(50.0, told=False, behaviour={"below_cdbs_20_percent": 0.9})}, cdbs(told=False).to_json())
     page = client.get(PAGE).text
     form = re.search(r'<form method="post" action="([^"]+/plan/draft)"(?:(?!</form>).)*Plan random and cDBS sessions of P1', page, re.S)
     assert form is not None

@@ -11,6 +11,7 @@ from scipy.stats import norm
 
 from ml.designs import LOW_AMPLITUDE, NEAR_SPREAD, Bound, near_session
 from ml.mdp import MdpSettings
+from ml.ope.posterior import verdict
 from ml.ope.posterior.further_sessions import (
     Further,
     Needed,
@@ -31,23 +32,29 @@ from ml.trajectories import ReplayBuffer, SessionTrajectory
 from tests.ml.ope.posterior.draws import RANKS
 
 
+@pytest.fixture(autouse=True)
+def plain_chances(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chances are the shares of draws, as the closed forms have them."""
+    monkeypatch.setattr(verdict, "CALIBRATION", ((0.0, 0.0), (1.0, 1.0)))
+
+
 def normal_draws(mean: float, sd: float) -> np.ndarray:
     """Draws without chance."""
     return np.asarray(norm.ppf(RANKS, mean, sd))
 
 
 def told_share(mean: float, sd: float, noise: float, n: int) -> float:
-    """Closed form: how often n sessions, up to four after one of cDBS, decide P(within) >= 0.8 or <= 0.5, one normal outcome.
+    """Closed form: how often n sessions, up to four after one of cDBS, decide P(within) >= 0.8 or <= 0.2, one normal outcome.
 
     The posterior given the data is normal with variance v = 1 / (1 / sd^2 + 1 / (noise^2 (1 / n + 1 / visits))); its mean is normal
     around `mean` with variance sd^2 - v; P(within) = Phi(posterior mean / sqrt(v)).
     """
     v = 1 / (1 / sd**2 + 1 / (noise**2 * (1 / n + 1 / -(-n // 4))))
     spread = np.sqrt(sd**2 - v)
-    return float(norm.sf(norm.ppf(0.8) * np.sqrt(v), mean, spread) + norm.cdf(0.0, mean, spread))
+    return float(norm.sf(norm.ppf(0.8) * np.sqrt(v), mean, spread) + norm.cdf(norm.ppf(0.2) * np.sqrt(v), mean, spread))
 
 
-@pytest.mark.parametrize(("mean", "sd", "noise"), [(1.0, 2.0, 1.0), (0.5, 2.0, 2.0), (1.0, 1.5, 1.5)])
+@pytest.mark.parametrize(("mean", "sd", "noise"), [(1.0, 3.0, 1.0), (0.5, 4.0, 2.0), (2.0, 4.0, 1.5)])
 def test_the_number_is_that_of_the_closed_form(mean: float, sd: float, noise: float) -> None:
     found = sessions_to_tell({"rating": normal_draws(mean, sd)}, {"rating": noise}, Levels())
     shares = {n: told_share(mean, sd, noise, n) for n in (1, 2, 3, 4, 6, 8, 12, 16, 24)}

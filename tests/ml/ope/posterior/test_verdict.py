@@ -8,9 +8,17 @@ import numpy as np
 import pytest
 
 from ml.ope.flags import Flag
-from ml.ope.posterior.verdict import HAZARDS, Levels, Verdict, interval, verdict
+from ml.ope.posterior import verdict as module
+from ml.ope.posterior.verdict import HAZARDS, Levels, Verdict, calibrate, interval, verdict
 from ml.qoc import Margins
 from tests.ml.ope.posterior.draws import N, cdbs, constructed, share
+
+
+@pytest.fixture(autouse=True)
+def plain_chances(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chances are the shares of draws, so that they are known in closed form."""
+    if "calibration" not in request.node.name:
+        monkeypatch.setattr(module, "CALIBRATION", ((0.0, 0.0), (1.0, 1.0)))
 
 
 def of(reference: Any = None, margins: Margins | None = None, levels: Levels | None = None, **changed: Any) -> Verdict:
@@ -32,7 +40,7 @@ def test_a_policy_within_all_margins_that_saves_energy_is_worth_a_test() -> None
     ]
 
 
-@pytest.mark.parametrize(("beyond", "code"), [(0.2, "test"), (0.201, "cannot_tell"), (0.499, "cannot_tell"), (0.5, "unsafe")])
+@pytest.mark.parametrize(("beyond", "code"), [(0.2, "test"), (0.201, "undecided"), (0.799, "undecided"), (0.8, "likely_worse")])
 @pytest.mark.parametrize(
     ("name", "good", "bad"),
     # the bad value lies just beyond its margin of 10 %, 1 point, 10 percentage points, the good one just within
@@ -44,7 +52,7 @@ def test_each_outcome_has_its_margin_and_its_levels(name: str, good: float, bad:
     assert found.within == pytest.approx(1 - beyond)
 
 
-@pytest.mark.parametrize(("same", "code"), [(0.1, "test"), (0.101, "cannot_tell")])
+@pytest.mark.parametrize(("same", "code"), [(0.1, "test"), (0.101, "undecided")])
 def test_a_test_saves_energy_with_the_stated_probability(same: float, code: str) -> None:
     found = of(outcome_draws={"energy": share(same, 0.7, 1.0)})
     assert (found.code, found.saves) == (code, pytest.approx(1 - same))
@@ -55,22 +63,52 @@ def test_outcomes_count_together_and_not_one_by_one() -> None:
     third = [share(0.15, 2.0, 1.0), share(0.15, 7.0, 1.0)[::-1], [20.0] * 400 + [60.0] * 150 + [20.0] * 450]
     found = of(outcome_draws=dict(zip(("grasp_hz", "rating", "tremor_percent"), third, strict=True)))
     assert found.within == pytest.approx(0.55)
-    assert found.code == "cannot_tell"
+    assert found.code == "undecided"
+
+
+@pytest.mark.parametrize(("harm", "code"), [(0.899, "likely_worse"), (0.9, "unsafe")])
+@pytest.mark.parametrize(
+    ("name", "bad", "mild"),
+    # twice the margin of 10 %, 1 point, 10 percentage points, and a loss just short of it
+    [("grasp_hz", 1.599, 1.601), ("rating", 4.999, 5.001), ("tremor_percent", 40.001, 39.999)],
+)
+def test_unsafe_is_what_does_harm_beyond_twice_a_margin_almost_surely(name: str, bad: float, mild: float, harm: float, code: str) -> None:
+    assert of(outcome_draws={name: share(harm, mild, bad)}).code == code
+    assert of(outcome_draws={name: [mild] * N}).code == "likely_worse"
+
+
+def test_a_likely_loss_names_its_outcome_and_chance() -> None:
+    found = of(outcome_draws={"rating": share(0.85, 7.0, 5.5)})
+    assert (found.reasons[0].code, found.reasons[0].value, found.reasons[0].fact("outcome")) == ("likely_beyond_margin", 0.85, "rating")
+    assert found.hazards == ()
+
+
+def test_the_calibration_is_monotone_and_corrects_chances_that_are_too_low() -> None:
+    said, true = zip(*module.CALIBRATION, strict=True)
+    assert list(said) == sorted(said)
+    assert list(true) == sorted(true)
+    assert all(0 <= v <= 1 for v in (*said, *true))
+    assert calibrate(0.5) > 0.6
+    middle = (said[1] + said[2]) / 2
+    assert calibrate(middle) == pytest.approx((true[1] + true[2]) / 2)
+    found = of(outcome_draws={"rating": share(0.5, 7.0, 1.0)})
+    assert found.within == pytest.approx(calibrate(0.5))
 
 
 def test_draws_are_compared_with_those_of_cdbs_one_by_one() -> None:
     """What the posterior gets wrong for both alike cancels: both trembling from 0 to 100 % of the time is no doubt about the difference."""
     both = share(0.5, 0.0, 90.0)
     assert of(cdbs(outcome_draws={"tremor_percent": both}), outcome_draws={"tremor_percent": both}).code == "test"
-    assert of(cdbs(outcome_draws={"tremor_percent": both[::-1]}), outcome_draws={"tremor_percent": both}).code == "unsafe"
+    assert of(cdbs(outcome_draws={"tremor_percent": both[::-1]}), outcome_draws={"tremor_percent": both}).within == 0.5
 
 
 def test_margins_and_levels_are_the_participants() -> None:
     risky = {"outcome_draws": {"tremor_percent": [26.0] * N}}
     assert of(**risky).code == "test"
-    assert of(margins=Margins(tremor_points=5.0), **risky).code == "unsafe"
+    assert of(margins=Margins(tremor_points=5.0), **risky).code == "likely_worse"
+    assert of(margins=Margins(tremor_points=2.5), **risky).code == "unsafe"
     doubtful = {"outcome_draws": {"tremor_percent": share(0.3, 20.0, 60.0)}}
-    assert of(**doubtful).code == "cannot_tell"
+    assert of(**doubtful).code == "undecided"
     assert of(levels=Levels(test_within=0.7), **doubtful).code == "test"
     assert of(levels=Levels(unsafe_beyond=0.3), **doubtful).code == "unsafe"
     with pytest.raises(ValueError, match="probabilities"):
@@ -101,12 +139,12 @@ def test_an_unsupported_but_promising_policy_is_tested_with_care_down_to_the_low
 
 def test_without_a_dose_that_two_sessions_held_there_is_no_test_with_care() -> None:
     found = of(supported=False, support={"lowest_supported": None})
-    assert (found.code, found.limit) == ("cannot_tell", None)
+    assert (found.code, found.limit) == ("undecided", None)
 
 
-def test_an_unsupported_policy_that_does_not_promise_cannot_be_told() -> None:
+def test_an_unsupported_policy_that_does_not_promise_is_undecided() -> None:
     found = of(supported=False, outcome_draws={"rating": share(0.3, 7.0, 1.0)})
-    assert (found.code, codes(found)[0]) == ("cannot_tell", "thin")
+    assert (found.code, codes(found)[0]) == ("undecided", "thin")
 
 
 def test_a_policy_that_acts_like_cdbs_is_called_the_same() -> None:
@@ -116,29 +154,28 @@ def test_a_policy_that_acts_like_cdbs_is_called_the_same() -> None:
 
 
 @pytest.mark.parametrize(
-    "changed",
+    ("changed", "code"),
     [
-        {},
-        {"supported": False},
-        {"behaviour": {"closeness_to_cdbs": 0.0}},
-        {"behaviour": {"below_cdbs_20_percent": 0.9}},
-        {"outcome_draws": {"rating": [1.0] * N}},
-        {"harms": (Flag("stopped", 1.0, None, "stops"),)},
-        {"unchecked": "no session has a whole window"},
+        ({}, "test"),
+        ({"supported": False}, "test_with_care"),
+        ({"behaviour": {"closeness_to_cdbs": 0.0}}, "same_as_cdbs"),
+        ({"behaviour": {"below_cdbs_20_percent": 0.9}}, "unsafe"),
+        ({"outcome_draws": {"rating": [1.0] * N}}, "unsafe"),
+        ({"harms": (Flag("stopped", 1.0, None, "stops"),)}, "unsafe"),
+        ({"unchecked": "no session has a whole window"}, "cannot_tell"),
     ],
 )
-def test_without_ordering_skill_nothing_can_be_told_and_hazards_still_stand(changed: dict[str, Any]) -> None:
-    found = of(told=False, **changed)
-    assert (found.code, found.proposed, codes(found)[0]) == ("cannot_tell", False, "no_ordering_skill")
-    assert found.reasons[0].fact("reasons") == ("no_better_than_equal",)
-    dangerous = bool(changed.keys() & {"harms"}) or "below_cdbs_20_percent" in str(changed) or "rating" in str(changed)
-    assert bool(found.hazards) == dangerous
+def test_a_want_of_ordering_skill_is_a_reason_and_changes_no_verdict(changed: dict[str, Any], code: str) -> None:
+    assert of(**changed).code == code
+    unskilled = next(r for r in of(told=False, **changed).reasons if r.code == "no_ordering_skill")
+    assert of(told=False, **changed).code == code
+    assert unskilled.fact("reasons") == ("no_better_than_equal",)
 
 
-def test_a_posterior_that_says_nothing_of_its_skill_has_none() -> None:
+def test_a_posterior_that_states_no_skill_has_none() -> None:
     own = constructed()
     del own.details["skill"]
-    assert verdict(own, cdbs(), Margins(), Levels()).code == "cannot_tell"
+    assert "no_ordering_skill" in codes(verdict(own, cdbs(), Margins(), Levels()))
 
 
 def test_the_order_of_precedence() -> None:
