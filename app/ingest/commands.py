@@ -1,4 +1,4 @@
-"""Commands of phase I: `betaloop import`, `betaloop ingest redecode` and `betaloop ingest resume`."""
+"""Commands of phase I: `betaloop import`, and those of `betaloop ingest`: `redecode`, `names`, `resume`."""
 
 from __future__ import annotations
 
@@ -83,6 +83,24 @@ def redecode_(
             typer.echo("Rankings and plans that rest on them say so on their pages; make new ones.")
     if any(c.state == "failed" for c in changes):
         raise typer.Exit(1)
+
+
+@ingest_app.command("names", epilog="Example: betaloop ingest names")
+def names_(as_json: AsJson = False) -> None:
+    """List the technical names in devices' files that this version does not know: send them to its developers after a new firmware."""
+    from app.ingest.repository import unknown_names
+    from ml.formats import DEVICE_NAMES
+
+    with transaction(ACTOR) as db:
+        found = unknown_names(db)
+    fields = ("device", "name", "recordings", "devices", "last_upload")
+    if as_json:
+        show({"names": [dict(zip(fields, (*row[:4], row[4].isoformat()), strict=True)) for row in found]}, True, "")
+        return
+    table = Table("device", "name", "recordings", "devices", "last upload")
+    for kind, name, recordings, devices, last in found:
+        table.add_row(DEVICE_NAMES.get(kind, kind), name, str(recordings), str(devices), f"{last:%Y-%m-%d}")
+    Console().print(table if found else "No device's file had a name that this version does not know.")
 
 
 @ingest_app.command("resume", epilog="Example: betaloop ingest resume")

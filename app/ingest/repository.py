@@ -137,6 +137,27 @@ def recordings_of_minutes(db: Session, like: Recording) -> Sequence[Recording]:
     return db.scalars(select(Recording).where(own, dated, either, shared > SLACK_S).order_by(Recording.id)).all()
 
 
+def unknown_names(db: Session) -> Sequence[tuple[str, str, int, int, datetime]]:
+    """List the technical names in devices' files that their decoders do not know, those of the most recordings first.
+
+    Returns:
+        Kind of the device, name, number of recordings and of devices, and when the last of them arrived.
+    """
+    stored = Recording.details["settings"]["unknown_names"]
+    each = func.jsonb_array_elements_text(stored).table_valued("value")
+    name, count = each.c.value, func.count(Recording.id.distinct())
+    query = (
+        select(UploadFile.kind, name, count, func.count(Recording.device_id.distinct()), func.max(Upload.created_at))
+        .join(UploadFile, UploadFile.id == Recording.upload_file_id)
+        .join(Upload, Upload.id == UploadFile.upload_id)
+        .join(each, true())
+        .where(func.jsonb_typeof(stored) == "array")
+        .group_by(UploadFile.kind, name)
+        .order_by(count.desc(), UploadFile.kind, name)
+    )
+    return [(row[0], row[1], row[2], row[3], row[4]) for row in db.execute(query)]
+
+
 def fullest(db: Session, recordings: Sequence[Recording]) -> list[Recording]:
     """Replace recordings by the fuller copies that superseded them, each once."""
     found: dict[int, Recording] = {}

@@ -18,6 +18,8 @@ SURVEYS = ("LfpMontageTimeDomain", "BrainSenseSurveysTimeDomain", "SenseChannelT
 
 MOST_NAMES = 12
 """Unknown names that one sentence lists."""
+MOST_STORED = 200
+"""Unknown names of one report that are stored with its history."""
 
 
 def _surveys(report: dict[str, Any], said: FileReport, utc: details.ToUtc) -> list[SpectrumLog]:
@@ -85,7 +87,8 @@ def history_recording(
         said.ignored.append(f"{entries_of} without a time: names of events, none that was marked")
     if void:
         said.flagged.append(f"trends: {void} values are the device's sign for no reading, or impossible: gaps")
-    if names := details.unknown_names(report):
+    names = details.unknown_names(report)
+    if names:
         listed = "; ".join(names[:MOST_NAMES]) + (f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else "")
         said.flagged.append(f"names that this version does not know, shown as they are: {listed}")
     if counts:
@@ -100,7 +103,13 @@ def history_recording(
         traces=(),
         events=details.as_events(dated, origin),
         limits={},
-        settings={"period_s": options.period_s, "section": "history", **kept, **({"battery": battery} if battery else {})},
+        settings={
+            "period_s": options.period_s,
+            "section": "history",
+            **kept,
+            **({"battery": battery} if battery else {}),
+            **({"unknown_names": names[:MOST_STORED]} if names else {}),
+        },
         quality={},
         fingerprint=fingerprint("percept history", [repr((started, kept, dated)), *(s.channel for s in spectra)]),
         spectra=tuple(spectra),

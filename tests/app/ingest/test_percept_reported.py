@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,9 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
+from typer.testing import CliRunner
 
+from app.cli import app
 from app.study.traces import unpack
 from app.tables.recordings import Recording, Trace
 
@@ -118,3 +121,23 @@ def test_power_that_is_dated_apart_is_a_run_of_its_own(send: Any, report: Any, d
 def test_loss_of_indefinite_streaming_is_told(send: Any, report: Any) -> None:
     said = sentences(send(report("14-indefinite-third-lost.json")))
     assert [f"{c}: 33.3 % of the samples are missing" in said for c in ("ZERO_THREE_LEFT", "ONE_THREE_LEFT")] == [True, True]
+
+
+def test_names_that_no_decoder_knows_are_listed_for_the_installation(send: Any, report: Any) -> None:
+    name, content = report("07-real-enumerations.json")
+    made = json.loads(content)
+    entry = {"DateTime": "2026-03-05T15:08:00Z", "TherapyStatus": "TherapyChangeStatusDef.SuspendedByZebra"}
+    made["DiagnosticData"]["EventLogs"].append(entry)
+    assert send((name, json.dumps(made).encode())).status_code == 201
+    listed = json.loads(CliRunner().invoke(app, ["ingest", "names", "--json"]).stdout)["names"]
+    assert [(n["device"], n["name"], n["recordings"], n["devices"]) for n in listed] == [
+        ("percept", "therapy status: TherapyChangeStatusDef.Suspended…", 1, 1)
+    ]
+    shown = CliRunner().invoke(app, ["ingest", "names"]).stdout
+    assert "therapy" in shown
+    assert "Zebra" not in shown
+
+
+def test_an_installation_without_unknown_names_says_so(send: Any, report: Any) -> None:
+    send(report("07-real-enumerations.json"))
+    assert "No device's file had a name" in CliRunner().invoke(app, ["ingest", "names"]).stdout
