@@ -157,6 +157,9 @@ class RankedPolicy(Model):
     decision: Decision | None = Field(description="By stated rules from the posterior and the participant's margins; null for references.")
     decision_reasons: list[ReasonOut] = Field(description="What the decision rests on; empty for references.")
     decision_reason: str = Field(description="The reasons in words.")
+    standing: str | None = Field(
+        None, description="Harms, own sessions and prediction, in the words of every page; null for references and for blinded assessors."
+    )
 
 
 class RankedSnapshot(Model):

@@ -16,6 +16,7 @@ from app.accounts.permissions import Caller
 from app.analysis.figures import csv_of
 from app.analysis.primary import Primary, primary
 from app.analysis.primary_schemas import csv_rows
+from app.analysis.standing import standing_sentences
 from app.evaluation import wording
 from app.evaluation.estimates.coverage import coverage_by_policy
 from app.evaluation.estimates.rows import estimate_of
@@ -52,12 +53,13 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
     record(db, "export", "participant", participant.id)
     found = primary(db, participant, caller)
     day = Days(participant.created_at)
+    standings = standing_sentences(db, participant, caller)
     sessions, steps = _sessions(db, participant, caller, found, day)
     tables = {
         "sessions": sessions,
         "steps": steps,
         "visits": [(v.number, day.of_date(v.date), v.locked, len(v.sessions)) for v in participant.visits],
-        "policies": [_policy_row(p, day) for p in repository.policies(db, participant.id)],
+        "policies": [(*_policy_row(p, day), standings.get(p.id)) for p in repository.policies(db, participant.id)],
         "estimates": _estimate_rows(db, participant),
         "coverage": _coverage_rows(db, participant),
         "margins": _margin_rows(participant, day),

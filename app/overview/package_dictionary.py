@@ -108,6 +108,7 @@ FIELDS: dict[str, tuple[Field, ...]] = {
         seed integer Seed of its training.
         created_day number Days since enrolment.
         onnx_sha256 string Hash of its file.
+        standing string Harms, own sessions and prediction, in the words of every page; empty where there is nothing of these.
     """),
     "estimates": _fields("""
         evaluation_id integer Number of the evaluation.

@@ -12,6 +12,7 @@ from app.evaluation.ranking.export import csv_of
 from app.evaluation.schemas import Kind, Method, RankingFilter, RankingOut
 from app.platform.database import Db
 from app.platform.web.schemas import problems
+from app.platform.web.templates import Part, make_part
 from app.study.deps import CurrentParticipant, ResultsViewed
 
 router = APIRouter(responses=problems(401, 403, 404, 422))
@@ -37,4 +38,7 @@ def read_ranking(
     """Candidate policies from best to worst on one snapshot, with every method's estimate, and references beside them."""
     shown = RankingFilter(supported=supported, kind=kind, tested=tested)
     found = ranking.current_ranking(db, participant, caller, method, shown)
+    standings = make_part(Part.STANDINGS, db, participant, caller)
+    for policy in found.policies:
+        policy.standing = standings.get(policy.policy_id)
     return csv_of(found) if format == "csv" else found

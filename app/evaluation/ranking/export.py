@@ -16,7 +16,19 @@ from ml.outcomes import FIELDS
 _PREDICTED = ("energy", "mean_amplitude", "mean_beta", *FIELDS)
 _NUMBERS = ("value", "low", "high", "level", "standard_error", "n", "step_return", "end_reward")
 _OF_RANKING = ("participant", "evaluation_id", "created_at", "default_method", "horizon_steps", "gamma", "stale")
-_OF_POLICY = ("rank", "policy_id", "name", "kind", "algorithm", "reference", "retired", "decision", "decision_reason", "probability_best")
+_OF_POLICY = (
+    "rank",
+    "policy_id",
+    "name",
+    "kind",
+    "algorithm",
+    "reference",
+    "retired",
+    "decision",
+    "decision_reason",
+    "standing",
+    "probability_best",
+)
 _GAIN = ("value", "low", "high")
 _TESTED = tuple(TestedBefore.model_fields)
 _COVERAGE = tuple(CHECKS)

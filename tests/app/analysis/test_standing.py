@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import html
 import io
 import itertools
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -100,6 +102,25 @@ def test_every_page_that_shows_a_policy_gives_the_same_standing(
     rows = client.get("/participants/P1/analyses.csv").text.splitlines()
     assert rows[0].endswith(",standing")
     assert "Held back" in rows[-1]
+
+
+def test_the_ranking_by_rest_its_table_and_the_data_package_have_the_sentence_of_the_pages(
+    client: TestClient, policies: list[int], judge: Callable[..., int], upload: Upload
+) -> None:
+    judge({number: judged(40.0 + number) for number in policies})
+    upload("rl", level=0.6, policy=policies[0])
+    listed = client.get("/api/v1/participants/P1/analyses/primary").json()["standings"]
+    due = {s["policy_id"]: s["sentence"] for s in listed}
+    assert due.keys() >= set(policies)
+    ranking = client.get("/api/v1/participants/P1/ranking").json()
+    assert {p["policy_id"]: p["standing"] for p in ranking["policies"]} == {
+        p["policy_id"]: due[p["policy_id"]] for p in ranking["policies"]
+    }
+    table = csv.DictReader(io.StringIO(client.get("/api/v1/participants/P1/ranking?format=csv").text))
+    assert {int(r["policy_id"]): r["standing"] for r in table if not r["reference"]}.items() <= due.items()
+    package = zipfile.ZipFile(io.BytesIO(client.get("/participants/P1/export.zip").content))
+    rows = csv.DictReader(io.StringIO(package.read("P1/policies.csv").decode()))
+    assert {int(r["policy_id"]): r["standing"] for r in rows if r["standing"]} == due
 
 
 def test_a_blinded_assessor_is_told_no_standing(client_as: Callable[[str], TestClient], policies: list[int], upload: Upload) -> None:
