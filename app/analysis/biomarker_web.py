@@ -111,6 +111,11 @@ def _some(visits: list[int]) -> list[int]:
     return [*visits[:-1:step], visits[-1]] if visits else []
 
 
+def _round(value: float) -> float:
+    """Round to what a screen can show: pages of several hundred sessions stay small."""
+    return float(f"{value:.5g}")
+
+
 def scatter(pair: Pairing, beta_unit: str) -> Chart:
     """All sessions that have both, in the units of the axes."""
     points = [(i, v, x * FACTORS.get(pair.x, 1.0), y * FACTORS.get(pair.y, 1.0)) for i, v, x, y in pair.points]
@@ -120,11 +125,12 @@ def scatter(pair: Pairing, beta_unit: str) -> Chart:
     bar = {"title": {"text": "Visit", "font": {"size": 12}}, "thickness": 10, "tickvals": _some(sorted(set(visits)))}
     data = [
         {
-            "type": "scatter", "mode": "markers", "x": places, "y": [p[3] for p in points],
+            "type": "scatter", "mode": "markers", "x": [_round(x) for x in places], "y": [_round(p[3]) for p in points],
             "marker": {"size": 8, "color": visits, "colorscale": SCALE, "showscale": len(set(visits)) > 1, "colorbar": bar},
             "customdata": [p[0] for p in points], "meta": "/sessions/",
-            "text": [f"Session {p[0]}, visit {p[1]}<br>{number(p[2])}, {number(p[3])}" for p in points],
-            "hovertemplate": "%{text}<extra></extra>",
+            # a dot may be apart from its value, so that x is given once more
+            "text": [number(p[2]) for p in points],
+            "hovertemplate": "Session %{customdata}, visit %{marker.color}<br>%{text}, %{y:.4~g}<extra></extra>",
         }
     ]  # fmt: skip
     layout = {

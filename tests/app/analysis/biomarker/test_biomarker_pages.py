@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import gzip
+import json
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+
+from app.analysis.biomarker import Pairing
+from app.analysis.biomarker_web import scatter
+from ml.statistics.within_visits.contrasts import Reason, Unavailable
 
 PATH = "/api/v1/participants/P1/analyses/beta"
 
@@ -62,3 +69,13 @@ def test_the_medication_of_a_session_is_entered_on_its_page(client: TestClient, 
     assert (stored["medication_h"], stored["stopped_reason"]) == (1.5, "dyskinesia")
     assert "dyskinesia" in client.get(f"/sessions/{session}").text
     assert client.patch(f"/api/v1/sessions/{session}", json={"medication_h": 500}).status_code == 422
+
+
+def test_a_chart_of_a_long_study_stays_small_and_names_each_dot() -> None:
+    rng = np.random.default_rng(0)
+    points = tuple((i + 1, i // 9 + 1, float(x), float(y)) for i, (x, y) in enumerate(rng.normal(2, 0.5, (333, 2))))
+    nothing = Unavailable(Reason.NOT_IDENTIFIED)
+    trace = scatter(Pairing("mean_beta", "grasp", nothing, nothing, points), "uV").figure["data"][0]
+    assert len(gzip.compress(json.dumps([trace["x"], trace["y"]]).encode())) < 4000
+    assert trace["x"] == pytest.approx([p[2] for p in points], rel=1e-4)
+    assert (trace["customdata"][32], trace["marker"]["color"][32]) == (33, 4)
