@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from datetime import date, datetime
 
+ROUNDING = 1e-12
+"""A number nearer to 0 than this is what rounding left of 0."""
 _RAISED = str.maketrans("0123456789", "\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079")
 
 
@@ -12,8 +14,10 @@ def number(value: float | None, digits: int = 3) -> str:
     """Format a number for people: significant digits, an em dash where there is none."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "—"
-    if value == 0:
+    if abs(value) < ROUNDING:
         return "0"
+    if abs(value) < 0.5e-6:  # six decimals would show nothing but a sign
+        return stated(value, digits)
     if abs(value) >= 10**digits:
         return f"{value:,.0f}".replace(",", "\u202f").replace("-", "\u2212")
     decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))

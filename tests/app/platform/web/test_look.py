@@ -93,3 +93,10 @@ def test_a_number_of_few_digits_shows_no_exponent_and_keeps_its_size() -> None:
 
 def test_the_hover_text_of_a_chart_writes_digits_without_an_exponent() -> None:
     assert [hover(), hover("x"), hover("customdata", 4)] == ["%{y:,.3~r}", "%{x:,.3~r}", "%{customdata:,.4~r}"]
+
+
+def test_a_number_too_small_for_six_decimals_is_neither_a_row_of_noughts_nor_a_signed_nought() -> None:
+    assert [number(v) for v in (-1e-17, 1e-17, 0.0, -0.0)] == ["0"] * 4, "what rounding left"
+    assert [number(v) for v in (1.234e-7, -4e-10)] == ["1.23\u00d710\u207b\u2077", "\u22124\u00d710\u207b\u00b9\u2070"]
+    shown = [number(sign * 10.0**power) for sign in (1, -1) for power in range(-20, 7)]
+    assert not [text for text in shown if set(text) <= set("\u22120.") and text != "0"]
