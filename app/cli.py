@@ -19,7 +19,7 @@ from app.accounts.permissions import SYSTEM
 from app.evaluation.ranking import commands as ranking
 from app.ingest import commands as ingest
 from app.overview import commands as package
-from app.pipeline.next_generation import commands as next_generation
+from app.pipeline import commands as next_generation
 from app.platform import logs
 from app.platform.audit.commands import app as audit_app
 from app.platform.bucket import bucket

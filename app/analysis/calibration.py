@@ -25,7 +25,7 @@ from app.analysis.calibration_accuracy import (
 )
 from app.evaluation import repository
 from app.evaluation.estimates.rows import estimate_of
-from app.evaluation.ranking.actual import QUANTITIES, Actual, actual
+from app.evaluation.ranking.assessment import QUANTITIES, Actual, actual
 from app.evaluation.ranking.results import DrivenSession, driven_sessions
 from app.planning.plans import repository as plans
 from app.platform.web.charts import counted

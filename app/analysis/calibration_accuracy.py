@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from app.evaluation.ranking.actual import QUANTITIES
+from app.evaluation.ranking.assessment import QUANTITIES
 from app.platform.web.schemas import Model
 from ml.ope import LEVEL, accuracy
 from ml.outcomes import enumerated

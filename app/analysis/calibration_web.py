@@ -15,8 +15,8 @@ from app.analysis import calibration_charts
 from app.analysis.calibration import calibration, in_sentences
 from app.analysis.calibration_accuracy import CalibrationOut
 from app.evaluation import repository
-from app.evaluation.estimates.methods import names
-from app.evaluation.ranking.actual import QUANTITIES
+from app.evaluation.methods import names
+from app.evaluation.ranking.assessment import QUANTITIES
 from app.platform.database import Db
 from app.platform.errors import Invalid
 from app.platform.web.csv_files import download, safe_cell

@@ -12,7 +12,7 @@ from app.analysis.evidence import evidence
 from app.analysis.primary import policy_names, policy_verdicts_of, verdicts_of
 from app.analysis.primary_verdict import VerdictResult
 from app.evaluation import repository as evaluations
-from app.evaluation import verdict_wording
+from app.evaluation.ranking import verdict_wording
 from app.evaluation.ranking.decisions import Decided, findings_of
 from app.evaluation.ranking.judged import judged
 from app.study.adverse_events import blocking_events, events_of_participant

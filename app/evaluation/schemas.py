@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import ConfigDict, Field
 
-from app.evaluation.estimates.methods import Method as Method
-from app.evaluation.estimates.methods import Methods
+from app.evaluation.methods import Methods
 from app.learning.schemas import PolicyIds, Preset
 from app.platform.web.schemas import Int, Model
 from app.study.outcomes.fields import fields_model

@@ -15,7 +15,7 @@ from app.evaluation.estimates.rows import row_of
 from app.evaluation.ranking.service import current_ranking as current_ranking
 from app.evaluation.schemas import EvaluateParams
 from app.learning import repository as learning
-from app.learning.policies.service import onnx_of, require_window, window_of
+from app.learning.policies import onnx_of, require_window, window_of
 from app.platform.errors import Invalid
 from app.platform.jobs import service as jobs
 from app.study import repository as study_repository

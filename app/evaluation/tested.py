@@ -10,9 +10,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.evaluation import repository
-from app.evaluation.ranking.actual import actual
+from app.evaluation.ranking.assessment import actual
 from app.evaluation.ranking.results import DrivenSession, driven_sessions
-from app.learning.policies.service import onnx_of, window_of
+from app.learning.policies import onnx_of, window_of
 from app.platform.errors import Invalid
 from app.tables.learning import BufferSnapshot, Policy
 from ml.mdp import MdpSettings

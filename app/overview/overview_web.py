@@ -24,7 +24,7 @@ from app.analysis.pooled import outlines, overall, readable
 from app.analysis.standing import standing_sentences
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.staleness import stale_reasons
-from app.evaluation.what_next import what_next
+from app.evaluation.ranking.verdict_wording import what_next
 from app.overview import repository, state
 from app.overview.package import export_participant
 from app.overview.state import State

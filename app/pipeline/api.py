@@ -1,4 +1,4 @@
-"""REST routes of jobs of every kind: start, look, follow, cancel, retry."""
+"""Routes of jobs."""
 
 from __future__ import annotations
 
@@ -12,14 +12,54 @@ from app.accounts import permissions as can
 from app.accounts.deps import CallerNow, CurrentCaller
 from app.pipeline import service
 from app.pipeline.deps import CurrentJob
-from app.pipeline.schemas import JobIn, JobOut
-from app.pipeline.serializers import job_out
-from app.platform.database import Db
+from app.pipeline.schemas import JobIn, JobOut, JobStepOut
+from app.platform.database import Db, now
 from app.platform.jobs import repository as jobs
 from app.platform.jobs import stream
 from app.platform.web.schemas import Page, PagingQuery, problems
 from app.study.deps import CurrentParticipant
-from app.tables.jobs import JobStatus
+from app.tables.jobs import Job, JobStatus
+from app.tables.participants import Participant
+
+# Jobs as API types.
+
+
+def job_out(job: Job, participant: Participant) -> JobOut:
+    """Convert a job for the API."""
+    return JobOut(
+        id=job.id,
+        kind=job.kind,
+        participant=participant.code,
+        status=str(job.status),
+        progress=job.progress,
+        seconds_left=job.seconds_left(now()),
+        message=job.message,
+        params=job.params,
+        result=job.result,
+        error=job.error,
+        code_version=job.code_version,
+        created_at=job.created_at,
+        created_by=job.created_by,
+        started_at=job.started_at,
+        finished_at=job.finished_at,
+        cancel_requested_at=job.cancel_requested_at,
+        steps=[
+            JobStepOut(
+                key=s.key,
+                title=s.title,
+                status=str(s.status),
+                progress=s.progress,
+                message=s.message,
+                attempts=s.attempts,
+                started_at=s.started_at,
+                finished_at=s.finished_at,
+            )
+            for s in job.steps
+        ],
+    )
+
+
+# REST routes of jobs of every kind: start, look, follow, cancel, retry.
 
 router = APIRouter(tags=["jobs"], responses=problems(401, 403, 404, 422))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from app.learning.training.configs import training_groups
+from app.learning.training_configs import training_groups
 from app.pipeline.distillation import declare_distillation, distil_all
 from app.pipeline.evaluation import (
     declare_evaluation,

@@ -7,10 +7,9 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from app.learning import repository
-from app.learning.policies import service
+from app.learning import policies, repository
 from app.learning.schemas import DistilParams
-from app.learning.training.configs import distillation_config
+from app.learning.training_configs import distillation_config
 from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, plan_on_snapshot, policy_facts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
@@ -54,7 +53,7 @@ def distil_all(job: JobContext, params: DistilParams, snapshot: dict[str, Any], 
             (f"distil/{k}", result, job.workdir(f"distil/{k}"), teacher["id"])
             for k, (result, teacher) in enumerate(zip(results, teachers, strict=True))
         ]
-        return {"policies": policy_facts(service.store_students(db, job.id, job.created_by, row, steps))}
+        return {"policies": policy_facts(policies.store_students(db, job.id, job.created_by, row, steps))}
 
     stored: list[dict[str, Any]] = job.transact("store-students", store)["policies"]
     return stored

@@ -14,8 +14,8 @@ from app.evaluation import repository, service
 from app.evaluation.estimates import compute, dose_shapes
 from app.evaluation.schemas import EvaluateParams
 from app.evaluation.tested import replayable, tested
-from app.learning.policies.baselines import ensure_baselines
-from app.learning.snapshots.buffers import read_buffer
+from app.learning.policies import ensure_baselines
+from app.learning.trajectories import read_buffer
 from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, acting, participant_of, plan_on_snapshot
 from app.platform import files
 from app.platform.jobs import JobContext

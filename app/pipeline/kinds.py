@@ -7,17 +7,17 @@ from sqlalchemy.orm import Session
 from app.evaluation.schemas import EvaluateParams
 from app.evaluation.service import policies_to_rank
 from app.learning.schemas import DistilParams, TrainParams
-from app.learning.snapshots.service import collect
+from app.learning.snapshots import collect
 from app.pipeline.distillation import teachers
-from app.pipeline.next_generation.parents import tested_policies
+from app.pipeline.next_generation import tested_policies
 from app.pipeline.params import NEXT_GENERATION, NextGenerationParams, PipelineParams
 from app.pipeline.training import training_starts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobKind, Priority, register
 from app.tables.participants import Participant
 
-_TRAINING = {"train": "app.learning.training.compute:train", "baselines": "app.learning.training.compute:baselines"}
-_DISTILLATION = {"distil": "app.learning.training.compute:distil"}
+_TRAINING = {"train": "app.learning.training_compute:train", "baselines": "app.learning.training_compute:baselines"}
+_DISTILLATION = {"distil": "app.learning.training_compute:distil"}
 _EVALUATION = {
     "fit_dlsm": "app.evaluation.estimates.compute:fit_dlsm",
     "check_coverage": "app.evaluation.estimates.compute:check_coverage",
@@ -61,7 +61,7 @@ register(
         name=NEXT_GENERATION,
         title="Next generation from what did best",
         params=NextGenerationParams,
-        orchestration="app.pipeline.next_generation.job:run_next_generation",
+        orchestration="app.pipeline.next_generation_job:run_next_generation",
         compute=_TRAINING | _DISTILLATION | _EVALUATION,
         requires=(usable_sessions, something_tested),
         priority=Priority.INTERACTIVE,

@@ -12,10 +12,10 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
-from app.evaluation.estimates.methods import names as method_names
+from app.evaluation.methods import names as method_names
 from app.learning import repository as learning
 from app.learning.schemas import ALGORITHM_NAMES, DEFAULT_SWEEP, AlgorithmName
-from app.learning.snapshots.service import not_ready
+from app.learning.snapshots import not_ready
 from app.pipeline import charts, service
 from app.pipeline.deps import CurrentJob
 from app.platform.database import Db

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from app.evaluation.estimates.methods import Methods
+from app.evaluation.methods import Methods
 from app.evaluation.schemas import EvaluateParams
 from app.learning.schemas import DEFAULT_SWEEP, Aim, AlgorithmName, Anchor, DistilParams, PolicyIds, SweepParams, TrainParams
 from app.platform.web.schemas import Int, Number

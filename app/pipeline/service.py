@@ -11,7 +11,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation.repository import newest_evaluation
 from app.learning import repository as learning
-from app.learning.snapshots.service import collect
+from app.learning.snapshots import collect
 from app.pipeline.stages import PLAN, snapshot_facts
 from app.platform.jobs import Priority, registry
 from app.platform.jobs import service as jobs

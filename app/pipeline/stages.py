@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.learning.snapshots import service as snapshots
+from app.learning import snapshots
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
 from app.study.margins import margins_of

@@ -9,13 +9,11 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.evaluation.tested import tested
-from app.learning import repository
-from app.learning.policies import service
+from app.learning import policies, repository, sweeps
 from app.learning.schemas import ALGORITHM_NAMES, TrainParams
-from app.learning.snapshots.buffers import read_buffer
-from app.learning.sweeps import service as sweeps
-from app.learning.sweeps.service import Group
-from app.learning.training.configs import HELD_BY, training_groups
+from app.learning.sweeps import Group
+from app.learning.training_configs import HELD_BY, training_groups
+from app.learning.trajectories import read_buffer
 from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, acting, plan_on_snapshot, policy_facts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
@@ -67,7 +65,7 @@ def training_starts(db: Session, participant_id: int, params: TrainParams) -> li
             raise Invalid(
                 f"Policy '{policy.name}' is {policy.kind}: only policies trained here can be trained further.", "Choose a trained policy."
             )
-        service.require_window(policy, db.get_one(Participant, participant_id).current_settings.window)
+        policies.require_window(policy, db.get_one(Participant, participant_id).current_settings.window)
         known = {"checkpoint_sha256": policy.checkpoint_sha256} if policy.checkpoint_sha256 else {"onnx_sha256": policy.onnx_sha256}
         # a student has no critic: the sweep's own algorithm goes on from it
         algorithm = policy.algorithm if policy.checkpoint_sha256 else params.algorithms[0]

@@ -15,7 +15,7 @@ from app.evaluation.ranking.assessment import cdbs_amplitude_now
 from app.evaluation.ranking.decisions import findings_of
 from app.evaluation.ranking.judged import Judged
 from app.evaluation.ranking.service import current
-from app.evaluation.verdict_wording import plainly
+from app.evaluation.ranking.verdict_wording import plainly
 from app.learning import repository as learning
 from app.planning import wording
 from app.planning.grounds import events_against

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from app.evaluation.verdict_wording import plainly
+from app.evaluation.ranking.verdict_wording import plainly
 from app.evaluation.wording import amplitude, chance, joined
 from app.planning.notices import OF_METHODS, Code, PlanWarning
 from app.planning.plans.designs import NEAR, Planned, SideBound, delivered_ma, is_held

@@ -15,8 +15,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.evaluation.ranking.service import current
-from app.pipeline.next_generation import service as next_generation
-from app.pipeline.next_generation.parents import tested_policies
+from app.pipeline import next_generation
+from app.pipeline.next_generation import tested_policies
 from app.pipeline.params import NEXT_GENERATION, NextGenerationParams
 from app.pipeline.service import start_job
 from app.planning.plans import repository as plans

@@ -30,9 +30,9 @@ import numpy as np
 import torch
 
 from app.learning.schemas import DEFAULT_SWEEP, TrainParams
-from app.learning.sweeps.comparison import held_near
-from app.learning.training.compute import hold_out, supported_best, with_best_anchor
-from app.learning.training.configs import training_groups
+from app.learning.sweeps import held_near
+from app.learning.training_compute import hold_out, supported_best, with_best_anchor
+from app.learning.training_configs import training_groups
 from benchmarks.support.cells import Cells
 from benchmarks.support.looks import look, said
 from benchmarks.support.results import run_benchmark

@@ -15,7 +15,7 @@ from typing import Any
 import httpx2 as httpx
 import numpy as np
 
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 
 from .installation import PASSWORD, Installation, utc
 

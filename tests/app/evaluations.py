@@ -12,8 +12,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation.service import store_evaluation
-from app.learning.policies.baselines import constant_onnx, ensure_baselines
-from app.learning.snapshots.service import collect, take_snapshot
+from app.learning.policies import constant_onnx, ensure_baselines
+from app.learning.snapshots import collect, take_snapshot
 from app.study.repository import participant_by_code
 from ml.ope.estimate import Estimate
 from ml.ope.posterior import verdict

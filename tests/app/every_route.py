@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 
 from app.accounts import service as accounts
 from app.analysis.energy import ImplantIn
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from app.main import DESCRIPTION
 from app.platform.database import transaction
 from app.tables.accounts import Role

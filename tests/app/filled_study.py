@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from fastapi.testclient import TestClient
 
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from app.platform.jobs.children.forked import ForkedProcesses
 from app.platform.jobs.children.report import StepReport
 from app.platform.jobs.children.supervisor import ChildMessages, ComputeCall

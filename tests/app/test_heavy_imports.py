@@ -27,7 +27,7 @@ def test_the_web_process_never_loads_torch_and_starts_without_what_it_may_never_
     modules = loaded("from app.main import create_app; create_app().openapi()")
     assert "app.pipeline.kinds" in modules
     assert modules & SLOW_TO_LOAD == set()
-    assert not {m for m in modules if m.startswith("app.") and m.endswith(".compute")}
+    assert not {m for m in modules if m.startswith("app.") and m.endswith("compute")}
 
 
 def test_a_command_starts_without_what_it_may_never_need() -> None:

@@ -14,7 +14,7 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.policies import service as learning
+from app.learning import policies as learning
 from app.pipeline import service as pipeline
 from app.planning.bundles import service as bundles
 from app.platform.errors import NotFound

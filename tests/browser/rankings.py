@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from fastapi.testclient import TestClient
 
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from ml.ope.support.behaviour_map import COLUMNS, DOSES, BehaviourMap, Curve
 from tests.ml.ope.posterior.draws import N
 

@@ -60,7 +60,7 @@ CONTENTS: list[Promise] = [
             "            return self.device(text)\n", "            return text\n", IDENTITY, at_start=True),
     Promise("a policy with operators of others is refused", "ml/policies/onnx_policy.py", "        if node.domain not in known:\n",
             "        if False:\n", FOREIGN, at_start=True),
-    Promise("a policy of strangers ends after its time", "app/learning/policies/foreign.py", "memory_mb=1024, cpu_s=10,",
+    Promise("a policy of strangers ends after its time", "app/learning/foreign.py", "memory_mb=1024, cpu_s=10,",
             "memory_mb=1024, cpu_s=40,", FOREIGN, at_start=True),
     Promise("a package recomputes its own tables", "app/overview/recompute.py", "float(np.nanmean(a**2)) if known(a)",
             "float(np.nanmean(a)) if known(a)", PACKAGE, at_start=True),

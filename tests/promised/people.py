@@ -142,7 +142,7 @@ PEOPLE: list[Promise] = [
          f"{FILES}::test_a_fault_while_identity_is_taken_out_keeps_the_file_encrypted"),
     ),
     *of(
-        "learning/policies/foreign",
+        "learning/foreign",
         ("policies of strangers are opened in children", '        return run_limited(reference, params, LIMITS, who="policies")\n',
          '        module, _, name = reference.partition(":")\n'
          '        return dict(getattr(__import__(module, fromlist=[name]), name)(params))\n',

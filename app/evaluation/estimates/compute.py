@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from app.evaluation.estimates import dose_shapes
-from app.learning.snapshots.buffers import read_buffer
+from app.learning.trajectories import read_buffer
 from app.platform import files
 from app.platform.jobs import StepReport, write_atomically
 from app.platform.web.numbers import number

@@ -10,9 +10,9 @@ from statistics import fmean, median
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.evaluation.ranking.actual import QUANTITIES, Actual, actual, mean_of
+from app.evaluation.ranking.assessment import QUANTITIES, Actual, actual, mean_of
 from app.evaluation.schemas import TestedBefore
-from app.learning.snapshots.trajectories import trajectory_of
+from app.learning.trajectories import trajectory_of
 from app.platform.errors import Invalid
 from app.platform.kept import kept
 from app.study import blinding

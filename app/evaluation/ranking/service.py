@@ -9,8 +9,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.evaluation import repository, verdict_wording, wording
+from app.evaluation import repository, wording
 from app.evaluation.estimates.coverage import coverage_failed
+from app.evaluation.ranking import verdict_wording
 from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.evaluation.ranking.judged import Judged, judged
 from app.evaluation.ranking.staleness import stale_reasons

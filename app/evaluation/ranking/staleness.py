@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.evaluation import repository
 from app.learning import repository as learning
-from app.learning.gate.service import LEARNED, gate
+from app.learning.gate import LEARNED, gate
 from app.platform.errors import Invalid
 from app.platform.kept import kept
 from app.study import blinding

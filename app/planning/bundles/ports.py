@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.learning.policies import foreign
+from app.learning import foreign
 from app.planning.bundles import repository
 from app.planning.bundles.service import FOREIGN
 from app.platform import files

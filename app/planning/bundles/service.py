@@ -18,10 +18,10 @@ from sqlalchemy.orm import Session
 from app import __version__
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
+from app.learning import foreign
 from app.learning import repository as learning
-from app.learning.policies import foreign
-from app.learning.policies.service import onnx_of, probe_windows
-from app.learning.snapshots.buffers import read_buffer
+from app.learning.policies import onnx_of, probe_windows
+from app.learning.trajectories import read_buffer
 from app.planning import wording
 from app.planning.bundles import repository
 from app.planning.grounds import events_against, unanswered

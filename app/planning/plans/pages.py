@@ -13,8 +13,8 @@ from starlette.datastructures import FormData
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
-from app.evaluation import verdict_wording
 from app.evaluation import wording as evaluation_wording
+from app.evaluation.ranking import verdict_wording
 from app.evaluation.wording import method_name, sentence
 from app.planning import draft_form, wording
 from app.planning.plans import key, repository, service

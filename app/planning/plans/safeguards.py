@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from app.evaluation import verdict_wording
+from app.evaluation.ranking import verdict_wording
 from app.evaluation.ranking.decisions import Decided
 from app.planning.grounds import Grounds
 from app.platform.errors import Conflict, Forbidden, Invalid

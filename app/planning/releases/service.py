@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts import sign_on
 from app.accounts.permissions import Caller
-from app.learning.policies.service import onnx_of
+from app.learning.policies import onnx_of
 from app.planning.bundles import service as bundles
 from app.platform.errors import Conflict, Forbidden
 from app.platform.signatures import repository as signatures

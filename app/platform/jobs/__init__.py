@@ -34,7 +34,7 @@ that `registry.KIND_MODULES` names; API, pages and form derive from it::
             title="Train policies",
             params=TrainParams,
             orchestration="app.pipeline.training:run_train",                # imported by workers
-            compute={"train": "app.learning.training.compute:train"},       # imported by children
+            compute={"train": "app.learning.training_compute:train"},       # imported by children
             requires=(usable_sessions,),                                    # called before the job is put on the queue
         )
     )

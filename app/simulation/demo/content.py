@@ -18,8 +18,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from app.accounts import repository
 from app.accounts import service as accounts
-from app.learning.policies.learned_earlier import Learned, add_learned
-from app.learning.snapshots.service import take_snapshot
+from app.learning.learned_earlier import Learned, add_learned
+from app.learning.snapshots import take_snapshot
 from app.platform.database import now, transaction
 from app.settings import get_settings
 from app.simulation.demo.accounts import ADMIN, CLINICIAN, ENGINEER, password

@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 
 from app import __version__
-from app.evaluation.ranking.actual import actual
+from app.evaluation.ranking.assessment import actual
+from app.learning import training_compute
 from app.learning.schemas import DEFAULT_SWEEP, DistilParams, TrainParams
-from app.learning.training import compute
-from app.learning.training.configs import distillation_config, generation_groups, training_groups
-from app.learning.training.results import POLICY, policy_file, training_file
+from app.learning.training_configs import POLICY, distillation_config, generation_groups, policy_file, training_file, training_groups
 from app.platform import files
 from app.platform.errors import Invalid
 from app.platform.jobs import StepReport
@@ -145,7 +144,7 @@ class _Participant:
             if group["start"]:
                 call["initial"] = {"checkpoint_sha256": group["start"]["checkpoint_sha256"]}
             with _folder() as folder:
-                result = compute.train(call, folder, _silent())
+                result = training_compute.train(call, folder, _silent())
                 for k, member in enumerate(result["members"]):
                     onnx = (folder / policy_file(k)).read_bytes()
                     learned = LearnedPolicy(
@@ -176,7 +175,7 @@ class _Participant:
         asked = DistilParams(preset="quick", updates=DISTIL_UPDATES, seed=seed)
         with _folder() as folder:
             call = {"snapshot_sha256": sha256, "teacher_sha256": teacher.sha256, "config": distillation_config(asked, 0)}
-            result = compute.distil(call, folder, _silent())
+            result = training_compute.distil(call, folder, _silent())
             onnx = (folder / POLICY).read_bytes()
         learned = LearnedPolicy(
             name=f"{teacher.policy.name}-small",

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from app.evaluation import verdict_wording, wording
+from app.evaluation import wording
+from app.evaluation.ranking import verdict_wording
 from app.platform.kept import forget
 from ml.ope.flags import Flag, distinct, not_counted_tests
 from ml.ope.posterior.verdict import Levels, verdict

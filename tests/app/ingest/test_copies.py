@@ -18,7 +18,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.ingest.copies import Relation, Rows, relation
-from app.learning.snapshots.service import take_snapshot
+from app.learning.snapshots import take_snapshot
 from app.study.repository import participant_by_code
 from app.tables.recordings import Recording
 from tests.app.ingest.conftest import device_zip, loose

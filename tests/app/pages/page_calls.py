@@ -10,7 +10,7 @@ from fastapi.testclient import TestClient
 from app.accounts import repository
 from app.accounts import service as accounts
 from app.accounts.deps import COOKIE
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from app.platform.database import new_session, transaction
 from app.tables.accounts import Role
 from tests.app.every_route import DOSE, MAPPING, PASSWORD, RATED, SPEECH, TABLE, World

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.analysis.pooled import Saved, overall
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from app.overview.overview_web import SOON
 from app.overview.state import Actor, Task, states
 from app.platform.jobs import service as jobs

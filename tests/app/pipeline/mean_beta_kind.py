@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from app.learning.snapshots.buffers import read_buffer
+from app.learning.trajectories import read_buffer
 from app.pipeline.kinds import usable_sessions
 from app.pipeline.stages import plan_on_snapshot
 from app.platform.jobs import JobContext, JobKind, StepReport, register

@@ -17,7 +17,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from app.settings import get_settings
 from app.tables.jobs import JobEvent
 

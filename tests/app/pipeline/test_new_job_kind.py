@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from app.learning.snapshots.buffers import read_buffer
+from app.learning.trajectories import read_buffer
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]

@@ -12,8 +12,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.policies.baselines import constant_onnx
-from app.learning.snapshots.buffers import read_buffer
+from app.learning.policies import constant_onnx
+from app.learning.trajectories import read_buffer
 from app.platform import files
 from app.study.repository import participant_by_code
 from app.tables.evaluations import Evaluation

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from app.accounts.permissions import SYSTEM
 from app.cli import app
-from app.learning.policies.baselines import constant_onnx
-from app.learning.snapshots.service import take_snapshot
+from app.learning.policies import constant_onnx
+from app.learning.snapshots import take_snapshot
 from app.pipeline.stages import PLAN, snapshot_facts
 from app.platform.database import now
 from app.platform.jobs import registry

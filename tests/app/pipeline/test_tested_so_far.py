@@ -12,12 +12,11 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.learning.schemas import TrainParams
-from app.learning.snapshots.buffers import read_buffer
-from app.learning.snapshots.service import take_snapshot
-from app.learning.training.compute import known_tests, stored_gains
-from app.learning.training.configs import training_groups
-from app.pipeline import training
-from app.pipeline.next_generation import parents
+from app.learning.snapshots import take_snapshot
+from app.learning.training_compute import known_tests, stored_gains
+from app.learning.training_configs import training_groups
+from app.learning.trajectories import read_buffer
+from app.pipeline import next_generation, training
 from app.pipeline.stages import snapshot_facts
 from app.pipeline.training import training_calls, training_plan
 from app.platform import files
@@ -76,12 +75,12 @@ def test_a_retired_policy_is_evidence_as_before_and_no_parent_and_one_without_it
     db.commit()
     before = training.tested_so_far(db, snapshot, SYSTEM)
     assert [p["id"] for p in before["policies"]] == [policies[1]]
-    assert [t.policy.id for t in parents.tested_policies(db, participant)] == [policies[1]]
+    assert [t.policy.id for t in next_generation.tested_policies(db, participant)] == [policies[1]]
     db.commit()
     retire(client, policies[1])
     db.expire_all()
     assert training.tested_so_far(db, snapshot, SYSTEM) == before
-    assert parents.tested_policies(db, participant) == []
+    assert next_generation.tested_policies(db, participant) == []
     files.path_of(db.get_one(Policy, policies[1]).onnx_sha256).unlink()
     assert training.tested_so_far(db, snapshot, SYSTEM) == {"tests": [], "policies": []}
 

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation.service import store_evaluation
-from app.learning.snapshots.service import take_snapshot
+from app.learning.snapshots import take_snapshot
 from app.platform import files
 from app.study import blinding
 from app.study.repository import participant_by_code

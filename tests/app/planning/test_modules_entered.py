@@ -14,7 +14,7 @@ from sqlalchemy import text
 from sqlalchemy.orm import Session
 
 from app.ingest.uploads import compute, reading
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from app.platform.jobs import registry
 from app.platform.kept import forget
 from ml.progress import silent

@@ -12,8 +12,8 @@ from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.snapshots.service import take_snapshot
-from app.pipeline.next_generation.service import outlook
+from app.learning.snapshots import take_snapshot
+from app.pipeline.next_generation import outlook
 from app.simulation.design import PRESETS, Design, Remembered
 from app.simulation.loop import ParticipantLoop, Signer
 from app.study.repository import participant_by_code

@@ -100,7 +100,7 @@ def test_the_test_vectors_reach_saturation_and_every_way_in_which_beta_goes_wron
 
 
 def test_a_policy_without_layers_leaves_as_onnx_alone_and_runs_within_the_same_envelope(manifest, test_windows):
-    from app.learning.policies.baselines import constant_onnx
+    from app.learning.policies import constant_onnx
 
     made = build_bundle(
         constant_onnx(0.5, 10), dataclasses.replace(manifest, normalisation_mean=None, normalisation_std=None), test_windows

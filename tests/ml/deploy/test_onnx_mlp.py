@@ -169,7 +169,7 @@ def test_our_own_networks_are_read_to_the_last_bit():
 
 
 def test_the_proportional_baseline_is_a_network_of_one_layer_and_a_constant_is_none():
-    from app.learning.policies.baselines import constant_onnx, proportional_onnx
+    from app.learning.policies import constant_onnx, proportional_onnx
     from ml.policies.policy import ProportionalPolicy
 
     policy = ProportionalPolicy(90.0, 150.0, floor=0.3, newest=3)

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation.service import store_evaluation
-from app.learning.snapshots.service import take_snapshot
+from app.learning.snapshots import take_snapshot
 from app.study.repository import participant_by_code
 from app.tables.learning import BufferSnapshot
 from tests.app.evaluations import estimate, policies  # noqa: F401 (a fixture)

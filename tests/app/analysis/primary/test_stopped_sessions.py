@@ -15,8 +15,8 @@ from app.analysis.evidence import evidence
 from app.analysis.facts import choose, of_controller
 from app.analysis.primary_verdict import judged_outcome
 from app.evaluation.ranking.results import driven_sessions
-from app.learning.gate.service import decide
-from app.learning.snapshots.service import collect, take_snapshot
+from app.learning.gate import decide
+from app.learning.snapshots import collect, take_snapshot
 from app.study.repository import participant_by_code, sessions_of_participant
 from app.study.sessions.usable_steps import failed_qoc_of
 from app.tables.learning import GateChoice

@@ -13,7 +13,7 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.evaluation.estimates.compute import choose_method, evaluate_method
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from app.platform import files
 from app.platform.jobs import StepReport
 from ml.mdp import MdpSettings

@@ -22,9 +22,9 @@ from app.evaluation.estimates.compute import check_coverage
 from app.evaluation.estimates.coverage import CHECKS, VERDICTS, shown_limit, shown_value
 from app.evaluation.schemas import CheckOut
 from app.evaluation.service import store_evaluation
-from app.learning.policies.baselines import constant_onnx, ensure_baselines
-from app.learning.snapshots.buffers import read_buffer
-from app.learning.snapshots.service import collect, take_snapshot
+from app.learning.policies import constant_onnx, ensure_baselines
+from app.learning.snapshots import collect, take_snapshot
+from app.learning.trajectories import read_buffer
 from app.overview.package import export_participant
 from app.platform import files
 from app.platform.jobs import StepReport

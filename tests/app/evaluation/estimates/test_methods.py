@@ -126,7 +126,7 @@ LOADED = """
 import sys, threading
 from importlib import import_module
 from pathlib import Path
-for name in ("app.learning.training.compute", "app.evaluation.estimates.compute"):
+for name in ("app.learning.training_compute", "app.evaluation.estimates.compute"):
     import_module(name).prepare()
 assert {"torch._dynamo", "scipy.optimize", "numba.core.dispatcher"} <= set(sys.modules)
 print([name for task in Path("/proc/self/task").iterdir() if (name := (task / "comm").read_text().strip()) != "jemalloc_bg_thd"])

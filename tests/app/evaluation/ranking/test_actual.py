@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.evaluation.ranking.actual import actual, mean_of
+from app.evaluation.ranking.assessment import actual, mean_of
 from ml.mdp import MdpSettings
 from ml.qoc import Qoc
 from ml.trajectories import SessionTrajectory

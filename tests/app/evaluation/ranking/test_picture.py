@@ -10,7 +10,7 @@ from fastapi.testclient import TestClient
 
 from app.evaluation.ranking import picture
 from app.evaluation.ranking.picture import DARKEST, MOST, SHAPES, TONES
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from app.platform.web.svg import Plane
 from ml.ope.support.behaviour_map import COLUMNS, DOSES, BehaviourMap, Curve
 from tests.app.evaluations import judged

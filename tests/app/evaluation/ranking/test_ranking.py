@@ -15,8 +15,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation.service import store_evaluation
-from app.learning.policies.baselines import constant_onnx
-from app.learning.snapshots.service import take_snapshot
+from app.learning.policies import constant_onnx
+from app.learning.snapshots import take_snapshot
 from app.platform.errors import Invalid
 from app.study.repository import participant_by_code
 from app.tables.evaluations import Evaluation

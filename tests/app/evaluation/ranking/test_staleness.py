@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.evaluation import repository, wording
 from app.evaluation.ranking.staleness import stale_reasons
-from app.learning.gate.service import decide
+from app.learning.gate import decide
 from app.platform.web.charts import counted
 from app.study.repository import participant_by_code, sessions_of_participant
 from app.tables.learning import GateChoice
@@ -48,7 +48,7 @@ def test_no_trace_is_read_to_see_whether_a_ranking_is_stale(
         raise AssertionError("a trace was read")
 
     monkeypatch.setattr("app.study.traces.unpack", values)
-    monkeypatch.setattr("app.learning.snapshots.service.collect", lambda *_: pytest.fail("the buffer was built again"))
+    monkeypatch.setattr("app.learning.snapshots.collect", lambda *_: pytest.fail("the buffer was built again"))
     assert stale(db) == []
     assert read == []
 

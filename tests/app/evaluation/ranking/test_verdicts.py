@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from pypdf import PdfReader
 
 from app.evaluation.ranking.decisions import Circumstances, decide
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from app.tables.participants import MarginsVersion
 from ml.designs import Bound
 from ml.ope.flags import Flag

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from app.evaluation.replay import wording
-from app.evaluation.replay.compute import run
-from app.evaluation.replay.schemas import DifferenceOut, ReplayOut
+from app.evaluation import replay
+from app.evaluation.replay import DifferenceOut, ReplayOut
+from app.evaluation.replay_compute import run
 from ml.deploy.windows import PolicyWindow
 from tests.app.words import above_fold, methods_named
 
@@ -76,10 +76,10 @@ def test_differences_are_told_in_milliamperes_or_as_shares() -> None:
     found = ReplayOut.model_validate(
         common | {"cdbs_amplitude_ma": None, "recorded_fraction": [1.0], "asked": asked, "differences": [apart]}
     )
-    (sentence,) = wording.differences(found)
+    (sentence,) = replay.differences(found)
     assert sentence == (
         "a would have asked for 10 % of cDBS more than b on average; they are apart in 40 % of the steps, most at 1 min 32 s, "
         "where a asks for 50 % of cDBS less."
     )
     alike = found.model_copy(update={"differences": [apart.model_copy(update={"apart": 0.0})], "cdbs_amplitude_ma": 3.0})
-    assert wording.differences(alike) == ["a and b would have asked for the same throughout, within 5 % of the cDBS amplitude."]
+    assert replay.differences(alike) == ["a and b would have asked for the same throughout, within 5 % of the cDBS amplitude."]

@@ -16,7 +16,7 @@ from sqlalchemy import inspect, text
 from sqlalchemy.orm import Session
 
 from app.ingest.uploads import reading, service
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from app.platform.embedded.server import EmbeddedPostgres
 from app.settings import get_settings
 from tests.app.ingest.conftest import Send

@@ -11,7 +11,7 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.snapshots.service import collect
+from app.learning.snapshots import collect
 from app.study.repository import participant_by_code
 from app.tables.learning import BufferGateDecision
 

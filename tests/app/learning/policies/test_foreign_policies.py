@@ -12,7 +12,7 @@ import pytest
 from fastapi.testclient import TestClient
 from onnx import TensorProto, helper, numpy_helper
 
-from app.learning.policies.baselines import constant_onnx
+from app.learning.policies import constant_onnx
 from ml.policies import onnx_policy
 
 WINDOW = 10

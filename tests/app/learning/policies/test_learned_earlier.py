@@ -9,10 +9,10 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.policies.baselines import constant_onnx
-from app.learning.policies.learned_earlier import Learned, add_learned
-from app.learning.snapshots.buffers import read_buffer
-from app.learning.snapshots.service import take_snapshot
+from app.learning.learned_earlier import Learned, add_learned
+from app.learning.policies import constant_onnx
+from app.learning.snapshots import take_snapshot
+from app.learning.trajectories import read_buffer
 from app.platform.errors import Conflict, Invalid
 from app.study import repository as study
 from app.tables.learning import BufferSnapshot

@@ -13,10 +13,10 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.policies.baselines import constant_onnx, ensure_baselines, proportional_onnx
+from app.learning.policies import constant_onnx, ensure_baselines, proportional_onnx
 from app.learning.schemas import DistilParams
-from app.learning.snapshots.service import collect, take_snapshot
-from app.learning.training.configs import distillation_config
+from app.learning.snapshots import collect, take_snapshot
+from app.learning.training_configs import distillation_config
 from app.platform import files
 from app.study.repository import participant_by_code
 from app.tables.learning import Policy

@@ -12,7 +12,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.snapshots.service import take_snapshot
+from app.learning.snapshots import take_snapshot
 from app.platform import files
 from app.platform.database import new_session
 from app.platform.errors import Invalid

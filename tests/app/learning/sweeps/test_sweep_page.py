@@ -13,12 +13,12 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.policies.baselines import constant_onnx
-from app.learning.snapshots.buffers import read_buffer
-from app.learning.snapshots.service import take_snapshot
-from app.learning.sweeps import parallel
-from app.learning.sweeps.comparison import better_without_learning, candidates
-from app.learning.training.compute import best_supported, stored_gains
+from app.learning import sweeps_charts
+from app.learning.policies import constant_onnx
+from app.learning.snapshots import take_snapshot
+from app.learning.sweeps import better_without_learning, candidates
+from app.learning.training_compute import best_supported, stored_gains
+from app.learning.trajectories import read_buffer
 from app.platform import files
 from app.platform.jobs import service as jobs
 from app.study.repository import participant_by_code
@@ -268,7 +268,7 @@ def test_each_policy_is_a_line_from_its_hyper_parameters_to_its_standing(store: 
     for k, policy in enumerate(db.query(Policy).order_by(Policy.id).limit(4)):
         policy.config = {"actor_lr": 10.0 ** (k - 5), "critic_lr": 1e-3}
     db.commit()
-    found = parallel.parallel(candidates(db.get_one(Sweep, sweep.id)))
+    found = sweeps_charts.parallel(candidates(db.get_one(Sweep, sweep.id)))
     assert found is not None
     assert found.columns[1] == "Learning rate"
     assert "Rate of the values" not in found.columns  # all are alike
@@ -290,7 +290,7 @@ def test_each_policy_is_a_line_from_its_hyper_parameters_to_its_standing(store: 
 
 
 def test_one_policy_alone_is_compared_with_nothing(store: Store, db: Session) -> None:
-    assert parallel.parallel(candidates(store(metrics(9.0, 8.0, 2.0, 0.0)))) is None
+    assert sweeps_charts.parallel(candidates(store(metrics(9.0, 8.0, 2.0, 0.0)))) is None
 
 
 def test_the_page_of_a_trained_policy_leads_back_to_its_sweep_and_its_snapshot(store: Store, client: TestClient) -> None:

@@ -12,9 +12,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.learning.schemas import DEFAULT_SWEEP, AlgorithmName, TrainParams
-from app.learning.sweeps.comparison import Candidate, better_without_learning, held_near
-from app.learning.training.compute import CONSTANT_GRID, with_best_anchor
-from app.learning.training.configs import ANCHORED, CLOSE, LOOSE, training_groups
+from app.learning.sweeps import Candidate, better_without_learning, held_near
+from app.learning.training_compute import CONSTANT_GRID, with_best_anchor
+from app.learning.training_configs import ANCHORED, CLOSE, LOOSE, training_groups
 from app.platform import files
 from app.tables.learning import Policy
 from ml.policies.onnx_policy import OnnxPolicy

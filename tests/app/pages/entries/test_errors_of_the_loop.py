@@ -11,8 +11,8 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.policies.baselines import constant_onnx
-from app.learning.snapshots.service import take_snapshot
+from app.learning.policies import constant_onnx
+from app.learning.snapshots import take_snapshot
 from app.study.repository import participant_by_code
 from app.tables.learning import Policy
 from app.tables.uploads import ColumnMapping

@@ -12,9 +12,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.learning.schemas import DEFAULT_SWEEP, TrainParams
-from app.learning.snapshots.service import take_snapshot
-from app.learning.training.configs import generation_groups, training_groups
-from app.pipeline.next_generation.parents import best
+from app.learning.snapshots import take_snapshot
+from app.learning.training_configs import generation_groups, training_groups
+from app.pipeline.next_generation import best
 from app.pipeline.training import training_starts
 from app.study.repository import participant_by_code
 from app.tables.evaluations import Evaluation

@@ -257,7 +257,7 @@ def test_a_policy_whose_stored_file_is_gone_is_named(client: TestClient, policy:
 def test_a_plain_network_made_elsewhere_leaves_with_its_c_header_and_the_page_says_why_another_does_not(
     client: TestClient, participant_code: str
 ) -> None:
-    from app.learning.policies.baselines import constant_onnx
+    from app.learning.policies import constant_onnx
 
     def added(name: str, content: bytes) -> int:
         posted = client.post("/api/v1/participants/P1/policies", data={"name": name}, files={"file": ("x.onnx", content)})

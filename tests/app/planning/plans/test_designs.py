@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.learning.snapshots.service import take_snapshot
+from app.learning.snapshots import take_snapshot
 from app.planning.plans.designs import SideBound, delivered_ma, rounded_up
 from app.platform import files
 from app.study.repository import participant_by_code

@@ -19,8 +19,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation.ranking.results import driven_sessions
-from app.learning.snapshots.coverage import describe
-from app.learning.snapshots.service import not_ready, take_snapshot
+from app.learning.coverage import describe
+from app.learning.snapshots import not_ready, take_snapshot
 from app.study.repository import participant_by_code, sessions_of_participant
 from app.tables.plans import Plan
 from tests.app.planning.slots.test_logs import DAY, log_of, send

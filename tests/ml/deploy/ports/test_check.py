@@ -140,7 +140,7 @@ def test_complete_windows_without_an_answer_are_a_fault(port):
 
 
 def test_a_dose_that_falls_where_the_policys_rises(manifest):
-    from app.learning.policies.baselines import proportional_onnx
+    from app.learning.policies import proportional_onnx
     from ml.policies.policy import ProportionalPolicy
 
     windows = np.abs(np.random.default_rng(0).normal(30.0, 9.0, (64, 10)))

@@ -1,1 +1,0 @@
-"""One policy: what it does, what is expected of it, where it comes from."""

@@ -1,1 +1,0 @@
-"""The gate of the replay buffer: when sessions of learned policies may enter it."""

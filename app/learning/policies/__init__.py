@@ -1,1 +1,0 @@
-"""Policies of a participant: trained, external and baseline ones."""

@@ -1,1 +1,0 @@
-"""Buffer snapshots: which sessions a result rests on, and what they cover."""

@@ -1,1 +1,0 @@
-"""Sweeps: policies trained in one action, compared on sessions that they did not learn from."""

@@ -1,1 +1,0 @@
-"""Training and distillation as the child processes run them, and their configurations."""
