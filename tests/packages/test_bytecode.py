@@ -11,7 +11,7 @@ WITHOUT = """
 import sys
 from importlib.util import cache_from_source
 from pathlib import Path
-import app.main, app.platform.jobs.worker, app.learning.training.compute as training
+import app.main, app.platform.jobs.worker, app.learning.training_compute as training
 app.main.create_app()
 training.prepare()
 files = [f for m in list(sys.modules.values()) if (f := getattr(m, "__file__", None)) and f.endswith(".py") and "site-packages" in f]
