@@ -34,6 +34,7 @@ from app.analysis.primary_verdict import LockedMargins, verdicts
 from app.planning.protocol.schedule import MOST_REPEATS, SESSION_MINUTES, Candidate, Rules, most_policies, schedule
 from app.study.blinding import Arm
 from app.tables.sessions import Controller
+from ml.outcomes import OUTCOMES
 from ml.policies.policy import ConstantPolicy
 from ml.population import PARTICIPANTS, run_sessions
 from ml.qoc import Margins, failed_qoc
@@ -110,8 +111,7 @@ def simulate(
     batch = run_sessions(code, controller, visits=visits, hours=hours, seeds=seeds, study_seed=studies, steps=steps)
     found = []
     for amplitude, outcome in zip(batch.amplitude, batch.outcomes, strict=True):
-        qoc = outcome.qoc
-        values = {"energy": float(np.mean(amplitude**2)), "grasp": qoc.grasp_hz, "rating": outcome.rating, "tremor": qoc.tremor_percent}
+        values = {"energy": float(np.mean(amplitude**2))} | {o.key: getattr(outcome.qoc, o.field) for o in OUTCOMES}
         found.append({name: float(value) for name, value in values.items() if value is not None})
     return found
 

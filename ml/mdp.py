@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -110,3 +111,9 @@ def end_reward(settings: MdpSettings, qoc: Qoc) -> float | None:
             return None
         total += outcome.end.weight(settings) * (float(value) / outcome.end.scale(settings))
     return total
+
+
+def end_rewards(settings: MdpSettings, qocs: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Compute `end_reward` of many sessions, [n], from their measured outcomes by `Outcome.field`, [n] each."""
+    parts = [o.end.weight(settings) * (qocs[o.field] / o.end.scale(settings)) for o in OUTCOMES if o.end is not None and o.field in qocs]
+    return np.asarray(sum(parts, np.zeros(())))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, make_dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.outcomes import OUTCOMES, Outcome
+from ml.outcomes import BY_FIELD, OUTCOMES, Outcome
 
 PLAUSIBLE_INTERVAL_S = (0.08, 3.0)
 """Intervals between open fists: faster is sensor bounce, slower is a pause and no grasp."""
@@ -44,6 +44,11 @@ class Qoc(_Values):
             value = getattr(self, outcome.field)
             if value is not None:
                 outcome.check(value)
+
+    @staticmethod
+    def from_numbers(values: Mapping[str, float | None]) -> Qoc:
+        """Make QoCs from numbers by `Outcome.field`, those of whole outcomes as integers."""
+        return Qoc(**{name: int(value) if value is not None and BY_FIELD[name].whole else value for name, value in values.items()})
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -125,8 +125,7 @@ def _difference(ours: SessionTrajectory, theirs: SessionTrajectory) -> str | Non
 
 
 def _outcomes(session: SessionTrajectory) -> np.ndarray[Any, np.dtype[np.float64]]:
-    qoc = session.qoc
-    return np.array([np.nan if v is None else v for v in (qoc.grasp_hz, qoc.rating, qoc.tremor_percent)], dtype=np.float64)
+    return np.array([np.nan if v is None else v for v in astuple(session.qoc)], dtype=np.float64)
 
 
 def _named(db: Session, participant: Participant, name: str, of: str | None) -> int | None:

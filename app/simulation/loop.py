@@ -161,7 +161,7 @@ class ParticipantLoop:
         db.expire_all()
         for row in slots.compare(db, visit, self.caller).rows:
             if row.line is not None and row.session is not None:
-                the_day.tremor(db, row.session, row.line.item, row.line.start_minute)
+                the_day.enter_missing(db, row.session, row.line.item, row.line.start_minute)
 
     def _learn(self, db: Session, person: Participant, number: int) -> None:
         """Run the job before a visit, the one already begun for it or a new one, and wait for its end."""

@@ -30,7 +30,7 @@ from app.tables.sessions import Controller, StudySession
 from app.tables.visits import Visit
 from ml.outcomes import BY_FIELD
 from ml.population import SimulatedSession, run_session
-from ml.population.outcomes import GRASP_TEST_S, Outcomes
+from ml.population.outcomes import GRASP_TEST_S, MEASURED, Outcomes
 
 RESOLUTION_MA = 0.1
 """What an RC+S delivers."""
@@ -93,13 +93,14 @@ class VisitDay:
         entry = {"uuid": str(_named(f"plan {plan_id}", "clinical_settings")), "kind": "clinical_settings", "device_time": at.isoformat()}
         self._send(db, plan_id, [entry])
 
-    def tremor(self, db: Session, session: StudySession, item: PlanItem, start_minute: float) -> None:
-        """Enter the tremor of a confirmed session, as the watch gave it; what is known already stays."""
-        if session.qoc is not None and session.qoc.value(BY_FIELD["tremor_percent"]) is not None:
+    def enter_missing(self, db: Session, session: StudySession, item: PlanItem, start_minute: float) -> None:
+        """Enter the outcomes of a confirmed session that its day does not take down, as the watch gave them; known ones stay."""
+        missing = [name for name in MEASURED if session.qoc is None or session.qoc.value(BY_FIELD[name]) is None]
+        if not missing:
             return
         # a session done before a stop is run again, on a tablet of its own: its time is before that of the day's
-        percent = self._run(db, item, start_minute, self.tablet / f"again-{item.position}").outcomes.qoc.tremor_percent
-        values = {"tremor_percent": percent, "sure": ["tremor_percent"], "reason": "as the simulated watch gave it"}
+        qoc = self._run(db, item, start_minute, self.tablet / f"again-{item.position}").outcomes.qoc
+        values = {name: getattr(qoc, name) for name in missing} | {"sure": missing, "reason": "as the simulated watch gave it"}
         changes.record_qoc(db, session, QocIn.model_validate(values), self.caller)
 
     def _run(self, db: Session, item: PlanItem, start_minute: float, tablet: Path) -> Held:
@@ -163,7 +164,7 @@ def _named(of: str, kind: str) -> UUID:
 def _entries(code: str, item: PlanItem, begins: dt.datetime, ended: dt.datetime, outcomes: Outcomes) -> list[dict[str, Any]]:
     """List the entries of the clinic day about one session: its times, rating and grasp test, and no side effects."""
     asked: list[tuple[str, Mapping[str, Any]]] = [
-        ("rating", {"value": outcomes.rating}),
+        ("rating", {"value": outcomes.qoc.rating}),
         ("grasp", _grasps(ended, outcomes)),
         *((kind, {"grade": "none"}) for kind in ("dyskinesia", "speech", "gait")),
         ("session_end", {}),

@@ -44,7 +44,7 @@ from benchmarks.support.looks import look, said
 from benchmarks.support.ope_cases import CDBS, virtual_case
 from benchmarks.support.results import run_benchmark
 from ml.designs import Hold, near_session
-from ml.mdp import step_reward
+from ml.mdp import end_rewards, step_reward
 from ml.ope.estimate import Estimate
 from ml.ope.posterior.estimator import FittedPosterior, build
 from ml.ope.posterior.further_sessions import MOST_HELD, Further, Place, further_sessions, session_noise, worth_exploring, worth_holding
@@ -56,7 +56,7 @@ from ml.policies.policy import ConstantPolicy, Policy
 from ml.population.virtual import WORLDS_PER_PART, World, visit_days, world
 from ml.population.virtual.sessions import Days
 from ml.population.virtual.world import STEPS, Part
-from ml.qoc import Margins, Qoc
+from ml.qoc import Margins
 from ml.statistics.bootstrap import percentile_interval
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
@@ -101,7 +101,6 @@ class Clinic:
             # the first sessions of cDBS are those that the tests are held against
             first = TESTED + 1000 * number + (10 * list(self.policies).index(CDBS) if controller == "cdbs" else 500) + place
             run = self.world.run(amplitudes[None], self._day(number, place), first)
-            qoc = Qoc(float(run.grasp_hz[0]), int(run.rating[0]), float(run.tremor_percent[0]))
             bound = s.bound if controller == "random" else None
             found.append(
                 SessionTrajectory(
@@ -111,7 +110,7 @@ class Clinic:
                     lead_beta=run.lead[0],
                     beta=run.beta[0],
                     amplitude=run.amplitude[0],
-                    qoc=qoc,
+                    qoc=run.qoc(0),
                     random_bound=bound,
                     holds=holds,
                 )
@@ -136,16 +135,9 @@ class Clinic:
         w, s = self.world, self.world.settings
         which = list(self.policies).index(name)
         run = w.run(self.policies[name], self._day(number, place), TESTED + 1000 * number + 10 * which + (place if name == CDBS else 0))
-        tremor = run.tremor_percent[0] / (100.0 if s.tremor_as_fraction else 1.0)
-        end = s.c2 * run.grasp_hz[0] + s.c3 * run.rating[0] - s.c4 * tremor
         steps = step_reward(s, run.beta[0], run.amplitude[0]) @ s.gamma ** np.arange(STEPS)
-        values = {
-            "return": float(steps + end),
-            "energy": float((run.amplitude**2).mean()),
-            "grasp_hz": float(run.grasp_hz[0]),
-            "rating": float(run.rating[0]),
-            "tremor_percent": float(run.tremor_percent[0]),
-        }
+        qocs = {field: float(of_sessions[0]) for field, of_sessions in run.qocs.items()}
+        values = {"return": float(steps + end_rewards(s, run.qocs)[0]), "energy": float((run.amplitude**2).mean()), **qocs}
         return TestSession(None if name == CDBS else name, number, values)
 
 

@@ -35,7 +35,7 @@ from ml.ope.posterior.verdict import Levels, verdict
 from ml.outcomes import PREDICTED
 from ml.population.virtual import WORLDS_PER_PART, DataDesign, World, world
 from ml.population.virtual.world import MARGINS, STEPS, VISITS, visit_plan
-from ml.qoc import Margins, Qoc
+from ml.qoc import Margins
 from ml.trajectories import ReplayBuffer
 
 TRUTH, QUICK_TRUTH, QUICK_WORLDS = 150, 40, 2
@@ -50,8 +50,7 @@ def without_answer(w: World, design: DataDesign) -> ReplayBuffer:
     for i, (session, row) in enumerate(zip(buffer.sessions, rows, strict=True)):
         own, cdbs = days.select(slice(i, i + 1)), np.ones((1, row.amplitudes.size))
         run = w.run(cdbs, own, UNANSWERED + i, row.amplitudes.size)
-        qoc = Qoc(float(run.grasp_hz[0]), int(run.rating[0]), float(run.tremor_percent[0]))
-        sessions.append(replace(session, beta=run.beta[0], lead_beta=run.lead[0], qoc=qoc))
+        sessions.append(replace(session, beta=run.beta[0], lead_beta=run.lead[0], qoc=run.qoc(0)))
     return replace(buffer, sessions=tuple(sessions))
 
 

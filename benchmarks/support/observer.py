@@ -15,6 +15,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.outcomes import PREDICTED
 from ml.policies.policy import ConstantPolicy, Policy
 from ml.population.virtual import World
 from ml.population.virtual.patient import MECHANISMS, Patient, draw_patient
@@ -78,7 +79,7 @@ def statistics(w: World, design: DataDesign, visits: int) -> Floats:
         n = row.amplitudes.size
         run = short if ends_early[i] else long
         shares = (above[i, :n].mean(), above[i, : n // 3].mean(), above[i, 2 * n // 3 : n].mean(), log_beta[i, :n].mean())
-        each.append([*shares, run.grasp_hz[i], run.rating[i], run.tremor_percent[i] / 100])
+        each.append([*shares, *(run.qocs[o.field][i] / p.percent for o, p in PREDICTED)])
     return np.concatenate([_by_bin(rows, np.array(each)), _answers(rows, log_beta)])
 
 

@@ -13,8 +13,7 @@ from ml.population.participants import PARTICIPANTS, ParticipantModel
 if TYPE_CHECKING:
     from ml.population.clinic import plan_day, random_controller_buffer, run_day
     from ml.population.device.folder import rcs_session_zip
-    from ml.population.sessions import SessionBatch, SimulatedSession, run_session, run_sessions
-    from ml.population.tables import grasps_csv, session_table_csv, strivepd_csv
+    from ml.population.sessions import SessionBatch, SimulatedSession, run_session, run_sessions, session_table_csv
     from ml.population.truth import TrueReturn, true_return
 
 _LAZY = {
@@ -26,9 +25,7 @@ _LAZY = {
     "SimulatedSession": "sessions",
     "run_session": "sessions",
     "run_sessions": "sessions",
-    "grasps_csv": "tables",
-    "session_table_csv": "tables",
-    "strivepd_csv": "tables",
+    "session_table_csv": "sessions",
     "TrueReturn": "truth",
     "true_return": "truth",
 }
@@ -39,7 +36,6 @@ __all__ = [
     "SessionBatch",
     "SimulatedSession",
     "TrueReturn",
-    "grasps_csv",
     "plan_day",
     "random_controller_buffer",
     "rcs_session_zip",
@@ -47,7 +43,6 @@ __all__ = [
     "run_session",
     "run_sessions",
     "session_table_csv",
-    "strivepd_csv",
     "true_return",
 ]
 

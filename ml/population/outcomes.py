@@ -18,6 +18,9 @@ TREMOR_CLASSES: Final = ("none", "slight", "mild", "moderate", "strong")
 TREMOR_BOUNDS: Final = (0.3, 1.0, 2.0, 3.2)  # assumed: mean severity of a minute at which the next class begins
 STEPS_PER_MINUTE: Final = 30
 
+MEASURED: Final = ("grasp_hz", "rating", "tremor_percent")
+"""Outcomes that a synthetic participant shows, by `Outcome.field`."""
+
 _GRASP_NOISE_HZ, _INTERVAL_CV, _DECREMENT = 0.12, 0.06, 0.01  # assumed
 _RATING_TOP, _RATING_BRADY, _RATING_TREMOR, _RATING_OVERLOAD, _RATING_CHANGE, _RATING_NOISE = 9.0, 3.0, 4.0, 3.0, 1.0, 0.5  # assumed
 _TREMOR_FULL = 2.5  # assumed: severity at which tremor costs its full share of the rating
@@ -29,13 +32,11 @@ class Outcomes:
 
     Attributes:
         open_fist_s: times of open fists in the 10 s test, [N], seconds from its start.
-        rating: 1-10.
         tremor_minutes: class of each minute, the last one possibly shorter.
-        qoc: the three QoCs by the paper's formulas.
+        qoc: the QoCs by the paper's formulas.
     """
 
     open_fist_s: NDArray[np.float64]
-    rating: int
     tremor_minutes: tuple[str, ...]
     qoc: Qoc
 
@@ -66,7 +67,7 @@ def measure(
     rating = int(min(max(round(score + _RATING_NOISE * g_rating), 1), 10))
     minutes = tremor_minutes(tremor)
     share = tremor_percent(minute_seconds(minutes, tremor.size), tremor.size * PERIOD_S)
-    return Outcomes(fists, rating, minutes, Qoc(grasp_frequency(fists), rating, share))
+    return Outcomes(fists, minutes, Qoc(**dict(zip(MEASURED, (grasp_frequency(fists), rating, share), strict=True))))
 
 
 def tremor_minutes(tremor: NDArray[np.float64]) -> tuple[str, ...]:

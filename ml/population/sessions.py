@@ -43,7 +43,7 @@ class SimulatedSession:
         lead_amplitude: amplitude fraction in force before step 0.
         bound: B of a random session, else None.
         lfp: 250 Hz, float32 mV, [(L + T) * 500], or None where it was not kept.
-        outcomes: open-fist times, rating, tremor minutes and QoCs.
+        outcomes: what was measured at the end, QoCs among it.
         hidden: what no device sees: `medication`, `activity`, `brady`, `tremor`, `overload`, each [T].
     """
 
@@ -70,21 +70,6 @@ class SimulatedSession:
     def qoc(self) -> Qoc:
         """End-of-session QoCs."""
         return self.outcomes.qoc
-
-    @property
-    def rating(self) -> int:
-        """Rating 1-10."""
-        return self.outcomes.rating
-
-    @property
-    def open_fist_s(self) -> Floats:
-        """Open-fist times of the grasp test, seconds from its start."""
-        return self.outcomes.open_fist_s
-
-    @property
-    def tremor_minutes(self) -> tuple[str, ...]:
-        """Tremor class of each minute."""
-        return self.outcomes.tremor_minutes
 
     def trajectory(self, session_id: int, policy_id: int | None = None) -> SessionTrajectory:
         """Convert the session to a trajectory of the MDP; the lead is the window before it."""
@@ -182,7 +167,7 @@ class Simulation:
             self._step(0, start, 1.0, self._no_lfp)
 
     def advance(self, amplitude: Floats, *, moving: bool = False, lfp: NDArray[np.float32] | None = None) -> dict[str, Floats]:
-        """Run one period of 2 s under `amplitude` [N]; `moving` while the grasp test lasts; `lfp` [N, 500] receives mV.
+        """Run one period of 2 s under `amplitude` [N]; `moving` while the hand is tested; `lfp` [N, 500] receives mV.
 
         Returns:
             `beta` (uV), `medication`, `activity`, `brady`, `tremor`, `overload`, each [N].
@@ -371,3 +356,17 @@ def _for_all(work: Callable[[slice], None], parts: Sequence[slice], pool: Thread
     results: list[Any] = [pool.submit(work, part) for part in parts]
     for result in results:
         result.result()
+
+
+def session_table_csv(session: SimulatedSession) -> bytes:
+    """Write columns `t_s,beta,amplitude_fraction`, one row per 2 s; beta in uV.
+
+    Row t_s = 2(k + 1) holds step k; rows with t_s <= 0 are the window before the session, the newest at 0.
+    """
+    lines = ["t_s,beta,amplitude_fraction"]
+    lead = session.lead_beta.size
+    for i, beta in enumerate(session.lead_beta):
+        lines.append(f"{PERIOD_S * (i - lead + 1):g},{float(beta)!r},{session.lead_amplitude!r}")
+    for k, (beta, amplitude) in enumerate(zip(session.beta, session.amplitude, strict=True)):
+        lines.append(f"{PERIOD_S * (k + 1):g},{float(beta)!r},{float(amplitude)!r}")
+    return ("\n".join(lines) + "\n").encode()

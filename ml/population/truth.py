@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -13,6 +14,7 @@ from ml.designs import DEFAULT_BOUND, Bound
 from ml.mdp import MdpSettings, end_reward, step_reward
 from ml.policies.policy import ConstantPolicy
 from ml.population.controllers import Controller
+from ml.population.outcomes import MEASURED
 from ml.population.participants import ParticipantModel, ReferenceBeta
 from ml.population.sessions import Floats, SessionBatch, run_sessions
 from ml.progress import Report, silent
@@ -35,7 +37,7 @@ class TrueReturn:
 
     Attributes:
         total: E[r_end + sum over t < steps of gamma^t r_t]. step_return, end_reward: its two parts.
-        energy: mean squared amplitude fraction. beta: mean P_beta in uV. grasp_hz, rating, tremor_percent: QoCs.
+        energy: mean squared amplitude fraction. beta: mean P_beta in uV. qocs: of each measured outcome, by `Outcome.field`.
         returns: total return of every session, [sessions].
         sessions, steps, seed: how it was measured; the same seed gives every controller the same days and the same noise.
     """
@@ -45,9 +47,7 @@ class TrueReturn:
     end_reward: Figure
     energy: Figure
     beta: Figure
-    grasp_hz: Figure
-    rating: Figure
-    tremor_percent: Figure
+    qocs: Mapping[str, Figure]
     returns: Floats
     sessions: int
     steps: int
@@ -109,9 +109,7 @@ def true_return(
         end_reward=_figure(ends),
         energy=_figure((batch.amplitude**2).mean(axis=1)),
         beta=_figure(batch.beta.mean(axis=1)),
-        grasp_hz=_figure([outcome.qoc.grasp_hz for outcome in batch.outcomes]),
-        rating=_figure([outcome.rating for outcome in batch.outcomes]),
-        tremor_percent=_figure([outcome.qoc.tremor_percent for outcome in batch.outcomes]),
+        qocs={name: _figure([getattr(o.qoc, name) for o in batch.outcomes]) for name in MEASURED},
         returns=returns,
         sessions=sessions,
         steps=steps,

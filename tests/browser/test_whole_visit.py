@@ -13,6 +13,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable
+from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from app.accounts import service as accounts
 from app.platform.database import transaction
 from app.tables.accounts import Role
 from ml.population import run_session
-from ml.population.tables import session_table_csv
+from ml.population.sessions import session_table_csv
 from tests.app.conftest import ended, worker
 from tests.browser.conftest import FLAGS, PASSWORD, Watched, kill_browser, program
 
@@ -113,7 +114,7 @@ def ranked(client: TestClient, participant_code: str, worker: None, ended: Calla
         of = {"participant": participant_code, "visit": "1", "controller": controller}
         sent = client.post("/api/v1/uploads", data=of, files={"file": (f"{k}.csv", session_table_csv(held))})
         assert sent.status_code == 201, sent.text
-        qoc = {"grasp_hz": held.qoc.grasp_hz, "rating": held.rating, "tremor_percent": held.qoc.tremor_percent}
+        qoc = asdict(held.qoc)
         client.put(f"/api/v1/sessions/{sent.json()['sessions'][0]['id']}/qoc", json=qoc)
     job = client.post(f"/api/v1/participants/{participant_code}/jobs", json={"kind": "pipeline", "count": 2, **SMALL})
     done = ended(job.json()["id"], 400)

@@ -27,6 +27,7 @@ from app.simulation.demo.data import REPEATS, SESSION_MINUTES, WASHOUT_MINUTES, 
 from app.simulation.demo.loader import Door, LoadFailed, State, Step, follow, run_all, show
 from app.simulation.demo.study import DemoSession, characteristics_body, demo_visits, participant_body, trajectories
 from app.study import repository as study
+from ml.outcomes import FIELDS
 from ml.population import PARTICIPANTS
 from ml.trajectories import ReplayBuffer
 
@@ -133,7 +134,7 @@ class Participant:
             self.people.admin.put(f"/sessions/{stored}/conditions", conditions)
 
     def _outcomes(self, session_id: int, qoc: dict[str, Any]) -> None:
-        self.people.admin.put(f"/sessions/{session_id}/qoc", qoc | {"sure": ["grasp_hz", "rating", "tremor_percent"]})
+        self.people.admin.put(f"/sessions/{session_id}/qoc", qoc | {"sure": list(FIELDS)})
 
     def _recorded(self, session: RecordedSession) -> None:
         """Upload a session of a visit with policies, as recorded when the files were made."""

@@ -30,8 +30,10 @@ from app.simulation.demo.data import DAY_WITH_POLICIES, Generation, LearnedPolic
 from app.simulation.demo.study import trajectories
 from ml.mdp import MdpSettings
 from ml.ope import PosteriorGain, Tests, TestSession, differences_to_cdbs, gains_over_cdbs, spread_of_random
+from ml.outcomes import OUTCOMES
 from ml.policies.onnx_policy import OnnxPolicy
 from ml.population import PARTICIPANTS, run_session
+from ml.population.outcomes import MEASURED
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet
 
 HIDDEN = [40, 30]
@@ -251,7 +253,7 @@ class _Participant:
                 tested.sessions += 1
             self.say(
                 f"{self.code} visit {visit}: {one.policy or one.controller}, energy {np.mean((ma / model.cdbs_amplitude_ma) ** 2):.2f}, "
-                f"grasp {ran.qoc.grasp_hz:.2f} Hz, rating {ran.qoc.rating}, tremor {ran.qoc.tremor_percent:.0f} %"
+                f"{', '.join(f'{o.noun} {getattr(ran.qoc, o.field):.3g} {o.entry_unit}' for o in OUTCOMES if o.field in MEASURED)}"
             )
 
     def _tests(self, buffer: ReplayBuffer) -> Tests:

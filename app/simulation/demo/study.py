@@ -104,8 +104,7 @@ class DemoSession:
 
     def qoc(self) -> dict[str, Any]:
         """Return the end-of-session QoCs for the REST interface."""
-        qoc = self.simulated.qoc
-        return {"grasp_hz": qoc.grasp_hz, "rating": qoc.rating, "tremor_percent": qoc.tremor_percent}
+        return asdict(self.simulated.qoc)
 
 
 @dataclass(frozen=True)

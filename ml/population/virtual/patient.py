@@ -6,9 +6,13 @@ All sizes are assumed; nothing here is fitted to a person. `equations`, which is
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
 
 PERIOD_S: Final = 2.0
 
@@ -24,6 +28,10 @@ BURSTS, VOLATILITY, HYSTERESIS, DELAYED, REGIMES, TOLERANCE, OSCILLATOR = range(
 LINE, HILL, THRESHOLD, U_SHAPE = range(4)
 NO_TREMOR, GRADED_TREMOR, EPISODIC_TREMOR = range(3)
 MEAN_RATING, LATE_RATING, PEAK_END_RATING = range(3)
+
+STEPS_PER_MINUTE, GRASP_STEPS, LATE_STEPS = 30, 5, 60
+MILD = 1.0
+"""Mean severity of a minute from which its tremor counts as mild."""
 
 
 class Patient(NamedTuple):
@@ -275,3 +283,52 @@ def draw_patient(kind: int, rng: np.random.Generator) -> Patient:
         rating_scale=uniform(0.5, 1.1),
         rating_noise=uniform(0.3, 0.8),
     )
+
+
+def faint_outcomes(patient: Patient, uniform: Callable[[float, float], float]) -> dict[str, Any]:
+    """Draw constants with which outcomes answer less to symptoms and vary more, as changes of a patient."""
+    return {
+        "grasp_low": patient.grasp_high - uniform(0.3, 0.6),
+        "grasp_noise": uniform(0.15, 0.3),
+        "rating_scale": uniform(0.3, 0.6),
+        "rating_noise": uniform(0.7, 1.2),
+    }
+
+
+def minute_means(values: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Average values of every step [n, T] over minutes, [n, M], and count the steps of each minute, [M]."""
+    starts = np.arange(0, values.shape[1], STEPS_PER_MINUTE)
+    lengths = np.diff(np.append(starts, values.shape[1]))
+    return np.asarray(np.add.reduceat(values, starts, axis=1) / lengths), lengths
+
+
+def measured_qocs(patient: Patient, noise: Floats, amplitude: Floats, brady: Floats, tremor: Floats, overload: Floats) -> dict[str, Floats]:
+    """Compute the measured outcomes of sessions by `Outcome.field`, [n] each.
+
+    Args:
+        noise: standard normals, errors of grasp and rating, [n, 2].
+        amplitude, brady, tremor, overload: amplitude fraction and symptoms, [n, T].
+    """
+    late = brady[:, -GRASP_STEPS:].mean(axis=1)
+    grasp = patient.grasp_high - (patient.grasp_high - patient.grasp_low) * late + patient.grasp_noise * noise[:, 0]
+    complaint = 3.0 * brady + 4.0 * np.minimum(tremor / 2.5, 1.0) + 3.0 * patient.side * overload
+    felt = _rated_complaint(patient.rating_form, complaint, minute_means(complaint)[0])
+    felt += np.abs(np.diff(amplitude, axis=1)).mean(axis=1)
+    score = patient.rating_top - patient.rating_scale * felt + patient.rating_noise * noise[:, 1]
+    of_minute, lengths = minute_means(tremor)
+    counted = of_minute >= MILD
+    return {
+        "grasp_hz": np.clip(grasp, 0.1, 4.5),
+        "rating": np.clip(np.round(score), 1, 10),
+        "tremor_percent": 100 * (counted @ lengths) / tremor.shape[1],
+    }
+
+
+def _rated_complaint(form: int, complaint: Floats, minutes: Floats) -> Floats:
+    """Summarise the complaint that a rating follows, [n], from that of every step, [n, T], and of every minute, [n, M]; see
+    `RATINGS`."""
+    if form == LATE_RATING:
+        return np.asarray(complaint[:, -LATE_STEPS:].mean(axis=1))
+    if form == PEAK_END_RATING:
+        return np.asarray((minutes.max(axis=1) + minutes[:, -1]) / 2)
+    return np.asarray(complaint.mean(axis=1))

@@ -7,6 +7,7 @@ the same noise: differences of true returns have small errors.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -16,14 +17,8 @@ from numpy.typing import NDArray
 from ml.policies.policy import Policy
 from ml.population.virtual import _kernel, equations
 from ml.population.virtual.equations import CONSTANTS, GAIN, HALF, HOUR, LEVEL, NEED, NOISES, NORMALS, STATES, U_BOUT, UNIFORMS
-from ml.population.virtual.patient import (
-    HYSTERESIS,
-    LATE_RATING,
-    OSCILLATOR,
-    PEAK_END_RATING,
-    TOLERANCE,
-    Patient,
-)  # fmt: skip
+from ml.population.virtual.patient import HYSTERESIS, OSCILLATOR, TOLERANCE, Patient, measured_qocs, minute_means
+from ml.qoc import Qoc
 
 Floats = NDArray[np.float64]
 Symptom = Literal["brady", "tremor", "overload"]
@@ -32,11 +27,8 @@ WARM_STEPS: Final = 30
 """Steps under cDBS before step 0; the last of them are the session's lead."""
 
 HOURS_OF_A_VISIT: Final = 2.0
-STEPS_PER_MINUTE, GRASP_STEPS, LATE_STEPS = 30, 5, 60
 OWN_NORMALS: Final = 5
-"""Normals of a session: its level, its first drift and activity, and the errors of grasp and rating."""
-MILD = 1.0
-"""Mean severity of a minute from which its tremor counts as mild."""
+"""Normals of a session: its level, its first drift and activity, and the two errors of `measured_qocs`."""
 
 _DAY_STREAM, _NORMAL_STREAM, _OWN_STREAM, _UNIFORM_STREAM, _BOUT_STREAM = 1, 2, 3, 4, 5
 
@@ -78,7 +70,7 @@ class Sessions:
 
     Attributes:
         lead: beta before step 0 under cDBS, [n, W]. beta, amplitude: [n, T]. brady, tremor, overload: symptoms, [n, T].
-        grasp_hz, rating, tremor_percent: QoCs, [n].
+        qocs: measured outcomes by `Outcome.field`, [n] each.
     """
 
     lead: Floats
@@ -87,20 +79,15 @@ class Sessions:
     brady: Floats
     tremor: Floats
     overload: Floats
-    grasp_hz: Floats
-    rating: Floats
-    tremor_percent: Floats
+    qocs: Mapping[str, Floats]
+
+    def qoc(self, i: int) -> Qoc:
+        """Return the QoCs of session i."""
+        return Qoc.from_numbers({name: float(values[i]) for name, values in self.qocs.items()})
 
     def by_minute(self, symptom: Symptom) -> Floats:
         """Average a symptom over each minute, [n, M]; the last minute may be shorter. The QoCs of the session follow from these."""
         return minute_means({"brady": self.brady, "tremor": self.tremor, "overload": self.overload}[symptom])[0]
-
-
-def minute_means(values: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Average values of every step [n, T] over minutes, [n, M], and count the steps of each minute, [M]."""
-    starts = np.arange(0, values.shape[1], STEPS_PER_MINUTE)
-    lengths = np.diff(np.append(starts, values.shape[1]))
-    return np.asarray(np.add.reduceat(values, starts, axis=1) / lengths), lengths
 
 
 def simulate(
@@ -148,8 +135,9 @@ def simulate(
             equations.step(patient, xi, constants, state, amplitude, k, noise, (beta, brady, tremor, overload))
         else:
             _kernel.advance(patient, xi, constants, state, amplitude, k, noise, beta, brady, tremor, overload)
-    run = [values[:, WARM_STEPS:] for values in (beta, amplitude, brady, tremor, overload)]
-    return Sessions(beta[:, WARM_STEPS - window : WARM_STEPS], *run, *quality(patient, own[:, -2:], *run[1:]))
+    lead, of_run = beta[:, WARM_STEPS - window : WARM_STEPS], (slice(None), slice(WARM_STEPS, None))
+    run, symptoms = (beta[of_run], amplitude[of_run]), (brady[of_run], tremor[of_run], overload[of_run])
+    return Sessions(lead, *run, *symptoms, measured_qocs(patient, own[:, -2:], run[1], *symptoms))
 
 
 def session_constants(patient: Patient, days: Days, own: Floats) -> Floats:
@@ -161,30 +149,6 @@ def session_constants(patient: Patient, days: Days, own: Floats) -> Floats:
     result[:, NEED] = patient.day_need * days.effects[:, 3]
     result[:, HOUR] = days.hours
     return result
-
-
-def quality(patient: Patient, noise: Floats, amplitude: Floats, brady: Floats, tremor: Floats, overload: Floats) -> tuple[Floats, ...]:
-    """Compute grasp frequency (Hz), rating (1-10) and tremor (%) of sessions from their symptoms, [n, T] each; `noise` [n, 2] standard
-    normals."""
-    late = brady[:, -GRASP_STEPS:].mean(axis=1)
-    grasp = patient.grasp_high - (patient.grasp_high - patient.grasp_low) * late + patient.grasp_noise * noise[:, 0]
-    complaint = 3.0 * brady + 4.0 * np.minimum(tremor / 2.5, 1.0) + 3.0 * patient.side * overload
-    felt = _rated_complaint(patient.rating_form, complaint, minute_means(complaint)[0])
-    felt += np.abs(np.diff(amplitude, axis=1)).mean(axis=1)
-    score = patient.rating_top - patient.rating_scale * felt + patient.rating_noise * noise[:, 1]
-    of_minute, lengths = minute_means(tremor)
-    counted = of_minute >= MILD
-    return np.clip(grasp, 0.1, 4.5), np.clip(np.round(score), 1, 10), 100 * (counted @ lengths) / tremor.shape[1]
-
-
-def _rated_complaint(form: int, complaint: Floats, minutes: Floats) -> Floats:
-    """Summarise the complaint that a rating follows, [n], from that of every step, [n, T], and of every minute, [n, M]; see
-    `patient.RATINGS`."""
-    if form == LATE_RATING:
-        return np.asarray(complaint[:, -LATE_STEPS:].mean(axis=1))
-    if form == PEAK_END_RATING:
-        return np.asarray((minutes.max(axis=1) + minutes[:, -1]) / 2)
-    return np.asarray(complaint.mean(axis=1))
 
 
 def _stream(key: int, stream: int, number: int) -> np.random.Generator:

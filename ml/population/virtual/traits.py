@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ml.population.virtual.patient import HILL, LATE_RATING, PEAK_END_RATING, THRESHOLD, U_SHAPE, Patient, drawn_rate
+from ml.population.virtual.patient import HILL, LATE_RATING, PEAK_END_RATING, THRESHOLD, U_SHAPE, Patient, drawn_rate, faint_outcomes
 
 Changes = dict[str, Any]
 
@@ -95,10 +95,7 @@ def _faint(p: Patient, u: _Draws) -> Changes:
         "noise": u(0.15, 0.3),
         "ar": u(0.3, 0.8),
         "session_level": u(0.05, 0.15),
-        "grasp_low": p.grasp_high - u(0.3, 0.6),
-        "grasp_noise": u(0.15, 0.3),
-        "rating_scale": u(0.3, 0.6),
-        "rating_noise": u(0.7, 1.2),
+        **faint_outcomes(p, u),
     }
 
 

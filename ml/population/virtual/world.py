@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.designs import DesignSettings, Hold, lay_out
-from ml.mdp import MdpSettings, step_reward
+from ml.mdp import MdpSettings, end_rewards, step_reward
 from ml.outcomes import PREDICTED
 from ml.policies.policy import ConstantPolicy, Policy, ProportionalPolicy
 from ml.population.virtual.candidates import draw_candidates, draw_following
@@ -25,7 +25,7 @@ from ml.population.virtual.following import Worth, deal, with_change, with_worth
 from ml.population.virtual.patient import MECHANISMS, Patient, draw_patient
 from ml.population.virtual.sessions import Days, Sessions, new_days, simulate, visit_days
 from ml.population.virtual.traits import TRAITS, with_trait
-from ml.qoc import Margins, Qoc
+from ml.qoc import Margins
 from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 Floats = NDArray[np.float64]
@@ -76,7 +76,7 @@ class Truth:
 
     Attributes:
         total: E[r_end + sum over t < H of gamma^t r_t]. step_return, end_reward: its parts. energy: mean squared amplitude fraction.
-        amplitude: mean fraction. beta: mean, uV. grasp_hz, rating, tremor_percent: QoCs.
+        amplitude: mean fraction. beta: mean, uV. qocs: of each measured outcome, by `Outcome.field`.
         returns: total return of every session, [n]; session i of two policies has the same day and noise.
     """
 
@@ -86,14 +86,12 @@ class Truth:
     energy: Mean
     amplitude: Mean
     beta: Mean
-    grasp_hz: Mean
-    rating: Mean
-    tremor_percent: Mean
+    qocs: Mapping[str, Mean]
     returns: Floats
 
     def to_json(self) -> dict[str, Any]:
         """Return means and standard errors by name, and the standard deviation of returns between sessions."""
-        named = {k: list(v) for k, v in vars(self).items() if isinstance(v, Mean)}
+        named = {k: list(v) for k, v in (vars(self) | dict(self.qocs)).items() if isinstance(v, Mean)}
         return named | {"returns_sd": float(self.returns.std(ddof=1))}
 
 
@@ -143,7 +141,6 @@ class World:
         for i, row in enumerate(rows):
             own = days.select(slice(i, i + 1))
             run = self.run(row.amplitudes[None, :], own, _DATA + 4096 * seed + i, row.amplitudes.size)
-            qoc = Qoc(float(run.grasp_hz[0]), int(run.rating[0]), float(run.tremor_percent[0]))
             bound = self.settings.bound if row.controller == "random" else None
             sessions.append(
                 SessionTrajectory(
@@ -153,7 +150,7 @@ class World:
                     lead_beta=run.lead[0],
                     beta=run.beta[0],
                     amplitude=run.amplitude[0],
-                    qoc=qoc,
+                    qoc=run.qoc(0),
                     random_bound=bound,
                     holds=row.holds,
                     medication_h=self.medication_h(row.hour),
@@ -271,7 +268,7 @@ def make_up(part: str, population: Population = 1) -> list[tuple[int, str | None
 def _truth(settings: MdpSettings, run: Sessions) -> Truth:
     discount = settings.gamma ** np.arange(run.beta.shape[1])
     steps = (step_reward(settings, run.beta, run.amplitude) * discount).sum(axis=1)
-    ends = end_rewards(settings, run.grasp_hz, run.rating, run.tremor_percent)
+    ends = end_rewards(settings, run.qocs)
     return Truth(
         total=Mean.of(steps + ends),
         step_return=Mean.of(steps),
@@ -279,22 +276,14 @@ def _truth(settings: MdpSettings, run: Sessions) -> Truth:
         energy=Mean.of((run.amplitude**2).mean(axis=1)),
         amplitude=Mean.of(run.amplitude.mean(axis=1)),
         beta=Mean.of(run.beta.mean(axis=1)),
-        grasp_hz=Mean.of(run.grasp_hz),
-        rating=Mean.of(run.rating),
-        tremor_percent=Mean.of(run.tremor_percent),
+        qocs={name: Mean.of(values) for name, values in run.qocs.items()},
         returns=steps + ends,
     )
 
 
-def end_rewards(settings: MdpSettings, grasp_hz: Floats, rating: Floats, tremor_percent: Floats) -> Floats:
-    """Compute `ml.mdp.end_reward` of many sessions, [n]."""
-    tremor = tremor_percent / 100 if settings.tremor_as_fraction else tremor_percent
-    return np.asarray(settings.c2 * grasp_hz + settings.c3 * rating - settings.c4 * tremor)
-
-
 def within_margins(policy: Truth, cdbs: Truth) -> bool:
     """Decide whether no predicted outcome is truly worse than under cDBS by more than its margin."""
-    return all(o.slack(getattr(policy, o.field).value, getattr(cdbs, o.field).value, MARGINS.of(o)) >= 0 for o, _ in PREDICTED)
+    return all(o.slack(policy.qocs[o.field].value, cdbs.qocs[o.field].value, MARGINS.of(o)) >= 0 for o, _ in PREDICTED)
 
 
 def simple_policies(settings: MdpSettings, spread: float) -> dict[str, Policy]:

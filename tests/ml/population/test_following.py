@@ -23,10 +23,10 @@ from ml.population.virtual import (
     worth_of_following,
 )
 from ml.population.virtual.following import deal, with_change, with_worth, without_answer
-from ml.population.virtual.sessions import MILD
+from ml.population.virtual.patient import MILD
 from ml.population.virtual.world import visit_plan
 
-FIELDS = ("lead", "beta", "brady", "tremor", "overload", "grasp_hz", "rating", "tremor_percent")
+FIELDS = ("lead", "beta", "brady", "tremor", "overload")
 
 
 def patient_with(worth, seed=0, kind=0):
@@ -42,6 +42,8 @@ def test_the_kernel_has_bouts_as_the_equations_do(kind, worth):
     fast, read = (simulate(patient, 1.2, follow, days=days, key=3, steps=90, readable=r) for r in (False, True))
     for field in FIELDS:
         np.testing.assert_allclose(getattr(fast, field), getattr(read, field), rtol=1e-9, atol=1e-9, err_msg=field)
+    for name, values in fast.qocs.items():
+        np.testing.assert_allclose(values, read.qocs[name], rtol=1e-9, atol=1e-9, err_msg=name)
 
 
 def test_bouts_have_their_duty_and_length_and_move_beta_by_what_they_say():
@@ -85,8 +87,8 @@ def test_symptoms_that_do_not_answer_are_the_same_at_any_dose():
     patient = without_answer(patient_with("pays"))
     low, full = (simulate(patient, 1.0, ConstantPolicy(a), days=new_days(2, 0, 50), key=2, steps=60) for a in (0.3, 1.0))
     np.testing.assert_array_equal(low.brady, full.brady)
-    np.testing.assert_array_equal(low.rating, full.rating)
-    np.testing.assert_array_equal(low.tremor_percent, full.tremor_percent)
+    np.testing.assert_array_equal(low.qocs["rating"], full.qocs["rating"])
+    np.testing.assert_array_equal(low.qocs["tremor_percent"], full.qocs["tremor_percent"])
 
 
 def test_outcomes_follow_from_minutes():
@@ -94,7 +96,7 @@ def test_outcomes_follow_from_minutes():
     minutes = run.by_minute("tremor")
     assert minutes.shape == (20, 3)
     np.testing.assert_allclose(minutes[:, 2], run.tremor[:, 60:].mean(1))
-    np.testing.assert_allclose(run.tremor_percent, 100 * ((minutes >= MILD) @ np.array([30, 30, 15])) / 75)
+    np.testing.assert_allclose(run.qocs["tremor_percent"], 100 * ((minutes >= MILD) @ np.array([30, 30, 15])) / 75)
 
 
 def test_an_inverse_controller_gives_least_where_the_other_gives_most():

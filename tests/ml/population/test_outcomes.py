@@ -19,12 +19,12 @@ def test_qocs_follow_the_papers_formulas_over_what_was_measured(constant_session
     batch = constant_sessions("P3", 0.25)
     for i in range(len(batch)):
         session = batch.session(i)
-        assert session.qoc.grasp_hz == grasp_frequency(session.open_fist_s)
-        seconds = minute_seconds(session.tremor_minutes, session.steps)
+        assert session.qoc.grasp_hz == grasp_frequency(session.outcomes.open_fist_s)
+        seconds = minute_seconds(session.outcomes.tremor_minutes, session.steps)
         assert session.qoc.tremor_percent == tremor_percent(seconds, 2.0 * session.steps)
-        assert session.open_fist_s[-1] <= 10
-        assert np.all(np.diff(session.open_fist_s) > 0.08)
-        assert session.rating in range(1, 11)
+        assert session.outcomes.open_fist_s[-1] <= 10
+        assert np.all(np.diff(session.outcomes.open_fist_s) > 0.08)
+        assert session.qoc.rating in range(1, 11)
 
 
 @pytest.mark.slow
@@ -42,7 +42,7 @@ def test_a_rating_falls_by_the_mean_change_of_amplitude():
     ratings = []
     for amplitude in (flat, jumping):
         counters = seed_streams(np.arange(400, dtype=np.uint64), np.ones(400, dtype=np.uint64))
-        ratings.append(np.mean([measure(PARTICIPANTS["P1"], row, amplitude, brady, none, none).rating for row in counters]))
+        ratings.append(np.mean([measure(PARTICIPANTS["P1"], row, amplitude, brady, none, none).qoc.rating for row in counters]))
     assert ratings[0] == pytest.approx(9 - 3 * 0.5, abs=0.1)
     assert ratings[0] - ratings[1] == pytest.approx(0.6, abs=0.1)
 
@@ -50,5 +50,5 @@ def test_a_rating_falls_by_the_mean_change_of_amplitude():
 def test_overload_and_tremor_lower_the_rating_to_no_less_than_1():
     counters = seed_streams(np.arange(2, dtype=np.uint64), np.ones(2, dtype=np.uint64))
     calm, bad = np.zeros(30), np.full(30, 5.0)
-    assert measure(PARTICIPANTS["P4"], counters[0], calm, calm, calm, calm).rating >= 8
-    assert measure(PARTICIPANTS["P4"], counters[1], calm, np.ones(30), bad, bad).rating == 1
+    assert measure(PARTICIPANTS["P4"], counters[0], calm, calm, calm, calm).qoc.rating >= 8
+    assert measure(PARTICIPANTS["P4"], counters[1], calm, np.ones(30), bad, bad).qoc.rating == 1

@@ -126,5 +126,5 @@ def test_end_rewards_separate_amplitudes_over_the_whole_range(code, returns):
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("code", list(PARTICIPANTS))
 def test_cdbs_is_rated_less_than_a_point_below_the_best_constant(code, returns):
-    ratings = {a: t.rating.mean for a, t in returns[code]["constant"].items()}
+    ratings = {a: t.qocs["rating"].mean for a, t in returns[code]["constant"].items()}
     assert 0 <= max(ratings.values()) - ratings[1.0] < 0.7, ratings

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ml.mdp import MdpSettings, end_reward
+from ml.mdp import MdpSettings, end_reward, end_rewards
 from ml.policies.policy import ConstantPolicy, ProportionalPolicy
 from ml.population.virtual import (
     MECHANISMS,
@@ -26,12 +26,11 @@ from ml.population.virtual import (
     world,
 )
 from ml.population.virtual.equations import dose
-from ml.population.virtual.patient import HILL, LINE, THRESHOLD, U_SHAPE
-from ml.population.virtual.sessions import quality
-from ml.population.virtual.world import end_rewards, make_up, visit_plan
+from ml.population.virtual.patient import HILL, LINE, THRESHOLD, U_SHAPE, measured_qocs
+from ml.population.virtual.world import make_up, visit_plan
 from ml.qoc import Qoc, tremor_percent
 
-FIELDS = ("lead", "beta", "amplitude", "brady", "tremor", "overload", "grasp_hz", "rating", "tremor_percent")
+FIELDS = ("lead", "beta", "amplitude", "brady", "tremor", "overload")
 FOLLOWING = ProportionalPolicy(0.6, 1.8, 0.2, 3)
 
 
@@ -57,6 +56,8 @@ def test_the_kernel_gives_the_numbers_of_the_equations(kind, seed):
     fast, read = (simulate(patient, 1.2, FOLLOWING, days=days, key=3, steps=120, readable=r) for r in (False, True))
     for field in FIELDS:
         np.testing.assert_allclose(getattr(fast, field), getattr(read, field), rtol=1e-9, atol=1e-9, err_msg=field)
+    for name, values in fast.qocs.items():
+        np.testing.assert_allclose(values, read.qocs[name], rtol=1e-9, atol=1e-9, err_msg=name)
 
 
 @pytest.mark.parametrize("kind", range(len(MECHANISMS)))
@@ -67,7 +68,7 @@ def test_a_session_is_the_same_alone_in_a_batch_and_at_its_beginning(kind):
     longer = simulate(patient, 1.0, FOLLOWING, days=days, key=4, steps=90)
     np.testing.assert_array_equal(together.beta[3], alone.beta[0])
     np.testing.assert_array_equal(together.beta, longer.beta[:, :60])
-    assert together.rating[3] == alone.rating[0]
+    assert together.qocs["rating"][3] == alone.qocs["rating"][0]
 
 
 @pytest.mark.parametrize("shape", [LINE, HILL, THRESHOLD])
@@ -157,7 +158,8 @@ def test_qocs_follow_the_formulas_of_the_paper():
     rng = np.random.default_rng(0)
     tremor = rng.uniform(0, 2, (n, steps))
     tremor[0] = 0.5
-    grasp, rating, share = quality(patient, np.zeros((n, 2)), np.ones((n, steps)), np.full((n, steps), 0.5), tremor, np.zeros((n, steps)))
+    half, none = np.full((n, steps), 0.5), np.zeros((n, steps))
+    grasp, rating, share = measured_qocs(patient, np.zeros((n, 2)), np.ones((n, steps)), half, tremor, none).values()
     assert grasp == pytest.approx((patient.grasp_low + patient.grasp_high) / 2)
     for i in range(n):
         minutes = [tremor[i, :30], tremor[i, 30:60], tremor[i, 60:]]
@@ -170,8 +172,8 @@ def test_qocs_follow_the_formulas_of_the_paper():
 def test_a_rating_goes_by_the_session_by_its_end_or_by_its_worst_and_last_minute(form, expected):
     patient = quiet(rating_form=RATINGS.index(form), rating_top=9.0, rating_scale=1.0, rating_noise=0.0, side=0.0)
     brady = np.repeat([[0.0, 0.0, 0.5, 1.0, 0.5]], 30, axis=1)
-    _, rating, _ = quality(patient, np.zeros((1, 2)), np.ones((1, 150)), brady, np.zeros((1, 150)), np.zeros((1, 150)))
-    assert rating == np.round(expected)
+    found = measured_qocs(patient, np.zeros((1, 2)), np.ones((1, 150)), brady, np.zeros((1, 150)), np.zeros((1, 150)))
+    assert found["rating"] == np.round(expected)
 
 
 def test_an_artefact_raises_the_sensed_beta_and_no_symptom():
@@ -220,7 +222,7 @@ def test_end_rewards_of_many_sessions_are_those_of_each():
     settings = MdpSettings(xi_beta=1.0, c2=3.0, c3=2.0, c4=5.0)
     grasp, rating, tremor = np.array([1.5, 2.5]), np.array([3.0, 9.0]), np.array([0.0, 62.5])
     each = [end_reward(settings, Qoc(float(g), int(r), float(t))) for g, r, t in zip(grasp, rating, tremor, strict=True)]
-    np.testing.assert_allclose(end_rewards(settings, grasp, rating, tremor), each)
+    np.testing.assert_allclose(end_rewards(settings, {"grasp_hz": grasp, "rating": rating, "tremor_percent": tremor}), each)
 
 
 def test_a_relay_has_two_amplitudes_and_remembers_within_its_window():
@@ -277,7 +279,7 @@ def test_the_truth_is_the_mean_of_logged_returns():
     truth = w.truth(ConstantPolicy(0.7), 200)
     other = simulate(w.patient, w.settings.xi_beta, ConstantPolicy(0.7), days=new_days(w.key, 5000, 200), key=w.key, first=5000)
     rewards = np.where(other.beta < w.settings.xi_beta, 0.0, -1.0) - 0.3 * 0.7
-    returns = rewards @ w.settings.gamma ** np.arange(300) + end_rewards(w.settings, other.grasp_hz, other.rating, other.tremor_percent)
+    returns = rewards @ w.settings.gamma ** np.arange(300) + end_rewards(w.settings, other.qocs)
     error = np.hypot(truth.total.standard_error, returns.std(ddof=1) / np.sqrt(200))
     assert abs(truth.total.value - returns.mean()) < 4 * error
     assert truth.energy.value == pytest.approx(0.49)
@@ -300,7 +302,7 @@ def test_silent_beta_does_not_answer_while_symptoms_do():
     full, off = (w.truth(ConstantPolicy(a), 200) for a in (1.0, 0.0))
     assert not w.patient.beta_answers
     assert abs(full.beta.value - off.beta.value) < 0.06 * full.beta.value
-    assert off.grasp_hz.value < full.grasp_hz.value - 0.3
+    assert off.qocs["grasp_hz"].value < full.qocs["grasp_hz"].value - 0.3
 
 
 def test_a_responder_needs_both_the_margins_and_the_energy():
@@ -311,9 +313,10 @@ def test_a_responder_needs_both_the_margins_and_the_energy():
     assert not is_responder({"off": off}, cdbs)
     saving = replace(cdbs, energy=Mean(0.8 * cdbs.energy.value, 0.0))
     assert is_responder({"saving": saving}, cdbs)
-    assert not is_responder({"slow": replace(saving, grasp_hz=Mean(0.89 * cdbs.grasp_hz.value, 0.0))}, cdbs)
-    assert not is_responder({"trembling": replace(saving, tremor_percent=Mean(cdbs.tremor_percent.value + 11, 0.0))}, cdbs)
-    assert not is_responder({"unwell": replace(saving, rating=Mean(cdbs.rating.value - 1.1, 0.0))}, cdbs)
+    at = {name: mean.value for name, mean in cdbs.qocs.items()}
+    for worse in ({"grasp_hz": 0.89 * at["grasp_hz"]}, {"tremor_percent": at["tremor_percent"] + 11}, {"rating": at["rating"] - 1.1}):
+        qocs = {**cdbs.qocs, **{name: Mean(value, 0.0) for name, value in worse.items()}}
+        assert not is_responder({"worse": replace(saving, qocs=qocs)}, cdbs)
 
 
 def test_visits_share_a_day_and_new_days_do_not():

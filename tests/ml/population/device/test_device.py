@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from ml.policies.policy import ConstantPolicy
-from ml.population import PARTICIPANTS, rcs_session_zip, run_session, run_sessions, session_table_csv, strivepd_csv
+from ml.population import PARTICIPANTS, rcs_session_zip, run_session, run_sessions, session_table_csv
 from ml.population.device.settings import COUNTS_PER_VOLT, GAIN
-from ml.population.tables import grasps_csv
 
 START = 1_600_000_000_000
 FILES = {
@@ -205,14 +204,3 @@ def test_the_step_table_puts_the_window_before_the_session_at_times_up_to_0(sess
     assert np.array_equal(rows[:, 1], np.concatenate([sessions[0].lead_beta, sessions[0].beta]))
     assert np.array_equal(rows[10:, 2], sessions[0].amplitude)
     assert np.all(rows[:10, 2] == 1)
-
-
-def test_tremor_and_grasp_exports_hold_what_was_measured(sessions):
-    header, *rows = strivepd_csv(sessions[1], started_ms=START).decode().splitlines()
-    assert len(rows) == len(sessions[1].tremor_minutes)
-    for row, name in zip(rows, sessions[1].tremor_minutes, strict=True):
-        cells = dict(zip(header.split(","), row.split(","), strict=True))
-        assert float(cells.pop(name)) == 1
-        assert sum(float(v) for k, v in cells.items() if k != "time") == 0
-    times = [float(line) for line in grasps_csv(sessions[0]).decode().splitlines()[1:]]
-    assert times == pytest.approx(sessions[0].open_fist_s)

@@ -132,10 +132,11 @@ def test_a_session_is_bit_identical_alone_in_a_batch_and_over_threads():
         visits, hours, seeds = [1, 2, 2, 5, 9], [0.0, 1.0, 3.1, 2.0, 5.0], [1, 2, 13, 4, 5]
         for threads in (1, 2):
             among = run_sessions("P4", controller, visits=visits, hours=hours, seeds=seeds, threads=threads, **common).session(2)
-            for name in ("lead_beta", "beta", "amplitude", "lfp", "open_fist_s"):
+            for name in ("lead_beta", "beta", "amplitude", "lfp"):
                 assert np.array_equal(getattr(alone, name), getattr(among, name)), name
             assert alone.qoc == among.qoc
-            assert alone.tremor_minutes == among.tremor_minutes
+            assert alone.outcomes.tremor_minutes == among.outcomes.tremor_minutes
+            assert np.array_equal(alone.outcomes.open_fist_s, among.outcomes.open_fist_s)
 
 
 def test_a_longer_session_begins_like_a_shorter_one():
