@@ -11,7 +11,7 @@ from app.platform.web.numbers import stated
 from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern
 from app.tables.recordings import Recording
 from app.tables.uploads import ColumnMapping
-from ml.formats import FILE_NAMES
+from ml.formats import FILE_NAMES, OUTCOME_TABLES
 
 _TELLING = ("controller", "program")
 HIDDEN = "controller hidden"
@@ -34,8 +34,7 @@ KIND_NAMES = {
     "csv": "table",
     "parquet": "table (Parquet)",
     "control_log": "controller's log",
-    "tremor": "tremor export",
-    "grasp": "grasp test",
+    **{one.kind: one.name for one in OUTCOME_TABLES},
     "mapped": "table with a column mapping",
     "unknown": "not read",
 }

@@ -14,18 +14,16 @@ from ml.formats.facts.clocks import lead_in_words
 from ml.formats.options import ArchiveLimits, BetaMeasure, DecodeOptions
 from ml.formats.recording import (
     DECODE_VERSION,
-    TREMOR_CLASSES,
     DecodedFile,
     EventLog,
     FileReport,
-    GraspLog,
+    OutcomeLog,
     Problem,
     RecordingLog,
     SampleLog,
     SpectrumLog,
     TraceLog,
     TraceSource,
-    TremorLog,
     UndecodableFile,
 )
 from ml.formats.redaction_record import REDACTOR_VERSION, Redaction, pseudonym
@@ -33,6 +31,9 @@ from ml.formats.registry import BY_KIND, DEVICE_NAMES, DEVICES, FILE_NAMES, SOUR
 from ml.formats.source import Source
 from ml.formats.tables import TABLES, decode_table, kind_of_text, redact_table
 from ml.formats.tables.delimited import utf16_without_mark
+from ml.formats.tables.grasps import GraspLog
+from ml.formats.tables.outcome_tables import OUTCOME_TABLES
+from ml.formats.tables.strivepd import TremorLog
 
 __all__ = [
     "BY_KIND",
@@ -40,10 +41,10 @@ __all__ = [
     "DEVICES",
     "DEVICE_NAMES",
     "FILE_NAMES",
+    "OUTCOME_TABLES",
     "REDACTOR_VERSION",
     "SOURCE_NAMES",
     "TABLES",
-    "TREMOR_CLASSES",
     "ArchiveLimits",
     "BetaMeasure",
     "DecodeOptions",
@@ -53,6 +54,7 @@ __all__ = [
     "FileKind",
     "FileReport",
     "GraspLog",
+    "OutcomeLog",
     "Problem",
     "RecordingLog",
     "Redaction",

@@ -15,8 +15,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.qoc import TREMOR_CLASSES as TREMOR_CLASSES
-
 DECODE_VERSION = 10
 """Raised whenever a decoder would give other numbers for the same bytes; traces are stored per version."""
 
@@ -200,29 +198,8 @@ class SpectrumLog:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TremorLog:
-    """Minutes of tremor in time order, in UTC.
-
-    Attributes:
-        start_unix_s: begin of each minute, shape [n].
-        duration_s: length of each minute's measurement, shape [n].
-        fractions: share per class in the order of `TREMOR_CLASSES`, shape [n, 6]; NaN where the export does not split the tremor.
-        any_tremor: share with slight or worse tremor, shape [n]; NaN where not known.
-    """
-
-    start_unix_s: NDArray[np.float64]
-    duration_s: NDArray[np.float64]
-    fractions: NDArray[np.float64]
-    any_tremor: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GraspLog:
-    """One hand's test: times of open fists in s, shape [n], strictly increasing; which intervals are implausible, shape [n - 1]."""
-
-    hand: Hemisphere | None
-    open_fist_s: NDArray[np.float64]
-    implausible: NDArray[np.bool_]
+class OutcomeLog:
+    """Base of what one table says of an outcome; `ml.formats.tables.outcome_tables` has its kinds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,12 +242,11 @@ class RecordingLog:
 
 @dataclass(frozen=True, slots=True)
 class DecodedFile:
-    """Everything one uploaded file gave: recordings of a device, minutes of tremor, hand-grasp tests."""
+    """Everything one uploaded file gave: recordings of a device, or measurements of an outcome."""
 
     recordings: tuple[RecordingLog, ...]
     reports: tuple[FileReport, ...]
-    tremor: tuple[TremorLog, ...] = ()
-    grasps: tuple[GraspLog, ...] = ()
+    outcomes: tuple[OutcomeLog, ...] = ()
 
 
 def fingerprint(kind: str, parts: Iterable[str | bytes | NDArray[Any]]) -> str:

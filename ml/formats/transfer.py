@@ -1,7 +1,7 @@
 """Transfer of decoded data from the process that decoded a file to the one that stores it: JSON, and arrays next to it.
 
-Nothing that is read here can run: no pickle, and no class but those of `recording`. The size is checked before anything is loaded, for
-it follows from the file of a stranger.
+Nothing that is read here can run: no pickle, and no class but those of `recording` and of the outcomes' logs. The size is checked before
+anything is loaded, for it follows from the file of a stranger.
 """
 
 from __future__ import annotations
@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 
 from ml.formats import recording
 from ml.formats.recording import DecodedFile, UndecodableFile
+from ml.formats.tables.outcome_tables import OUTCOME_TABLES
 
 MOST_TEXT = 16 << 20
 """Bytes of JSON: some 50 000 events. The longest recordings at hand have some hundred."""
 MOST_NUMBERS = 128 << 20
 """Bytes of arrays: 200 traces of the longest recording (`MAX_ROWS` of RC+S)."""
 _TEXT, _NUMBERS, _KIND = "decoded.json", "arrays.npz", "$"
-_CLASSES = {c.__name__: c for c in vars(recording).values() if isinstance(c, type) and dataclasses.is_dataclass(c)}
+_LOGS = (*vars(recording).values(), *(one.log for one in OUTCOME_TABLES))
+_CLASSES = {c.__name__: c for c in _LOGS if isinstance(c, type) and dataclasses.is_dataclass(c)}
 
 
 def write(decoded: DecodedFile, folder: Path) -> None:

@@ -9,7 +9,8 @@ from zoneinfo import available_timezones
 
 from app.ingest.mappings.schemas import MappedColumnIn, MappingIn
 from app.platform.errors import Invalid
-from ml.formats.tables.mapping.model import AMPLITUDES, SIGNALS, TREMOR_SHARES, UNITS, WRITTEN, MappedColumn, TableMapping
+from ml.formats import OUTCOME_TABLES
+from ml.formats.tables.mapping.model import AMPLITUDES, SIGNALS, UNITS, WRITTEN, MappedColumn, TableMapping
 from ml.formats.tables.mapping.times import is_absolute
 from ml.formats.tables.numbers import unit_name
 
@@ -29,15 +30,15 @@ ROLE_NAMES = {
     "tremor_class": "Class of tremor, a word",
     "hand": "Hand, L or R",
 }
-HOLDS_NAMES = {"steps": "steps of beta", "lfp": "samples of LFP", "tremor": "minutes of tremor", "grasp": "times of open fists"}
-ALLOWED = {
+HOLDS_NAMES = {"steps": "steps of beta", "lfp": "samples of LFP", **{one.kind: one.holds for one in OUTCOME_TABLES}}
+ALLOWED: dict[str, tuple[str, ...]] = {
     "steps": ("time", "beta", "beta_power", *AMPLITUDES),
     "lfp": ("time", "lfp", *AMPLITUDES),
-    "tremor": ("time", *TREMOR_SHARES, "tremor_class"),
-    "grasp": ("time", "hand"),
+    **{one.kind: ("time", *one.roles) for one in OUTCOME_TABLES},
 }
 _CHANNEL = re.compile(r"(?=.*\d)[0-9A-Ea-e+/-]{1,20}")
 _NEEDED_SHARES = ("tremor_none", "tremor_slight", "tremor_mild", "tremor_moderate", "tremor_strong")
+_SHARES = ("tremor_unknown", *_NEEDED_SHARES)
 
 
 def mapping_of(wanted: MappingIn, preview: dict[str, Any]) -> TableMapping:
@@ -155,13 +156,13 @@ def _whole(wanted: MappingIn) -> list[tuple[str, str]]:
         errors.append(("Columns", "a table of steps needs a column of the stimulation's amplitude"))
     if wanted.holds == "tremor":
         missing = [ROLE_NAMES[r] for r in _NEEDED_SHARES if r not in roles]
-        if "tremor_class" in roles and any(r in TREMOR_SHARES for r in roles):
+        if "tremor_class" in roles and any(r in _SHARES for r in roles):
             errors.append(("Columns", "tremor is told by shares or by a class, not by both"))
         elif "tremor_class" not in roles and missing:
             errors.append(("Columns", f"tremor needs a column of its class, or shares of every class; missing: {', '.join(missing)}"))
         if not is_absolute(wanted.time_format):
             errors.append(("Format of times", "minutes of tremor find their session by the clock: they need Unix times or dates"))
-    repeated = Counter(r for r in roles if r == "hand" or r in TREMOR_SHARES or r == "tremor_class")
+    repeated = Counter(r for r in roles if any(r in one.roles for one in OUTCOME_TABLES))
     errors += [("Columns", f"'{ROLE_NAMES[r]}' is named twice") for r, count in repeated.items() if count > 1]
     return errors
 

@@ -112,7 +112,7 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
     """Correct a proposal and let it count from now on.
 
     Returns:
-        Sentences: contradictions with its amplitudes, and what was derived for it from tremor and grasp files.
+        Sentences: contradictions with its amplitudes, and what was derived for it from files of outcomes.
 
     Raises:
         Conflict: as `change`, or another confirmed session counts on the same stretch. Invalid: visit or controller is still open.
@@ -209,7 +209,7 @@ def _refuse_asked_about(db: Session, session: StudySession, done: str) -> None:
 
 
 def _delete(db: Session, session: StudySession) -> None:
-    """Delete a session that was never confirmed; the trail keeps it, and its grasp tests stay as removed rows."""
+    """Delete a session that was never confirmed; the trail keeps it, and its tests stay as removed rows."""
     outcomes_intake.give_up(db, session)
     db.delete(session)
     db.flush()

@@ -15,12 +15,12 @@ from app.platform.jobs import StepReport
 from app.platform.raw_bytes import RawFile
 from app.settings import stored_secret
 from ml import formats
-from ml.formats import ArchiveLimits, DecodeOptions, UndecodableFile, transfer
+from ml.formats import OUTCOME_TABLES, ArchiveLimits, DecodeOptions, UndecodableFile, transfer
 from ml.formats.archive import reading_of_members
 from ml.formats.tables.mapping import TableMapping, find_mapping, preview_of, redact_mapped
 from ml.formats.unpacking import is_packed, unpack
 
-MAPPABLE = ("csv", "parquet", "tremor", "grasp")
+MAPPABLE = ("csv", "parquet", *(one.kind for one in OUTCOME_TABLES))
 """Kinds of files that a column mapping may read."""
 
 

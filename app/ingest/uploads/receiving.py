@@ -30,7 +30,7 @@ from app.settings import get_settings
 from app.tables.participants import Participant
 from app.tables.recordings import Recording
 from app.tables.uploads import PREVIEW, StoredFile, Upload, UploadFile
-from ml.formats import REDACTOR_VERSION, DecodedFile, DecodeOptions, FileReport, GraspLog, Problem, Redaction, Source, UndecodableFile
+from ml.formats import REDACTOR_VERSION, DecodedFile, DecodeOptions, FileReport, OutcomeLog, Problem, Redaction, Source, UndecodableFile
 from ml.formats.archive import cleaned_suffix
 
 log = structlog.get_logger()
@@ -59,7 +59,7 @@ class FileOutcome:
         duplicate: its bytes, or all of its recordings, had come before. same_bytes: its bytes had; `row` is the earlier file then.
         session_ids: sessions that it belongs to.
         recordings: what it holds, new and known.
-        grasps: hand-grasp tests that wait for their session.
+        outcomes: measurements, of which some wait for their session.
     """
 
     name: str
@@ -70,7 +70,7 @@ class FileOutcome:
     session_ids: list[int] = field(default_factory=list)
     for_sender: Problem | None = None
     recordings: list[Recording] = field(default_factory=list)
-    grasps: Sequence[GraspLog] = ()
+    outcomes: Sequence[OutcomeLog] = ()
 
     @property
     def reports_for_sender(self) -> list[FileReport]:
@@ -293,7 +293,7 @@ class Receiver:
             if content.kind in TABLES:
                 decoded = name_beta(decoded, self.beta, self.participant.current_settings)
             stored = recordings.store(self.db, self.participant, row, decoded.recordings)
-            tremor = outcomes_intake.take_tremor(self.db, row, decoded.tremor)
+            derived = outcomes_intake.take_clocked(self.db, row, decoded.outcomes)
         except ReaderEnded as ended:
             return self._put_aside(row, content, ended)
         except UndecodableFile as error:
@@ -309,7 +309,7 @@ class Receiver:
             ours = UndecodableFile("the decoder failed on this file", "file", f"Tell your administrator: upload file {row.id}.")
             return self._failed(name, row, content, ours)
         reports = list(decoded.reports)
-        add_redaction(reports[0], content.redaction, tremor)
+        add_redaction(reports[0], content.redaction, derived)
         if row.column_mapping is not None:
             reports[0].understood.insert(0, wording.read_by_mapping(row.column_mapping))
         reports[0].understood.extend(stored.understood)
@@ -317,7 +317,7 @@ class Receiver:
         row.status = "decoded"
         store_reports(row, reports, [r.id for r in stored.known], content.redaction.unreadable)
         all_known = bool(stored.known) and not stored.fresh
-        return FileOutcome(name, row, reports, all_known, recordings=[*stored.known, *stored.fresh], grasps=decoded.grasps)
+        return FileOutcome(name, row, reports, all_known, recordings=[*stored.known, *stored.fresh], outcomes=decoded.outcomes)
 
     def _known_meanwhile(self, name: str, row: UploadFile) -> FileOutcome | None:
         """Build the outcome for a file whose bytes another upload has brought since; the row goes then."""

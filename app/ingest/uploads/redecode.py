@@ -29,13 +29,12 @@ from app.platform.database import transaction
 from app.platform.errors import Conflict, NotFound
 from app.platform.jobs.children.child import places
 from app.study import repository as study
-from app.study.outcomes import values as outcomes
 from app.study.traces import AMPLITUDE_STREAM, unpack
 from app.tables.participants import Participant
 from app.tables.recordings import Recording, Trace
 from app.tables.sessions import StudySession
 from app.tables.uploads import UploadFile
-from ml.formats import DECODE_VERSION, DecodedFile, RecordingLog, UndecodableFile
+from ml.formats import DECODE_VERSION, OUTCOME_TABLES, DecodedFile, RecordingLog, UndecodableFile
 
 log = structlog.get_logger()
 
@@ -103,7 +102,7 @@ def redecode(participant_id: int | None, upload_file_id: int | None, dry_run: bo
 def _read_again(db: Session, file: UploadFile, participant: Participant, actor: str) -> tuple[list[str], list[str]]:
     """Read a file again; what changed, and the sessions whose time or dose did."""
     known = [*repository.recordings_of_file(db, file.id)]
-    outcomes_only = file.kind in ("tremor", "grasp")
+    outcomes_only = any(file.kind == one.kind for one in OUTCOME_TABLES)
     if not outcomes_only and all(_version(db, r) >= DECODE_VERSION for r in known):
         return [], []
     decoded = _decoded(db, file, participant)
@@ -144,22 +143,12 @@ def _decoded(db: Session, file: UploadFile, participant: Participant) -> Decoded
 
 
 def _outcomes_again(db: Session, file: UploadFile, decoded: DecodedFile) -> list[str]:
-    """Read tremor minutes and grasp tests again; returns what changed, or nothing where all is unchanged."""
-    before = _outcomes(db, file)
-    said = outcomes_intake.take_tremor(db, file, decoded.tremor)
+    """Read the outcomes of a file again; returns what changed, or nothing where all is unchanged."""
+    before = outcomes_intake.stored_of(db, file)
+    said = outcomes_intake.take_clocked(db, file, decoded.outcomes)
     if file.session_id is not None:
-        said += outcomes_intake.take_grasps(db, file, decoded.grasps, db.get_one(StudySession, file.session_id))
-    return said if _outcomes(db, file) != before else []
-
-
-def _outcomes(db: Session, file: UploadFile) -> list[tuple[object, ...]]:
-    """Collect all that reading an outcome file again can change: its minutes, its grasp tests, and the QoCs of the participant's
-    sessions."""
-    series = outcomes.tremor_series_of_file(db, file.participant_id, file.id)
-    minutes = (series.n, series.start_unix_s_f64, series.duration_s_f64, series.fractions_f32, series.any_tremor_f32) if series else ()
-    tests = [(t.session_id, t.hand, t.open_fist_s_f64, tuple(t.implausible)) for t in outcomes.grasp_tests_of_file(db, file.id)]
-    revisions = [(s.id, len(s.qocs)) for s in study.sessions_of_participant(db, file.participant_id)]
-    return [minutes, *tests, *revisions]
+        said += outcomes_intake.take_of_session(db, file, decoded.outcomes, db.get_one(StudySession, file.session_id))
+    return said if outcomes_intake.stored_of(db, file) != before else []
 
 
 def _version(db: Session, recording: Recording) -> int:

@@ -335,7 +335,7 @@ def attach_grasps_of(db: Session, outcome: UploadOutcome, stated: StatedSession)
                 file.reports[0].flagged.append(f"It belongs to session {file.row.session_id} already and was not moved.")
             continue
         try:
-            said = attach_grasps(db, file.row, target) if target else outcomes_intake.take_grasps(db, file.row, file.grasps, None)
+            said = attach_grasps(db, file.row, target) if target else outcomes_intake.take_of_session(db, file.row, file.outcomes, None)
         except BetaloopError as error:
             said = [str(error)]
         file.reports[0].understood.extend(said)
@@ -362,7 +362,7 @@ def attach_grasps(db: Session, file: UploadFile, session: StudySession) -> list[
         decoded = reading.decode(files.path_of(file.stored_sha256), file.kind, DecodeOptions(), file.name)
     except UndecodableFile as error:
         raise Invalid(f"File {file.id} cannot be read any more: {error.what} ({error.where}).", error.hint) from error
-    return outcomes_intake.take_grasps(db, file, decoded.grasps, session)
+    return outcomes_intake.take_of_session(db, file, decoded.outcomes, session)
 
 
 def decode_options(participant: Participant, beta: BetaStated) -> DecodeOptions:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
-from ml.formats.recording import DecodedFile, FileReport, GraspLog, Hemisphere, UndecodableFile
+from ml.formats.recording import DecodedFile, FileReport, Hemisphere, OutcomeLog, UndecodableFile
 from ml.formats.source import Source
 from ml.formats.tables.columns import BETA_NAMES
 from ml.formats.tables.delimited import TextTable, read_delimited
 from ml.formats.tables.numbers import column_name, shown
+from ml.formats.tables.outcome_table import OutcomeTable, cell
 from ml.formats.tables.removed import removed_columns
 from ml.qoc import PLAUSIBLE_INTERVAL_S
 
@@ -30,6 +32,15 @@ EVENTS = frozenset({"event", "events", "state", "status", "phase", "gesture", "h
 OPENED = frozenset({"open", "opening", "opened", "open_fist", "open fist", "open_hand", "open hand"})
 CLOSED = frozenset({"close", "closing", "closed", "closed_fist", "closed fist", "closed_hand", "closed hand", "fist"})
 HANDS: dict[str, Hemisphere] = {"l": "left", "left": "left", "r": "right", "right": "right"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraspLog(OutcomeLog):
+    """One hand's test: times of open fists in s, shape [n], strictly increasing; which intervals are implausible, shape [n - 1]."""
+
+    hand: Hemisphere | None
+    open_fist_s: NDArray[np.float64]
+    implausible: NDArray[np.bool_]
 
 
 def looks_like_grasps(headers: Sequence[str]) -> bool:
@@ -73,7 +84,7 @@ def decode_grasps(path: Source, options: DecodeOptions | None = None, name: str 
     if not logs:
         what = "the table has no rows of open fists" if closed else "the table has a header but no rows"
         raise UndecodableFile(what, "after line 1", "Add one row per open fist.")
-    return DecodedFile((), (report,), grasps=logs)
+    return DecodedFile((), (report,), outcomes=logs)
 
 
 def _time_column(table: TextTable, names: list[tuple[str, str | None]]) -> tuple[int, float]:
@@ -134,3 +145,32 @@ def _one_hand(
         named, them = ("interval", "it") if count == 1 else ("intervals", "them")
         report.flagged.append(f"{whose}{count} {named} outside {low:g} to {high:g} s: kept, look at {them}")
     return GraspLog(hand, t, implausible)
+
+
+def _lines(hands: Sequence[GraspLog]) -> list[str]:
+    """Write `t_s`, and `hand` where a hand is named."""
+    if len(hands) == 1 and hands[0].hand is None:
+        return ["t_s", *(cell(t) for t in hands[0].open_fist_s.tolist())]
+    return ["t_s,hand", *(f"{cell(t)},{h.hand}" for h in hands for t in h.open_fist_s.tolist())]
+
+
+def _mapped_cells(
+    table: TextTable, places: Mapping[str, int], t_s: NDArray[np.float64], absolute: bool
+) -> tuple[list[str], list[list[str]]]:
+    known = t_s[np.isfinite(t_s)]
+    times = t_s - known[0] if absolute and known.size else t_s  # moments count from the first
+    hand = [place for role, place in places.items() if role == "hand"]
+    return ["t_s", "hand"][: 1 + len(hand)], [[cell(t)] + [row[i] for i in hand] for t, row in zip(times, table.rows, strict=True)]
+
+
+GRASP_TESTS = OutcomeTable(
+    kind="grasp",
+    name="grasp test",
+    holds="times of open fists",
+    log=GraspLog,
+    roles=("hand",),
+    recognises=looks_like_grasps,
+    decode=decode_grasps,
+    lines=_lines,
+    mapped_cells=_mapped_cells,
+)

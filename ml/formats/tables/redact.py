@@ -1,6 +1,6 @@
 """Take identity out of tables before they are stored: known columns stay, as the numbers and classes that were read from them.
 
-The result decodes to the same recording, minutes or grasp tests; texts of the file do not survive at all.
+The result decodes to the same recording or outcomes; texts of the file do not survive at all.
 """
 
 from __future__ import annotations
@@ -10,22 +10,21 @@ from pathlib import Path
 import numpy as np
 
 from ml.formats.options import DecodeOptions
-from ml.formats.recording import TREMOR_CLASSES, GraspLog, TremorLog
 from ml.formats.redaction_record import Redaction
 from ml.formats.source import Source
 from ml.formats.tables.columns import Columns, read_csv, read_parquet
 from ml.formats.tables.control_log import redact_log
-from ml.formats.tables.grasps import decode_grasps
+from ml.formats.tables.outcome_table import OutcomeTable, cell
+from ml.formats.tables.outcome_tables import BY_KIND
 from ml.formats.tables.removed import removed_columns
 from ml.formats.tables.steps import decode_columns
-from ml.formats.tables.strivepd import decode_strivepd
 
 
 def redact_table(source: Source, target: Path, kind: str, options: DecodeOptions) -> Redaction:
     """Write a table of the known columns alone; the same bytes in give the same bytes out.
 
     Headers become the column's role with its unit in brackets, cells the numbers that were read. A table of steps or of raw LFP keeps its
-    line numbers; tremor becomes a wide export, a grasp test `t_s` and `hand`.
+    line numbers; a table of an outcome becomes the lines of its kind.
 
     Args:
         source: the uploaded table.
@@ -37,10 +36,10 @@ def redact_table(source: Source, target: Path, kind: str, options: DecodeOptions
         UndecodableFile: the table cannot be decoded; nothing is written then.
         ValueError: no kind of table, or one that a column mapping reads.
     """
-    if kind not in ("csv", "parquet", "control_log", "tremor", "grasp"):
+    if kind not in ("csv", "parquet", "control_log", *BY_KIND):
         raise ValueError(f"a file of kind {kind} is not cleaned here; a column mapping cleans the tables that it reads")
-    if kind in ("tremor", "grasp"):
-        return redact_outcomes(source, target, kind, options)
+    if kind in BY_KIND:
+        return redact_outcomes(source, target, BY_KIND[kind], options)
     if kind == "control_log":
         return redact_log(source, target, options)
     columns = read_csv(source, options) if kind == "csv" else read_parquet(source, options)
@@ -52,40 +51,20 @@ def redact_table(source: Source, target: Path, kind: str, options: DecodeOptions
     return Redaction(removed=removed_columns(columns.ignored), repaired=list(columns.notes))
 
 
-def redact_outcomes(source: Source, target: Path, kind: str, options: DecodeOptions) -> Redaction:
-    """Write a tremor export or a grasp test as the minutes or open fists that were read from it; see `redact_table`."""
-    decoded = decode_strivepd(source, options) if kind == "tremor" else decode_grasps(source, options)
+def redact_outcomes(source: Source, target: Path, table: OutcomeTable, options: DecodeOptions) -> Redaction:
+    """Write a table of an outcome as the measurements that were read from it; see `redact_table`."""
+    decoded = table.decode(source, options, None)
     report = decoded.reports[0]
-    lines = _tremor_lines(decoded.tremor[0]) if kind == "tremor" else _grasp_lines(decoded.grasps)
-    target.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    target.write_text("\n".join(table.lines(decoded.outcomes)) + "\n", encoding="utf-8")
     assumed = [text for text in report.flagged if "read as UTC" in text]
     return Redaction(removed=list(report.removed), repaired=[*report.repaired, *assumed], ignored=list(report.ignored))
-
-
-def _tremor_lines(minutes: TremorLog) -> list[str]:
-    """A wide export with the length of each minute and all tremor together; times in Unix seconds."""
-    lines = [",".join(("time", "duration_s", *TREMOR_CLASSES, "any_tremor"))]
-    rows = zip(
-        minutes.start_unix_s.tolist(), minutes.duration_s.tolist(), minutes.fractions.tolist(), minutes.any_tremor.tolist(), strict=True
-    )
-    return lines + [",".join(map(_cell, (start, length, *shares, any_))) for start, length, shares, any_ in rows]
-
-
-def _grasp_lines(hands: tuple[GraspLog, ...]) -> list[str]:
-    if len(hands) == 1 and hands[0].hand is None:
-        return ["t_s", *(_cell(t) for t in hands[0].open_fist_s.tolist())]
-    return ["t_s,hand", *(f"{_cell(t)},{h.hand}" for h in hands for t in h.open_fist_s.tolist())]
-
-
-def _cell(value: float) -> str:
-    return "" if value != value else repr(value)
 
 
 def _write_csv(columns: Columns, target: Path) -> None:
     with target.open("w", encoding="utf-8", newline="") as out:
         out.write(",".join(columns.label(role) for role in columns.values) + "\n")
         at = 2
-        columns_of_cells = [list(map(_cell, v.tolist())) for v in columns.values.values()]
+        columns_of_cells = [list(map(cell, v.tolist())) for v in columns.values.values()]
         for line, row in zip(columns.lines.tolist(), map(",".join, zip(*columns_of_cells, strict=True)), strict=True):
             # blank lines keep every row on its line, so that later reports name the line that the sender sees
             out.write("\n" * (line - at) + row + "\n" if line > at else row + "\n")

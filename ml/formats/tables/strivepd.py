@@ -7,19 +7,22 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
-from ml.formats.recording import TREMOR_CLASSES, DecodedFile, FileReport, TremorLog, UndecodableFile
+from ml.formats.recording import DecodedFile, FileReport, OutcomeLog, UndecodableFile
 from ml.formats.source import Source
 from ml.formats.tables.dates import ChangedClocks, in_zone, named_month, spreadsheet_date, zone_of_header
 from ml.formats.tables.delimited import TextTable, read_delimited
 from ml.formats.tables.numbers import NotANumber, column_name, parse_number, shown
+from ml.formats.tables.outcome_table import OutcomeTable, cell
 from ml.formats.tables.removed import removed_columns
+from ml.qoc import TREMOR_CLASSES
 
 SUMMARY = "all"
 """slight + mild + moderate + strong of the same minute: no class of its own, never added to the others."""
@@ -41,6 +44,23 @@ KNOWN = frozenset(
 )
 _SHARE = re.compile(r"^(percent|fraction|share)|(percent|pct|fraction|share)$")
 WANTED = ", ".join(TREMOR_CLASSES)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TremorLog(OutcomeLog):
+    """Minutes of tremor in time order, in UTC.
+
+    Attributes:
+        start_unix_s: begin of each minute, shape [n].
+        duration_s: length of each minute's measurement, shape [n].
+        fractions: share per class in the order of `TREMOR_CLASSES`, shape [n, 6]; NaN where the export does not split the tremor.
+        any_tremor: share with slight or worse tremor, shape [n]; NaN where not known.
+    """
+
+    start_unix_s: NDArray[np.float64]
+    duration_s: NDArray[np.float64]
+    fractions: NDArray[np.float64]
+    any_tremor: NDArray[np.float64]
 
 
 def looks_like_tremor(headers: Sequence[str]) -> bool:
@@ -90,7 +110,7 @@ def decode_strivepd(path: Source, options: DecodeOptions | None = None, name: st
     if minutes.start_unix_s.size == 0:
         raise UndecodableFile("the table holds no minute of tremor", "after line 1", "Upload the export as StrivePD wrote it.")
     report.understood.append(f"{minutes.start_unix_s.size} minutes of tremor")
-    return DecodedFile((), (report,), tremor=(minutes,))
+    return DecodedFile((), (report,), outcomes=(minutes,))
 
 
 def _wide(table: TextTable, columns: dict[str, int], time: int, report: FileReport) -> TremorLog:
@@ -265,3 +285,41 @@ def _in_order(
             "their zone in the night in which the clocks were changed"
         )
     return TremorLog(start, length[order], fractions[order], any_tremor[order])
+
+
+def _lines(logs: Sequence[TremorLog]) -> list[str]:
+    """Write a wide export with the length of each minute and all tremor together; times in Unix seconds."""
+    lines = [",".join(("time", "duration_s", *TREMOR_CLASSES, "any_tremor"))]
+    for log in logs:
+        rows = zip(log.start_unix_s.tolist(), log.duration_s.tolist(), log.fractions.tolist(), log.any_tremor.tolist(), strict=True)
+        lines += [",".join(map(cell, (start, length, *shares, any_))) for start, length, shares, any_ in rows]
+    return lines
+
+
+SHARE_ROLES = tuple(f"tremor_{name}" for name in TREMOR_CLASSES)
+CLASS_ROLE = "tremor_class"
+
+
+def _mapped_cells(
+    table: TextTable, places: Mapping[str, int], t_s: NDArray[np.float64], absolute: bool
+) -> tuple[list[str], list[list[str]]]:
+    del absolute  # minutes find their session by the clock, so that their times always are
+    if CLASS_ROLE in places:
+        of_class = places[CLASS_ROLE]
+        return ["time", "class"], [[cell(t), row[of_class].strip().lower()] for t, row in zip(t_s, table.rows, strict=True)]
+    decimal = table.decimal_mark([places[role] for role in sorted(places, key=lambda role: places[role])])
+    by_class = [table.numbers(places[role], decimal, role) if role in places else np.zeros(t_s.size) for role in SHARE_ROLES]
+    return ["time", *TREMOR_CLASSES], [[cell(t), *map(cell, row)] for t, row in zip(t_s, np.column_stack(by_class), strict=True)]
+
+
+WATCH_EXPORTS = OutcomeTable(
+    kind="tremor",
+    name="tremor export",
+    holds="minutes of tremor",
+    log=TremorLog,
+    roles=(*SHARE_ROLES, CLASS_ROLE),
+    recognises=looks_like_tremor,
+    decode=decode_strivepd,
+    lines=_lines,
+    mapped_cells=_mapped_cells,
+)

@@ -26,13 +26,13 @@ def test_every_kind_of_file_is_the_same_after_the_transfer(rcs, percept, pack, t
         assert after.reports == before.reports
         assert len(after.recordings) == len(before.recordings)
         assert all(same_recording(a, b) for a, b in zip(before.recordings, after.recordings, strict=True))
-        for a, b in zip(before.tremor, after.tremor, strict=True):
+        for a, b in zip(before.outcomes, after.outcomes, strict=True):
             np.testing.assert_array_equal(a.fractions, b.fractions)
 
 
 def test_what_is_too_large_is_refused_by_who_writes_and_by_who_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     year = np.zeros(500_000)
-    decoded = DecodedFile((), (), tremor=(TremorLog(year, year, np.zeros((500_000, 6)), year),))
+    decoded = DecodedFile((), (), outcomes=(TremorLog(year, year, np.zeros((500_000, 6)), year),))
     transfer.write(decoded, tmp_path)
     monkeypatch.setattr(transfer, "MOST_NUMBERS", 1 << 20)
     with pytest.raises(UndecodableFile, match="MiB of numbers"):

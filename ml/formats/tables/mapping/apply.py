@@ -1,6 +1,6 @@
 """Reading of a table by a column mapping, and writing of what may be stored of it: named columns alone, as numbers.
 
-Steps and LFP are written as a table of their own kind (`stored`), tremor and grasps as those that every decoder of theirs reads.
+Steps and LFP are written as a table of their own kind (`stored`), outcomes as those that every decoder of theirs reads.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
-from ml.formats.recording import TREMOR_CLASSES, UndecodableFile
+from ml.formats.recording import UndecodableFile
 from ml.formats.redaction_record import Redaction
 from ml.formats.source import InMemory, Source
 from ml.formats.tables.delimited import MOST_TITLES, TextTable
 from ml.formats.tables.mapping.lines import Top, read_rows, read_top
-from ml.formats.tables.mapping.model import AMPLITUDES, SIGNALS, TREMOR_SHARES, TableMapping, header_hash
+from ml.formats.tables.mapping.model import AMPLITUDES, SIGNALS, TableMapping, header_hash
 from ml.formats.tables.mapping.preview import is_row
 from ml.formats.tables.mapping.stored import MappedTable, decode_table_of, write
 from ml.formats.tables.mapping.times import is_absolute, read_times
+from ml.formats.tables.outcome_tables import BY_KIND
 from ml.formats.tables.redact import redact_outcomes
 from ml.formats.tables.removed import removed_columns
 
@@ -79,7 +79,7 @@ def redact_mapped(source: Source, target: Path, mapping: TableMapping, key: byte
         write(found, target)
         return Redaction(removed=removed, repaired=list(table.notes))
     # in memory: cells of text are not screened yet
-    redaction = redact_outcomes(InMemory(_outcomes(table, mapping).encode()), target, mapping.kind, options)
+    redaction = redact_outcomes(InMemory(_outcomes(table, mapping).encode()), target, BY_KIND[mapping.kind], options)
     redaction.removed.extend(removed)
     return redaction
 
@@ -115,36 +115,13 @@ def _signals(table: TextTable, mapping: TableMapping, options: DecodeOptions) ->
 
 
 def _outcomes(table: TextTable, mapping: TableMapping) -> str:
-    """Write a table of tremor or grasps with the names that its decoder knows, each row on its original line."""
+    """Write a table of an outcome with the names that its decoder knows, each row on its original line."""
     (time,) = mapping.of_role("time")
+    places = {c.role: c.number - 1 for c in mapping.columns if c.role != "time"}
     t_s = read_times(table, time.number - 1, mapping)
-    if mapping.kind == "grasp":
-        hand = mapping.of_role("hand")
-        names = ["t_s", "hand"] if hand else ["t_s"]
-        cells = [[_text(t)] + [row[c.number - 1] for c in hand] for t, row in zip(_from_first(t_s, mapping), table.rows, strict=True)]
-    elif of_class := mapping.of_role("tremor_class"):
-        names = ["time", "class"]
-        cells = [[_text(t), row[of_class[0].number - 1].strip().lower()] for t, row in zip(t_s, table.rows, strict=True)]
-    else:
-        shares = {c.role: c.number - 1 for c in mapping.of_role(*TREMOR_SHARES)}
-        decimal = table.decimal_mark(list(shares.values()))
-        names = ["time", *TREMOR_CLASSES]
-        by_class = [
-            table.numbers(shares[role], decimal, role) if role in shares else np.zeros(t_s.size) for role in TREMOR_SHARES
-        ]  # fmt: skip
-        cells = [[_text(t), *map(_text, row)] for t, row in zip(t_s, np.column_stack(by_class), strict=True)]
+    names, cells = BY_KIND[mapping.kind].mapped_cells(table, places, t_s, is_absolute(mapping.time_format))
     out, at = [",".join(names)], 1
     for line, row in zip(table.lines, cells, strict=True):
         out += [""] * (line - at - 1) + [",".join(f'"{cell}"' if "," in cell else cell for cell in row)]
         at = line
     return "\n".join(out) + "\n"
-
-
-def _from_first(t_s: NDArray[np.float64], mapping: TableMapping) -> NDArray[np.float64]:
-    """Convert times of open fists to seconds; moments count from the first."""
-    known = t_s[np.isfinite(t_s)]
-    return t_s - known[0] if is_absolute(mapping.time_format) and known.size else t_s
-
-
-def _text(value: float) -> str:
-    return "" if value != value else repr(float(value))

@@ -8,8 +8,9 @@ from dataclasses import asdict, dataclass, fields
 from hashlib import sha256
 from typing import Any, Literal
 
-from ml.formats.recording import TREMOR_CLASSES, Hemisphere
+from ml.formats.recording import Hemisphere
 from ml.formats.tables.numbers import column_name
+from ml.formats.tables.outcome_tables import BY_KIND, OUTCOME_TABLES
 
 Holds = Literal["steps", "lfp", "tremor", "grasp"]
 """What a table holds: steps of beta, samples of LFP, minutes of tremor, times of open fists."""
@@ -25,8 +26,7 @@ WRITTEN = ("iso", "dmy", "mdy", "excel")
 
 SIGNALS = ("beta", "beta_power", "lfp")
 AMPLITUDES = ("amplitude_ma", "amplitude_fraction")
-TREMOR_SHARES = tuple(f"tremor_{name}" for name in TREMOR_CLASSES)
-ROLES = ("time", *SIGNALS, *AMPLITUDES, *TREMOR_SHARES, "tremor_class", "hand")
+ROLES = ("time", *SIGNALS, *AMPLITUDES, *(role for one in OUTCOME_TABLES for role in one.roles))
 """What a column may hold. A column that no mapping names is removed."""
 
 _VOLTAGES = ("uV", "nV", "mV", "V")
@@ -93,9 +93,9 @@ class TableMapping:
         return sorted((c for c in self.columns if c.role in roles), key=lambda c: c.number)
 
     @property
-    def kind(self) -> Literal["mapped", "tremor", "grasp"]:
+    def kind(self) -> str:
         """The kind of file that a table becomes."""
-        return self.holds if self.holds in ("tremor", "grasp") else "mapped"
+        return self.holds if self.holds in BY_KIND else "mapped"
 
 
 def header_hash(cells: Sequence[str], key: bytes) -> str:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from ml.formats.recording import TREMOR_CLASSES, UndecodableFile
+from ml.formats.recording import UndecodableFile
 from ml.formats.source import Source
 from ml.formats.tables.delimited import MOST_TITLES
 from ml.formats.tables.mapping.lines import MOST_COLUMNS, Top, read_top
 from ml.formats.tables.mapping.model import header_hash
 from ml.formats.tables.numbers import MISSING, TIME_UNITS, NotANumber, known_unit, parse_number
 from ml.formats.tables.removed import is_personal
+from ml.qoc import TREMOR_CLASSES
 
 LONGEST_CELL = 40
 MOST_SHOWN = 12

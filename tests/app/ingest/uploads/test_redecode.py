@@ -140,7 +140,7 @@ def more_tremor(decoded: DecodedFile) -> DecodedFile:
         fractions[:, 3] *= 2
         return replace(log, fractions=fractions, any_tremor=fractions[:, 2:].sum(axis=1))
 
-    return replace(decoded, tremor=tuple(map(change, decoded.tremor)))
+    return replace(decoded, outcomes=tuple(map(change, decoded.outcomes)))
 
 
 def test_a_dry_run_tells_and_changes_nothing(send: Any, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:

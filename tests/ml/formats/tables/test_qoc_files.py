@@ -6,10 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ml.formats import UndecodableFile, decode, redact, sniff
-from ml.formats.recording import TREMOR_CLASSES
 from ml.formats.tables.grasps import decode_grasps
 from ml.formats.tables.strivepd import decode_strivepd
-from ml.qoc import grasp_frequency
+from ml.qoc import TREMOR_CLASSES, grasp_frequency
 
 
 @pytest.fixture
@@ -32,20 +31,20 @@ def write(tmp_path):
     ],
 )
 def test_open_fists_in_seconds_or_microseconds_give_two_grasps_a_second(write, text):
-    (hand,) = decode_grasps(write(text)).grasps
+    (hand,) = decode_grasps(write(text)).outcomes
     assert hand.hand is None
     assert grasp_frequency(hand.open_fist_s) == pytest.approx(2.0)
 
 
 def test_a_column_of_hands_gives_one_test_per_hand(write):
     decoded = decode_grasps(write("t_s,hand\n1,L\n1.1,right\n2,left\n2.6,R\n"))
-    assert {h.hand: h.open_fist_s.tolist() for h in decoded.grasps} == {"left": [1.0, 2.0], "right": [1.1, 2.6]}
+    assert {h.hand: h.open_fist_s.tolist() for h in decoded.outcomes} == {"left": [1.0, 2.0], "right": [1.1, 2.6]}
 
 
 def test_implausible_intervals_are_flagged_and_kept(write):
     decoded = decode_grasps(write("t_s\n0\n0.05\n1\n5\n"))
-    assert decoded.grasps[0].implausible.tolist() == [True, False, True]
-    assert decoded.grasps[0].open_fist_s.size == 4
+    assert decoded.outcomes[0].implausible.tolist() == [True, False, True]
+    assert decoded.outcomes[0].open_fist_s.size == 4
     assert "2 intervals" in decoded.reports[0].flagged[0]
 
 
@@ -56,7 +55,7 @@ def test_a_single_open_fist_is_kept_and_said_to_be_too_few(write):
 def test_closed_fists_are_not_counted(write):
     rows = "".join(f"{k},open,R\n{k + 0.5},Closed,R\n" for k in range(20))
     decoded = decode_grasps(write(f"t_s,event,hand\n{rows}"))
-    assert grasp_frequency(decoded.grasps[0].open_fist_s) == pytest.approx(1.0)
+    assert grasp_frequency(decoded.outcomes[0].open_fist_s) == pytest.approx(1.0)
     assert decoded.reports[0].ignored == ["20 rows of closed fists"]
 
 
@@ -82,7 +81,7 @@ def test_grasp_files_that_cannot_be_used_say_where(write, text, what, where):
 
 def test_a_wide_export_gives_fractions_that_add_up(recordings):
     decoded = decode_strivepd(recordings / "tremor/strivepd_wide.csv")
-    (minutes,) = decoded.tremor
+    (minutes,) = decoded.outcomes
     assert minutes.fractions.shape == (12, 6)
     np.testing.assert_allclose(minutes.fractions.sum(axis=1), 1.0, atol=0.01)
     assert minutes.fractions[0, TREMOR_CLASSES.index("mild")] == 0.173913
@@ -91,7 +90,7 @@ def test_a_wide_export_gives_fractions_that_add_up(recordings):
 
 def test_in_a_long_export_all_is_no_severity_and_identity_is_named(recordings):
     decoded = decode_strivepd(recordings / "tremor/strivepd_long.csv")
-    (minutes,) = decoded.tremor
+    (minutes,) = decoded.outcomes
     assert minutes.start_unix_s[0] == 1668225180.0
     np.testing.assert_allclose(minutes.any_tremor[-2:], [10.434783 / 60, 5 / 60])
     assert np.isnan(minutes.fractions[-1, TREMOR_CLASSES.index("mild")])
@@ -104,7 +103,7 @@ def test_in_a_long_export_all_is_no_severity_and_identity_is_named(recordings):
 def test_a_long_export_is_gathered_by_minute(write):
     rows = ["mild,6", "moderate,3", "none,51", "slight,0", "strong,0", "unknown,0", "all,9"]
     text = "time,severity,duration\n" + "".join(f"2022-11-12T03:53:00Z,{row}\n" for row in rows)
-    (minutes,) = decode_strivepd(write(text)).tremor
+    (minutes,) = decode_strivepd(write(text)).outcomes
     np.testing.assert_allclose(minutes.fractions, [[0, 0.85, 0, 0.1, 0.05, 0]])
     np.testing.assert_allclose(minutes.any_tremor, [0.15])
 
@@ -134,7 +133,7 @@ def test_tremor_files_that_cannot_be_used_say_why(write, text, what):
     "stamp", ["1668225180", "1668225180000", "1668225180000000000", "2022-11-12T03:53:00+00:00", "2022-11-11T19:53:00-08:00"]
 )
 def test_times_are_read_in_any_of_their_spellings(write, stamp):
-    (minutes,) = decode_strivepd(write(f"time,severity,duration\n{stamp},mild,1\n")).tremor
+    (minutes,) = decode_strivepd(write(f"time,severity,duration\n{stamp},mild,1\n")).outcomes
     assert minutes.start_unix_s.tolist() == [1668225180.0]
 
 
@@ -149,7 +148,7 @@ def test_times_are_read_in_any_of_their_spellings(write, stamp):
 def test_a_table_of_one_class_per_minute_gives_whole_minutes_in_time_order(write, text):
     path = write(text)
     assert sniff(path) == "tremor"
-    (minutes,) = decode(path).tremor
+    (minutes,) = decode(path).outcomes
     assert minutes.start_unix_s.tolist() == [1767607200.0, 1767607260.0]
     assert [TREMOR_CLASSES[i] for i in minutes.fractions.argmax(axis=1)] == ["mild", "none"]
     assert minutes.duration_s.tolist() == [60.0, 60.0]
@@ -158,7 +157,7 @@ def test_a_table_of_one_class_per_minute_gives_whole_minutes_in_time_order(write
 
 def test_a_time_without_a_zone_is_read_as_utc_and_said(write):
     decoded = decode(write("minute_start,class\n2026-01-05 10:00:00,mild\n"))
-    assert decoded.tremor[0].start_unix_s.tolist() == [1767607200.0]
+    assert decoded.outcomes[0].start_unix_s.tolist() == [1767607200.0]
     assert any("read as UTC" in text for text in decoded.reports[0].flagged)
 
 
@@ -193,7 +192,7 @@ def test_a_formula_for_a_number_is_refused_with_its_line_and_elsewhere_it_is_not
     assert "line 3" in caught.value.where
     decoded = decode(write(f't_s,hand,note\n1,L,"{cell}"\n2,L,x\n'))
     assert cell not in repr(decoded)
-    assert decoded.grasps[0].open_fist_s.tolist() == [1.0, 2.0]
+    assert decoded.outcomes[0].open_fist_s.tolist() == [1.0, 2.0]
 
 
 @pytest.mark.parametrize(
@@ -207,7 +206,7 @@ def test_marks_encodings_and_a_wrong_extension_do_not_matter(tmp_path, encode, t
     path.write_bytes(encode(text))
     assert sniff(path) == kind
     decoded = decode(path)
-    assert len(decoded.tremor) + len(decoded.grasps) == 1
+    assert len(decoded.outcomes) == 1
 
 
 @given(
@@ -222,7 +221,7 @@ def test_whatever_follows_a_header_gives_content_or_a_clear_error(tmp_path_facto
     found, said = (), ""
     try:
         decoded = decode(path)
-        found = (*decoded.recordings, *decoded.tremor, *decoded.grasps)
+        found = (*decoded.recordings, *decoded.outcomes)
     except UndecodableFile as error:
         said = error.what and error.where and error.hint
     assert found or said
@@ -231,7 +230,7 @@ def test_whatever_follows_a_header_gives_content_or_a_clear_error(tmp_path_facto
 @pytest.mark.parametrize("cell", ["nan", "INF", "1e999", ""])
 def test_a_share_without_a_number_leaves_the_minute_undivided(write, cell):
     decoded = decode(write(f"time,unknown,none,slight,mild,moderate,strong\n1588184000,0,1,0,{cell},0,0\n"))
-    assert np.isnan(decoded.tremor[0].fractions[0, TREMOR_CLASSES.index("mild")])
+    assert np.isnan(decoded.outcomes[0].fractions[0, TREMOR_CLASSES.index("mild")])
     assert any("not known" in text for text in decoded.reports[0].flagged)
 
 

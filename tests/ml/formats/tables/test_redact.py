@@ -80,7 +80,7 @@ def test_redacted_tremor_is_the_same_minutes_without_anything_else(tmp_path, tex
     redact(target, again, "tremor", KEY)
     assert again.read_bytes() == target.read_bytes()
     assert sniff(target) == "tremor"
-    (before,), (after,) = decode(source).tremor, decode(target).tremor
+    (before,), (after,) = decode(source).outcomes, decode(target).outcomes
     for field in ("start_unix_s", "duration_s", "fractions", "any_tremor"):
         np.testing.assert_array_equal(getattr(before, field), getattr(after, field))
     assert not any(secret in target.read_text() + repr(done) for secret in ("Jane", "Doe", "4711", "NPC1"))
@@ -92,7 +92,7 @@ def test_the_real_exports_keep_their_minutes_and_lose_their_identifiers(recordin
         source, target = recordings / f"tremor/{name}.csv", tmp_path / f"{name}.csv"
         assert sniff(source) == "tremor"
         redact(source, target, "tremor", KEY)
-        (before,), (after,) = decode(source).tremor, decode(target).tremor
+        (before,), (after,) = decode(source).outcomes, decode(target).outcomes
         np.testing.assert_array_equal(before.fractions, after.fractions)
         np.testing.assert_array_equal(before.start_unix_s, after.start_unix_s)
         assert not any(secret in target.read_text() for secret in ("LARICRKw", "e3dd146f", "applewatch"))
@@ -107,7 +107,7 @@ def test_a_redacted_grasp_test_is_the_same_test(tmp_path, text):
     assert sniff(source) == "grasp"
     redact(source, target, "grasp", KEY)
     assert sniff(target) == "grasp"
-    before, after = decode(source).grasps, decode(target).grasps
+    before, after = decode(source).outcomes, decode(target).outcomes
     assert [g.hand for g in before] == [g.hand for g in after]
     for a, b in zip(before, after, strict=True):
         np.testing.assert_array_equal(a.open_fist_s, b.open_fist_s)
@@ -135,6 +135,6 @@ def test_any_minutes_survive_redaction_bit_by_bit(tmp_path_factory, shares, firs
     lines += [",".join([str(first + 60 * i), *(repr(v / sum(row)) for v in row)]) for i, row in enumerate(shares)]
     (folder / "s.csv").write_text("\n".join(lines))
     redact(folder / "s.csv", folder / "t.csv", "tremor", KEY)
-    (before,), (after,) = decode(folder / "s.csv").tremor, decode(folder / "t.csv").tremor
+    (before,), (after,) = decode(folder / "s.csv").outcomes, decode(folder / "t.csv").outcomes
     np.testing.assert_array_equal(before.fractions, after.fractions)
     np.testing.assert_array_equal(before.any_tremor, after.any_tremor)

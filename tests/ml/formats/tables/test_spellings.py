@@ -115,9 +115,9 @@ TREMOR = {
 def test_tremor_in_another_spelling_is_the_same_minutes(write, tmp_path, text):
     path = write(text)
     assert sniff(path) == "tremor"
-    (got,), (plain,) = decode_strivepd(path).tremor, decode_strivepd(write(WIDE, "wide.csv")).tremor
+    (got,), (plain,) = decode_strivepd(path).outcomes, decode_strivepd(write(WIDE, "wide.csv")).outcomes
     redact_table(path, tmp_path / "clean.csv", "tremor", DecodeOptions())
-    (clean,) = decode_strivepd(tmp_path / "clean.csv").tremor
+    (clean,) = decode_strivepd(tmp_path / "clean.csv").outcomes
     for one in (got, clean):
         for name in ("start_unix_s", "duration_s", "fractions", "any_tremor"):
             np.testing.assert_allclose(getattr(one, name), getattr(plain, name), atol=1e-12)
@@ -125,7 +125,7 @@ def test_tremor_in_another_spelling_is_the_same_minutes(write, tmp_path, text):
 
 def test_one_minute_without_shares_does_not_hide_that_the_others_are_in_per_cent(write):
     text = TREMOR["per cent"] + "2024-03-14T10:07:00Z,,,,,,\n"
-    (got,) = decode_strivepd(write(text)).tremor
+    (got,) = decode_strivepd(write(text)).outcomes
     np.testing.assert_allclose(got.fractions[:2].sum(axis=1), 1.0)
 
 

@@ -311,7 +311,7 @@ def test_no_bytes_whatever_raise_anything_but_a_clear_error(tmp_path_factory, co
     found, said = (), ""
     try:
         decoded = decode(path)
-        found = (*decoded.recordings, *decoded.tremor, *decoded.grasps)
+        found = (*decoded.recordings, *decoded.outcomes)
     except UndecodableFile as error:
         said = error.what and error.where and error.hint
     assert found or said
