@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from app.overview.trail_rows import Names, Row
+from app.planning.visit_day.schemas import ASKED
 from app.study.adverse_event_types import EVENT_KINDS
 from app.study.data_queries import ASKED_ABOUT
 
@@ -13,7 +14,7 @@ _JOBS = {
 }  # fmt: skip
 _ENTERED = {
     "start": "the start of", "stop": "the end of", "session_end": "the end of", "stop_cause": "why it was stopped early, of",
-    "rating": "a rating of", "grasp": "a grasp test of", "dyskinesia": "dyskinesia in", "speech": "speech in", "gait": "gait in",
+    **{one.kind: f"{one.one} of" for one in ASKED}, "dyskinesia": "dyskinesia in", "speech": "speech in", "gait": "gait in",
     "note": "a note on", "adverse_event": "an adverse event in", "skip": "the skipping of", "repeat": "the repeating of",
     "clinical_settings": "the clinical settings of", "dose": "a dose of the day of",
 }  # fmt: skip

@@ -11,8 +11,8 @@ from app.planning.plans.designs import NEAR, Planned, SideBound, delivered_ma, i
 from app.planning.plans.suggested import Held
 from app.planning.protocol.session_order import Order
 from app.planning.slots.matching import Deviation
-from app.planning.visit_day.record import Contradiction, Entry, grasp_hz, moment
-from app.planning.visit_day.schemas import SlotOut
+from app.planning.visit_day.record import Contradiction, Entry, moment
+from app.planning.visit_day.schemas import ASKED, ASKED_BY_KIND, Asked, SlotOut
 from app.planning.visit_day.screening import Found
 from app.platform.web.charts import counted
 from app.platform.web.numbers import stated
@@ -23,6 +23,7 @@ from app.tables.sessions import Controller
 from ml.deploy.manifest import BundleManifest
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS, NEAR_SPREAD
 from ml.ope import Suggestion
+from ml.outcomes import BY_FIELD
 
 LEAVE_AT_ONCE = "A stop, an adverse event or a lost link: back to cDBS at once; the rest of the session is not made up for."
 
@@ -164,7 +165,8 @@ def screened(found: Sequence[Found]) -> str:
 DAY_STATES = {"waiting": "to come", "running": "running", "asked": "to be rated", "done": "finished", "skipped": "skipped"}
 """How far a session of the clinic day is."""
 _MATTERS = {
-    "start": "starts", "stop": "stops", "stop_cause": "causes of the early stop", "rating": "ratings", "grasp": "grasp tests",
+    "start": "starts", "stop": "stops", "stop_cause": "causes of the early stop",
+    **{one.kind: one.several for one in ASKED},
     "skip": "reasons for skipping it", "speech": "grades of speech", "gait": "grades of gait", "dyskinesia": "grades of dyskinesia",
 }  # fmt: skip
 
@@ -187,11 +189,11 @@ def from_the_day(who: Sequence[str]) -> str:
     return "entered on the clinic day" + (f" by {', '.join(who)}" if who else "")
 
 
-def day_differs(name: str, entered: float, known: float | None) -> str:
+def day_differs(asked: Asked, entered: float, known: float | None) -> str:
     """Describe a QoC that the clinic day has otherwise than the session, which keeps its own; `known` None: a person took it back."""
-    what, unit = {"rating": ("rating", ""), "grasp_hz": ("grasp frequency", " Hz")}[name]
-    own = "none" if known is None else f"{stated(known, 3)}{unit}"
-    return f"The clinic day has a {what} of {stated(entered, 3)}{unit}, the session {own}; the session keeps its own."
+    what = BY_FIELD[asked.field].label.lower()
+    own = "none" if known is None else f"{stated(known, 3)}{asked.unit}"
+    return f"The clinic day has a {what} of {stated(entered, 3)}{asked.unit}, the session {own}; the session keeps its own."
 
 
 def day_ended(elapsed_s: float, recorded_s: float) -> str:
@@ -207,8 +209,8 @@ def open_contradiction(kind: str) -> str:
 
 def _entered(entry: Entry) -> str:
     payload = entry.payload
-    if entry.kind == "grasp":
-        return f"{grasp_hz(payload):.2f} Hz"
+    if entry.kind in ASKED_BY_KIND:
+        return ASKED_BY_KIND[entry.kind].words(payload)
     return str(payload.get("value") or payload.get("grade") or payload.get("reason") or payload.get("cause") or entry.kind)
 
 

@@ -22,15 +22,15 @@ from app.planning import wording
 from app.planning.visit_day import service
 from app.planning.visit_day.record import MANY, contradictions, last_attempt, open_severe, outcomes_of, standing, state_of
 from app.planning.visit_day.schemas import (
+    ASKED,
+    ASKED_BY_KIND,
     AdverseEventPayload,
     DeviceTime,
     DosePayload,
     EntryIn,
     GradePayload,
-    GraspPayload,
     NotePayload,
     Nothing,
-    RatingPayload,
     ReasonPayload,
     StopCausePayload,
 )
@@ -61,7 +61,7 @@ class _When(Model):
 
 _PAYLOADS: dict[str, type[Model]] = {
     "start": Nothing, "stop": Nothing, "session_end": Nothing, "clinical_settings": Nothing, "stop_cause": StopCausePayload,
-    "rating": RatingPayload, "grasp": GraspPayload, "dyskinesia": GradePayload, "speech": GradePayload, "gait": GradePayload,
+    **{one.kind: one.payload for one in ASKED}, "dyskinesia": GradePayload, "speech": GradePayload, "gait": GradePayload,
     "note": NotePayload, "skip": ReasonPayload, "repeat": ReasonPayload, "adverse_event": AdverseEventPayload,
     "dose": DosePayload,
 }  # fmt: skip
@@ -71,8 +71,7 @@ _LABELS = {
     "kind": "Adverse event",
     "severity": "Severity",
     "note": "What happened",
-    "value": "Rating",
-    "hz": "Grasp frequency",
+    **{field: label for one in ASKED for field, label in one.labels.items()},
     "grade": "Grade",
     "text": "Note",
     "reason": "Reason",
@@ -138,7 +137,7 @@ def _entry(values: FormData) -> tuple[Any, int]:
     kind = str(values.get("kind", ""))
     if kind not in _PAYLOADS:
         raise Invalid(f"'{kind}' is nothing that can be entered.", "Load the page again.")
-    texts = {k: str(v) for k, v in values.items()} | ({"method": "typed"} if kind == "grasp" else {})
+    texts = {k: str(v) for k, v in values.items()} | dict(ASKED_BY_KIND[kind].form if kind in ASKED_BY_KIND else {})
     payload = parse(_PAYLOADS[kind], texts | _event(texts) if kind == "adverse_event" else texts, _LABELS)
     numbers = {name: _number(texts.get(name, "")) for name in ("plan_item_id", "attempt", "plan_id")}
     replaces = [u for u in texts.get("replaces", "").split() if u]

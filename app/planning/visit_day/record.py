@@ -6,14 +6,12 @@ matter (two tablets, or two people), nothing is taken until somebody decides bet
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any, Literal, Protocol
 
-import numpy as np
-
-from ml.qoc import grasp_frequency
+from app.planning.visit_day.schemas import ASKED, ASKED_BY_KIND
 
 SAME_MOMENT_S = 5.0
 """Two starts (or stops) of one session within this time are the same event pressed twice."""
@@ -91,12 +89,12 @@ class SlotOutcome:
     """What was entered about the attempt of a session that counts; None where nothing was, or where two entries contradict.
 
     Attributes:
-        rating: 1 to 10. grasp_hz: Hz. dyskinesia, speech, gait: `none`, `mild` or `severe`. notes: in order.
-        contradictions: kinds of which two different entries stand. entered_by: of rating and grasp, by name.
+        qocs: of the outcomes that are asked for, by `Outcome.field`; those that were entered.
+        dyskinesia, speech, gait: `none`, `mild` or `severe`. notes: in order.
+        contradictions: kinds of which two different entries stand. entered_by: of the outcomes, by kind of entry.
     """
 
-    rating: int | None = None
-    grasp_hz: float | None = None
+    qocs: Mapping[str, float] = field(default_factory=dict)
     dyskinesia: str | None = None
     speech: str | None = None
     gait: str | None = None
@@ -154,8 +152,8 @@ def agree(one: Entry, other: Entry) -> bool:
     """Whether two entries of one matter say the same."""
     if one.kind in ("start", "stop"):
         return abs((moment(one) - moment(other)).total_seconds()) <= SAME_MOMENT_S
-    if one.kind == "grasp":
-        return grasp_hz(one.payload) == grasp_hz(other.payload)
+    if (asked := ASKED_BY_KIND.get(one.kind)) is not None:
+        return asked.value(one.payload) == asked.value(other.payload)
     return bool(one.payload == other.payload)
 
 
@@ -180,13 +178,6 @@ def _grade(entry: Entry) -> str | None:
     if entry.kind in GRADED:
         return str(entry.payload["grade"])
     return str(entry.payload["severity"]) if entry.kind == "adverse_event" else None
-
-
-def grasp_hz(payload: dict[str, Any]) -> float:
-    """Grasp frequency of a test, Hz (eq:grasp_speed)."""
-    if payload["method"] == "typed":
-        return float(payload["hz"])
-    return grasp_frequency(np.asarray(payload["taps_s"], dtype=np.float64))
 
 
 def state_of(entries: Sequence[Entry], plan_item_id: int) -> State:
@@ -231,12 +222,11 @@ def outcome_of(entries: Sequence[Entry], item: int, number: int) -> SlotOutcome:
     said = said_of(entries, item, number)
     mine = [e for e in standing(entries) if (e.plan_item_id, e.attempt) == (item, number)]
     return SlotOutcome(
-        rating=said["rating"].payload["value"] if "rating" in said else None,
-        grasp_hz=grasp_hz(said["grasp"].payload) if "grasp" in said else None,
+        qocs={one.field: one.value(said[one.kind].payload) for one in ASKED if one.kind in said},
         **{name: said[name].payload["grade"] if name in said else None for name in GRADED},
         notes=tuple(e.payload["text"] for e in mine if e.kind == "note"),
         contradictions=tuple(c.kind for c in contradictions(entries) if (c.plan_item_id, c.attempt) == (item, number)),
-        entered_by={name: said[name].entered_by for name in ("rating", "grasp") if name in said},
+        entered_by={name: said[name].entered_by for name in ASKED_BY_KIND if name in said},
     )
 
 

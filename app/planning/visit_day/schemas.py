@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import datetime as dt
 import itertools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
+import numpy as np
 from pydantic import AfterValidator, Field, Strict, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.characteristics import PlannedDose
 from app.tables.adverse_events import EventKind
 from app.tables.visits import Drug
+from ml.qoc import grasp_frequency
 
 MOST_TAPS = 200
 _LONGEST_OFFSET_MS = 10**13  # a tablet whose battery was empty may wake in 1970, and what it holds must be taken all the same
@@ -72,6 +75,69 @@ class GraspPayload(Model):
         elif any(later <= earlier for earlier, later in itertools.pairwise(self.taps_s)):
             raise ValueError("the taps must follow one another")
         return self
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """An outcome that the clinic day asks for after a session.
+
+    Attributes:
+        kind: of its entries. field: of `Outcome.field`. payload: of its entries. form: fields that the plain form adds.
+        labels: of the form's fields.
+        one, several: its entries in words. unit: after a value in a sentence.
+        value: of a payload, in the outcome's unit. decimals: of a value in a list of entries; None where it is shown as entered.
+    """
+
+    kind: str
+    field: str
+    payload: type[Model]
+    form: Mapping[str, str]
+    labels: Mapping[str, str]
+    one: str
+    several: str
+    unit: str
+    value: Callable[[Mapping[str, Any]], float]
+    decimals: int | None = None
+
+    def words(self, payload: Mapping[str, Any]) -> str:
+        """Return the value of a payload in words."""
+        value = self.value(payload)
+        return str(value) if self.decimals is None else f"{value:.{self.decimals}f}{self.unit}"
+
+
+def _grasp_hz(payload: Mapping[str, Any]) -> float:
+    """Compute the grasp frequency of a test, Hz (eq:grasp_speed)."""
+    if payload["method"] == "typed":
+        return float(payload["hz"])
+    return grasp_frequency(np.asarray(payload["taps_s"], dtype=np.float64))
+
+
+ASKED = (
+    Asked(
+        kind="rating",
+        field="rating",
+        payload=RatingPayload,
+        form={},
+        labels={"value": "Rating"},
+        one="a rating",
+        several="ratings",
+        unit="",
+        value=lambda payload: payload["value"],
+    ),
+    Asked(
+        kind="grasp",
+        field="grasp_hz",
+        payload=GraspPayload,
+        form={"method": "typed"},
+        labels={"hz": "Grasp frequency"},
+        one="a grasp test",
+        several="grasp tests",
+        unit=" Hz",
+        value=_grasp_hz,
+        decimals=2,
+    ),
+)
+ASKED_BY_KIND: Mapping[str, Asked] = {one.kind: one for one in ASKED}
 
 
 class GradePayload(Model):

@@ -14,6 +14,7 @@ from app.accounts.permissions import Caller
 from app.planning import wording
 from app.planning.visit_day import repository
 from app.planning.visit_day.record import GRADED, MILD, Entry, attempt_at, moment, outcome_of, said_of, standing
+from app.planning.visit_day.schemas import ASKED
 from app.platform.database import set_reason
 from app.study import adverse_events as events
 from app.study.adverse_event_types import AdverseEventIn
@@ -24,14 +25,12 @@ from app.tables.plans import DayEntry
 from app.tables.sessions import StudySession
 from app.tables.visits import Visit
 
-QOCS = ("rating", "grasp_hz")
-"""Outcomes that a clinic day has."""
 SAME_END = timedelta(seconds=60)
 """A stop that was entered within this time of its recording's end is that end: it is pressed by hand."""
 
 
 def take_outcomes(db: Session, session: StudySession, caller: Caller) -> list[str]:
-    """Give a confirmed session the rating, grasp frequency, mild side effects and early stop that were entered about its place.
+    """Give a confirmed session the outcomes, mild side effects and early stop that were entered about its place.
 
     They are those of the attempt that its recording began nearest to. What a person typed for the session, or a file gave, stays.
     Contradicting entries count for nothing. Again, it adds nothing.
@@ -55,7 +54,7 @@ def take_outcomes(db: Session, session: StudySession, caller: Caller) -> list[st
     number = attempt_at(entries, session.plan_item_id, session.started_at)
     found = outcome_of(entries, session.plan_item_id, number)
     reason = wording.from_the_day(sorted(set(found.entered_by.values())))
-    follow_day(db, session, {name: getattr(found, name) for name in QOCS}, caller.label, reason)
+    follow_day(db, session, {one.field: found.qocs.get(one.field) for one in ASKED}, caller.label, reason)
     _early_stop(session, entries, number, db)
     _mild(db, session, entries, number, caller)
     db.flush()
@@ -74,10 +73,10 @@ def differences(session: StudySession, entries: Sequence[DayEntry]) -> list[str]
     number = attempt_at(entries, item, session.started_at)
     found = outcome_of(entries, item, number)
     told = []
-    for name in QOCS:
-        entered, known = getattr(found, name), getattr(session.qoc, name, None)
+    for one in ASKED:
+        entered, known = found.qocs.get(one.field), getattr(session.qoc, one.field, None)
         if entered is not None and entered != known:
-            told.append(wording.day_differs(name, entered, known))
+            told.append(wording.day_differs(one, entered, known))
     elapsed = elapsed_s(entries, item, number)
     if elapsed is not None and abs(elapsed - session.duration_s) > SAME_END.total_seconds():
         told.append(wording.day_ended(elapsed, session.duration_s))

@@ -102,7 +102,7 @@ def test_outcomes_of_a_session_are_those_of_its_last_attempt(clinic_day: Any, db
     )
     first, second = clinic_day.slots[:2]
     found, times = slot_outcomes(db, clinic_day.plan), slot_times(db, clinic_day.plan)
-    assert (found[first].rating, found[first].grasp_hz, found[first].gait) == (8, 1.5, "mild")
+    assert (found[first].qocs, found[first].gait) == ({"rating": 8, "grasp_hz": 1.5}, "mild")
     assert [(a.number, a.repeated_because) for a in times[first].attempts] == [(1, "the cable was loose"), (2, None)]
     assert times[first].stop_cause is None
     assert times[second].skipped_because == "no time left"
@@ -114,19 +114,19 @@ def test_two_ratings_count_for_nothing_until_one_is_chosen(clinic_day: Any, db: 
     clinic_day.outcomes(one, other)
     slot = clinic_day.slots[0]
     found = slot_outcomes(db, clinic_day.plan)[slot]
-    assert (found.rating, found.contradictions) == (None, ("rating",))
+    assert (found.qocs.get("rating"), found.contradictions) == (None, ("rating",))
     page = clinic_day.client.get(f"/visit-day/{clinic_day.visit}", headers={"Accept": "text/html"}).text
     assert "2 different ratings: 7 by admin@clinic.example" in page
     clinic_day.outcomes(clinic_day.entry("rating", {"value": 4}, replaces=[one["uuid"], other["uuid"]]))
     db.expire_all()
     found = slot_outcomes(db, clinic_day.plan)[slot]
-    assert (found.rating, found.contradictions) == (4, ())
+    assert (found.qocs["rating"], found.contradictions) == (4, ())
 
 
 def test_a_correction_takes_the_place_of_what_it_names(clinic_day: Any, db: Session) -> None:
     first = clinic_day.entry("rating", {"value": 7})
     clinic_day.outcomes(first, clinic_day.entry("rating", {"value": 6}, replaces=[first["uuid"]]))
-    assert slot_outcomes(db, clinic_day.plan)[clinic_day.slots[0]].rating == 6
+    assert slot_outcomes(db, clinic_day.plan)[clinic_day.slots[0]].qocs["rating"] == 6
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def test_entries_about_a_replaced_plan_stay_true(clinic_day: Any, db: Session) -
     assert client.post(f"/api/v1/visits/{clinic_day.visit}/plan", json=draft).status_code == 201
     assert client.get(f"/api/v1/visits/{clinic_day.visit}/day").status_code == 409
     assert clinic_day.outcomes(clinic_day.entry("rating", {"value": 7})) == ["stored"]
-    assert slot_outcomes(db, old)[old_slots[0]].rating == 7
+    assert slot_outcomes(db, old)[old_slots[0]].qocs["rating"] == 7
 
 
 def test_a_locked_visit_refuses_entries_and_the_tablet_may_send_them_again_later(clinic_day: Any, db: Session) -> None:
