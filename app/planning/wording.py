@@ -11,8 +11,9 @@ from app.planning.plans.designs import NEAR, Planned, SideBound, delivered_ma, i
 from app.planning.plans.suggested import Held
 from app.planning.protocol.session_order import Order
 from app.planning.slots.matching import Deviation
+from app.planning.visit_day.asked import ASKED, ASKED_BY_KIND, Asked
 from app.planning.visit_day.record import Contradiction, Entry, moment
-from app.planning.visit_day.schemas import ASKED, ASKED_BY_KIND, Asked, SlotOut
+from app.planning.visit_day.schemas import SlotOut
 from app.planning.visit_day.screening import Found
 from app.platform.web.charts import counted
 from app.platform.web.numbers import stated

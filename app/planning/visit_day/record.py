@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any, Literal, Protocol
 
-from app.planning.visit_day.schemas import ASKED, ASKED_BY_KIND
+from app.planning.visit_day.asked import ASKED, ASKED_BY_KIND
 
 SAME_MOMENT_S = 5.0
 """Two starts (or stops) of one session within this time are the same event pressed twice."""
