@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from app.overview.trail_rows import Names, Row
-from app.planning.visit_day.asked import ASKED
+from app.planning.visit_day.record import ASKED
 from app.study.adverse_event_types import EVENT_KINDS
 from app.study.data_queries import ASKED_ABOUT
 

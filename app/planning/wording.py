@@ -11,8 +11,7 @@ from app.planning.plans.designs import NEAR, Planned, SideBound, delivered_ma, i
 from app.planning.plans.suggested import Held
 from app.planning.protocol.session_order import Order
 from app.planning.slots.matching import Deviation
-from app.planning.visit_day.asked import ASKED, ASKED_BY_KIND, Asked
-from app.planning.visit_day.record import Contradiction, Entry, moment
+from app.planning.visit_day.record import ASKED, ASKED_BY_KIND, AskedOutcome, Contradiction, Entry, moment
 from app.planning.visit_day.schemas import SlotOut
 from app.planning.visit_day.screening import Found
 from app.platform.web.charts import counted
@@ -190,11 +189,11 @@ def from_the_day(who: Sequence[str]) -> str:
     return "entered on the clinic day" + (f" by {', '.join(who)}" if who else "")
 
 
-def day_differs(asked: Asked, entered: float, known: float | None) -> str:
+def day_differs(outcome: AskedOutcome, entered: float, known: float | None) -> str:
     """Describe a QoC that the clinic day has otherwise than the session, which keeps its own; `known` None: a person took it back."""
-    what = BY_FIELD[asked.field].label.lower()
-    own = "none" if known is None else f"{stated(known, 3)}{asked.unit}"
-    return f"The clinic day has a {what} of {stated(entered, 3)}{asked.unit}, the session {own}; the session keeps its own."
+    what = BY_FIELD[outcome.field].label.lower()
+    own = "none" if known is None else f"{stated(known, 3)}{outcome.unit}"
+    return f"The clinic day has a {what} of {stated(entered, 3)}{outcome.unit}, the session {own}; the session keeps its own."
 
 
 def day_ended(elapsed_s: float, recorded_s: float) -> str:

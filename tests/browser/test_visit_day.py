@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from sqlalchemy import text
 
 from app.accounts import service as accounts
-from app.planning.visit_day.asked import DeviceTime
+from app.planning.visit_day.record import DeviceTime
 from app.platform.database import transaction
 from app.tables.accounts import Role
 from tests.browser.conftest import FLAGS, PASSWORD, Watched, kill_browser, program

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
-from app.planning.visit_day.record import contradictions, last_attempt, open_severe, state_of
-from app.planning.visit_day.asked import DeviceTime
+from app.planning.visit_day.record import DeviceTime, contradictions, last_attempt, open_severe, state_of
 from app.planning.visit_day.screening import rules, screen
 from tests.browser.conftest import Watched
 from tests.browser.day_page import open_day

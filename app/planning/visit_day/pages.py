@@ -20,8 +20,18 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.planning import wording
 from app.planning.visit_day import service
-from app.planning.visit_day.asked import ASKED, ASKED_BY_KIND, DeviceTime
-from app.planning.visit_day.record import MANY, contradictions, last_attempt, open_severe, outcomes_of, standing, state_of
+from app.planning.visit_day.record import (
+    ASKED,
+    ASKED_BY_KIND,
+    MANY,
+    DeviceTime,
+    contradictions,
+    last_attempt,
+    open_severe,
+    outcomes_of,
+    standing,
+    state_of,
+)
 from app.planning.visit_day.schemas import (
     AdverseEventPayload,
     DosePayload,

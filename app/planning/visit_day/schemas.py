@@ -10,7 +10,7 @@ from uuid import UUID
 
 from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
-from app.planning.visit_day.asked import EntryBase, GraspEntry, RatingEntry, SessionEntry
+from app.planning.visit_day.record import EntryBase, GraspEntry, RatingEntry, SessionEntry
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.study.characteristics import PlannedDose
 from app.tables.adverse_events import EventKind

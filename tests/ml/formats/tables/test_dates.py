@@ -20,7 +20,7 @@ def minute(write, header, cell):
     """Read the one minute of a tremor export: its start, and what is flagged."""
     path = write(HEAD.format(time=header) + f"{cell},1,0,0,0,0,0\n")
     decoded = decode(path)
-    return datetime.fromtimestamp(decoded.tremor[0].start_unix_s[0], UTC), repr(decoded.reports[0].flagged)
+    return datetime.fromtimestamp(decoded.outcomes[0].start_unix_s[0], UTC), repr(decoded.reports[0].flagged)
 
 
 @pytest.mark.parametrize(
