@@ -9,6 +9,7 @@ import json
 import re
 import subprocess
 import sys
+import time
 import zipfile
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -216,11 +217,20 @@ def test_the_bundles_own_runner_runs_a_blinded_session_and_refuses_it_a_second_t
     call = [sys.executable, "-m", "controller", f"--key={key}", "--time=20", "--run", "--log=log.csv", f"--ledger={tmp_path / 'ledger'}"]
     m = json.loads((tmp_path / "manifest.json").read_bytes())
     hello = f"hello 1 P1 - {m['beta_unit']} {m['beta_source']} {1000 * m['period_s']:g}\n"
-    first = subprocess.run(call, cwd=tmp_path, input=hello + "stop\n", capture_output=True, text=True, check=False)
-    assert first.returncode == 0, first.stderr
-    assert "test vectors agree" in first.stderr
-    assert "worst difference" not in first.stderr, "0 of a fraction is that of a schedule"
-    assert "blinded: what a decision takes stands masked in its log" in first.stdout
+    first = subprocess.Popen(call, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1)
+    assert first.stdin is not None
+    first.stdin.write(hello)
+    began, seq = time.monotonic(), 0
+    while not any("decided" in run.read_text() for run in tmp_path.glob("ledger/*.run")) and time.monotonic() < began + 60:
+        if (passed := time.monotonic() - began) >= m["period_s"] * (seq + 1):
+            first.stdin.write(f"beta {seq} {1000 * passed:.0f} {1.4 + 0.1 * (seq % 3)} {m['beta_unit']} {m['beta_source']}\n")
+            seq += 1
+        time.sleep(0.05)
+    out, said = first.communicate("stop\n", timeout=120)
+    assert first.returncode == 0, said
+    assert "test vectors agree" in said
+    assert "worst difference" not in said, "0 of a fraction is that of a schedule"
+    assert "blinded: what a decision takes stands masked in its log" in out
     again = subprocess.run([*call[:-2], "--log=b.csv", call[-1]], cwd=tmp_path, input=hello, capture_output=True, text=True, check=False)
     assert (again.returncode, "a slot runs once" in again.stderr) == (1, True)
 
