@@ -7,7 +7,7 @@ from typing import cast
 
 from app.tables.participants import SettingsVersion
 from ml.formats import DecodedFile, TraceLog, TraceSource
-from ml.formats.tables.numbers import unit_name
+from ml.formats.tables.cells.numbers import unit_name
 
 
 @dataclass(frozen=True)

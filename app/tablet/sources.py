@@ -21,8 +21,8 @@ from ml.deploy.runtime.envelope import BetaSample, Signal
 from ml.deploy.runtime.protocol import number
 from ml.deploy.streaming import StreamingBeta, split_by_period
 from ml.formats import DecodeOptions, RecordingLog, TraceLog, UndecodableFile, decode, sniff
-from ml.formats.tables.delimited import read_delimited
-from ml.formats.tables.numbers import column_name, unit_name
+from ml.formats.tables.cells.delimited import read_delimited
+from ml.formats.tables.cells.numbers import column_name, unit_name
 from ml.signals import Stretch, band_rows
 
 LFP_UNITS = {"uV": 1.0, "mV": 1000.0, "V": 1e6}

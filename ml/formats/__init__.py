@@ -30,7 +30,7 @@ from ml.formats.redaction_record import REDACTOR_VERSION, Redaction, pseudonym
 from ml.formats.registry import BY_KIND, DEVICE_NAMES, DEVICES, FILE_NAMES, SOURCE_NAMES, DeviceFormat
 from ml.formats.source import Source
 from ml.formats.tables import TABLES, decode_table, kind_of_text, redact_table
-from ml.formats.tables.delimited import utf16_without_mark
+from ml.formats.tables.cells.delimited import utf16_without_mark
 from ml.formats.tables.grasps import GraspLog
 from ml.formats.tables.outcome_tables import OUTCOME_TABLES
 from ml.formats.tables.strivepd import TremorLog

@@ -26,8 +26,8 @@ from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.tables.accounts import Study
 from app.tables.uploads import ColumnMapping
+from ml.formats.tables.cells.numbers import known_unit
 from ml.formats.tables.mapping.model import UNITS
-from ml.formats.tables.numbers import known_unit
 
 router = APIRouter()
 

@@ -10,9 +10,9 @@ from zoneinfo import available_timezones
 from app.ingest.mappings.schemas import MappedColumnIn, MappingIn
 from app.platform.errors import Invalid
 from ml.formats import OUTCOME_TABLES
+from ml.formats.tables.cells.numbers import unit_name
 from ml.formats.tables.mapping.model import AMPLITUDES, SIGNALS, UNITS, WRITTEN, MappedColumn, TableMapping
 from ml.formats.tables.mapping.times import is_absolute
-from ml.formats.tables.numbers import unit_name
 
 ROLE_NAMES = {
     "time": "Time",

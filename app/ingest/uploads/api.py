@@ -24,7 +24,7 @@ from app.study.settings_types import BetaSource
 from app.tables.participants import Hemisphere
 from app.tables.sessions import Controller
 from app.tables.uploads import UploadFile as UploadFileRow
-from ml.formats.tables.numbers import unit_name
+from ml.formats.tables.cells.numbers import unit_name
 
 router = APIRouter(route_class=UploadRoute, tags=["uploads"], responses=problems(401, 403, 404, 422))
 

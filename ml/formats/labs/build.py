@@ -18,7 +18,7 @@ from ml.formats.labs.dose import amplitude_traces
 from ml.formats.labs.names import UV
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import EventLog, FileReport, Hemisphere, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
-from ml.formats.tables.numbers import known_unit
+from ml.formats.tables.cells.numbers import known_unit
 from ml.signals import Stretch, row_means
 
 MOST_CHANNELS = 64

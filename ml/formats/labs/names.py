@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
+from ml.formats.tables.cells.numbers import known_unit
 from ml.formats.tables.columns import LFP_SCALE
-from ml.formats.tables.numbers import known_unit
 
 Kind = Literal["lfp", "stimulation", "acceleration", "other"]
 Side = Literal["left", "right"]

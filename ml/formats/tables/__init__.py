@@ -8,8 +8,8 @@ from pathlib import Path
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, UndecodableFile
 from ml.formats.source import Source
+from ml.formats.tables.cells.delimited import read_headers
 from ml.formats.tables.control_log import decode_log, is_log
-from ml.formats.tables.delimited import read_headers
 from ml.formats.tables.mapping import decode_mapped
 from ml.formats.tables.outcome_tables import OUTCOME_TABLES
 from ml.formats.tables.redact import redact_table

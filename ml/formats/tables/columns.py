@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
-from ml.formats.recording import FileReport, UndecodableFile
+from ml.formats.recording import UndecodableFile
 from ml.formats.source import Source
-from ml.formats.tables.dates import written_s, zone_named
-from ml.formats.tables.delimited import TextTable, read_delimited, read_head, rows_behind
-from ml.formats.tables.numbers import MISSING, column_name, known_unit, shown, unit_name
-from ml.formats.tables.plain import read_plain
+from ml.formats.tables.cells.dates import written_s, zone_named
+from ml.formats.tables.cells.delimited import TextTable, read_delimited, read_head, rows_behind
+from ml.formats.tables.cells.numbers import MISSING, column_name, known_unit, shown, unit_name
+from ml.formats.tables.cells.plain import read_plain
 
 TIME_NAMES = ("t_s", "t", "time_s", "time", "seconds", "t_sec", "timestamp", "datetime", "date_time", "time_utc")
 MILLISECOND_NAMES = ("t_ms", "time_ms", "milliseconds")
@@ -36,12 +36,6 @@ PER_UNIT: dict[str, dict[str | None, float]] = {
 """How many of the header's unit make 1 mA, or the fraction 1."""
 CLOCK_CHANGE_SPREAD_S = 600.0
 """Dates that go back by an hour, give or take so much, are those of a clock that was changed."""
-LARGEST = {"amplitude_ma": 25.5, "amplitude_fraction": 10.0}
-"""25.5 mA is the largest amplitude that a stimulator like RC+S or Percept can be set to; a fraction above 10 was meant as percent."""
-RATIO_SPREAD = 0.05
-"""mA per fraction may vary by this share, for rounded cells, and still be one cDBS amplitude."""
-LEAST_FRACTION = 0.05
-"""Below this fraction rounding alone moves the ratio."""
 LONGEST_TABLE_S = 7 * 86_400.0
 """No session's table reaches further from the session's start, before it or after it."""
 LATEST_FIRST_S = 3600.0
@@ -364,46 +358,3 @@ def _arrow_floats(column: object) -> NDArray[np.float64]:
     floats = np.array(floats, dtype=np.float64)
     floats[~np.isfinite(floats)] = np.nan
     return floats
-
-
-def checked_amplitude(role: str, columns: Columns, report: FileReport) -> NDArray[np.float64]:
-    """Check an amplitude column's numbers [rows] in mA or as a fraction, NaN where there is none.
-
-    Raises:
-        UndecodableFile: an amplitude that no stimulator gives; names line and column.
-    """
-    values = columns.values[role]
-    if lost := int(np.sum(np.isnan(values))):
-        report.flagged.append(f"{lost} rows without a number in {role}: kept as gaps")
-    values = values / PER_UNIT[role][columns.units[role]]
-    if (negative := np.flatnonzero(values < 0)).size:
-        hint = "Amplitudes are 0 or more; leave the cell empty if unknown."
-        raise columns.error(f"negative amplitude {values[negative[0]]:g}", role, hint, int(negative[0]))
-    if (absurd := np.flatnonzero(values > LARGEST[role] * (1 + 1e-9))).size:
-        raise _absurd(role, float(values[absurd[0]]), columns, int(absurd[0]))
-    if role == "amplitude_fraction" and (above := int(np.sum(values > 1))):
-        report.flagged.append(f"{above} rows have an amplitude above the cDBS amplitude (fraction > 1); kept as they are")
-    return values
-
-
-def _absurd(role: str, value: float, columns: Columns, row: int) -> UndecodableFile:
-    largest = LARGEST[role]
-    if role == "amplitude_ma":
-        what = f"amplitude {value:g} mA, more than the {largest:g} mA that a stimulator can give"
-        hint = "Give mA; if the numbers are in uA, name the column amplitude (uA)."
-    else:
-        what = f"amplitude fraction {value:g}, more than {largest:g} times the cDBS amplitude"
-        hint = "Give 1 for the cDBS amplitude; name the column amplitude_fraction (%) for percent or amplitude_ma for mA."
-    return columns.error(what, role, hint, row)
-
-
-def compare_amplitudes(milliamps: NDArray[np.float64], fraction: NDArray[np.float64], report: FileReport) -> None:
-    """Say which of two amplitude columns is used, and whether both can be true for one cDBS amplitude."""
-    report.ignored.append("amplitude_fraction: amplitude_ma is given too and is what is stored")
-    both = np.isfinite(milliamps) & np.isfinite(fraction) & (fraction > LEAST_FRACTION)
-    if not both.any():
-        return
-    ratio = milliamps[both] / fraction[both]
-    if ratio.max() > (1 + RATIO_SPREAD) * ratio.min():
-        runs = f"runs from {ratio.min():.3g} to {ratio.max():.3g} mA"
-        report.flagged.append(f"amplitude_ma and amplitude_fraction disagree: their ratio, the cDBS amplitude, {runs}")

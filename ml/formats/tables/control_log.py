@@ -23,10 +23,10 @@ from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, TraceSource, UndecodableFile
 from ml.formats.redaction_record import Redaction
 from ml.formats.source import Source
+from ml.formats.tables.cells.numbers import NotANumber, known_unit, parse_number, shown
 from ml.formats.tables.columns import Columns
 from ml.formats.tables.log_head import ENDS, MEND, Ran, read_head
 from ml.formats.tables.masked import row_of
-from ml.formats.tables.numbers import NotANumber, known_unit, parse_number, shown
 from ml.formats.tables.steps import GRID_TOLERANCE, decode_columns
 
 MARK = b"# betaloop controller log"

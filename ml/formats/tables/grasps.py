@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, Hemisphere, OutcomeLog, UndecodableFile
 from ml.formats.source import Source
+from ml.formats.tables.cells.delimited import TextTable, read_delimited
+from ml.formats.tables.cells.numbers import column_name, shown
 from ml.formats.tables.columns import BETA_NAMES
-from ml.formats.tables.delimited import TextTable, read_delimited
-from ml.formats.tables.numbers import column_name, shown
 from ml.formats.tables.outcome_table import OutcomeTable, cell
 from ml.formats.tables.removed import removed_columns
 from ml.qoc import PLAUSIBLE_INTERVAL_S

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from ml.formats.beta import LARGEST_UV, channel_spectrum, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
-from ml.formats.tables.columns import LFP_SCALE, TIME_SCALE, Columns, check_reach, checked_amplitude, compare_amplitudes
-from ml.formats.tables.numbers import known_unit
+from ml.formats.tables.amplitudes import checked_amplitude, compare_amplitudes
+from ml.formats.tables.cells.numbers import known_unit
+from ml.formats.tables.columns import LFP_SCALE, TIME_SCALE, Columns, check_reach
 from ml.signals import BRIDGE_S, Stretch, row_means, step_means
 
 GAP = 1.5

@@ -16,7 +16,8 @@ from typing import Any, cast
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import Hemisphere, UndecodableFile
-from ml.formats.tables.columns import LARGEST, LOG_KIND_LINE
+from ml.formats.tables.amplitudes import LARGEST
+from ml.formats.tables.columns import LOG_KIND_LINE
 from ml.formats.tables.masked import facts_of
 from ml.formats.tables.steps import GRID_TOLERANCE
 

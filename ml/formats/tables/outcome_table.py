@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, OutcomeLog
 from ml.formats.source import Source
-from ml.formats.tables.delimited import TextTable
+from ml.formats.tables.cells.delimited import TextTable
 
 
 class MappedCells(Protocol):

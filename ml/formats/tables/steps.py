@@ -12,17 +12,16 @@ from numpy.typing import NDArray
 
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
+from ml.formats.tables.amplitudes import checked_amplitude, compare_amplitudes
+from ml.formats.tables.cells.numbers import shown, unit_name
 from ml.formats.tables.columns import (
     TIME_SCALE,
     Columns,
     check_reach,
-    checked_amplitude,
-    compare_amplitudes,
     read_csv,
     read_parquet,
 )
 from ml.formats.tables.lfp import decode_lfp
-from ml.formats.tables.numbers import shown, unit_name
 
 GRID_TOLERANCE = 0.01
 """A time may lie this share of the period off the grid: clocks written with two decimals."""

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, OutcomeLog, UndecodableFile
 from ml.formats.source import Source
-from ml.formats.tables.dates import ChangedClocks, in_zone, named_month, spreadsheet_date, zone_of_header
-from ml.formats.tables.delimited import TextTable, read_delimited
-from ml.formats.tables.numbers import NotANumber, column_name, parse_number, shown
+from ml.formats.tables.cells.dates import ChangedClocks, in_zone, named_month, spreadsheet_date, zone_of_header
+from ml.formats.tables.cells.delimited import TextTable, read_delimited
+from ml.formats.tables.cells.numbers import NotANumber, column_name, parse_number, shown
 from ml.formats.tables.outcome_table import OutcomeTable, cell
 from ml.formats.tables.removed import removed_columns
 from ml.qoc import TREMOR_CLASSES

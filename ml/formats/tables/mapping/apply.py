@@ -15,7 +15,7 @@ from ml.formats.options import DecodeOptions
 from ml.formats.recording import UndecodableFile
 from ml.formats.redaction_record import Redaction
 from ml.formats.source import InMemory, Source
-from ml.formats.tables.delimited import MOST_TITLES, TextTable
+from ml.formats.tables.cells.delimited import MOST_TITLES, TextTable
 from ml.formats.tables.mapping.lines import Top, read_rows, read_top
 from ml.formats.tables.mapping.model import AMPLITUDES, SIGNALS, TableMapping, header_hash
 from ml.formats.tables.mapping.preview import is_row

@@ -11,9 +11,9 @@ from typing import Any
 
 from ml.formats.recording import UndecodableFile
 from ml.formats.source import Source
+from ml.formats.tables.cells.delimited import MOST_TITLES, rows_of, split_line, text_lines
+from ml.formats.tables.cells.numbers import column_name
 from ml.formats.tables.columns import LOG_COLUMNS
-from ml.formats.tables.delimited import MOST_TITLES, rows_of, split_line, text_lines
-from ml.formats.tables.numbers import column_name
 
 MOST_LINES = MOST_TITLES + 5
 """Lines that are looked at to learn how a table is written."""

@@ -9,7 +9,7 @@ from hashlib import sha256
 from typing import Any, Literal
 
 from ml.formats.recording import Hemisphere
-from ml.formats.tables.numbers import column_name
+from ml.formats.tables.cells.numbers import column_name
 from ml.formats.tables.outcome_tables import BY_KIND, OUTCOME_TABLES
 
 Holds = Literal["steps", "lfp", "tremor", "grasp"]

@@ -11,10 +11,10 @@ from typing import Any
 
 from ml.formats.recording import UndecodableFile
 from ml.formats.source import Source
-from ml.formats.tables.delimited import MOST_TITLES
+from ml.formats.tables.cells.delimited import MOST_TITLES
+from ml.formats.tables.cells.numbers import MISSING, TIME_UNITS, NotANumber, known_unit, parse_number
 from ml.formats.tables.mapping.lines import MOST_COLUMNS, Top, read_top
 from ml.formats.tables.mapping.model import header_hash
-from ml.formats.tables.numbers import MISSING, TIME_UNITS, NotANumber, known_unit, parse_number
 from ml.formats.tables.removed import is_personal
 from ml.qoc import TREMOR_CLASSES
 

@@ -30,9 +30,9 @@ from ml.formats.recording import (
     UndecodableFile,
     fingerprint,
 )
+from ml.formats.tables.cells.plain import read_plain
 from ml.formats.tables.columns import Columns
 from ml.formats.tables.mapping.model import AMPLITUDES, SIGNALS, MappedColumn
-from ml.formats.tables.plain import read_plain
 from ml.formats.tables.steps import decode_columns
 
 MARK = "# betaloop mapped table, version 1"

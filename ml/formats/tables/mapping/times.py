@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.recording import UndecodableFile
-from ml.formats.tables.dates import ChangedClocks, in_zone, named_month, spreadsheet_date
-from ml.formats.tables.delimited import TextTable
+from ml.formats.tables.cells.dates import ChangedClocks, in_zone, named_month, spreadsheet_date
+from ml.formats.tables.cells.delimited import TextTable
+from ml.formats.tables.cells.numbers import MISSING, NotANumber, parse_number, shown
 from ml.formats.tables.mapping.model import RELATIVE, UNIX, WRITTEN, TableMapping, TimeFormat
-from ml.formats.tables.numbers import MISSING, NotANumber, parse_number, shown
 
 _WRITTEN = re.compile(r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})[T ,]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,6}))?)?", re.ASCII)
 _SPAN_S = (datetime(1990, 1, 1, tzinfo=UTC).timestamp(), datetime(2200, 1, 1, tzinfo=UTC).timestamp())

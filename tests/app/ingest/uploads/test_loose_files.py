@@ -1,9 +1,11 @@
-"""Loose RC+S files are known by their content, and files of two implants or sessions are never put into one recording."""
+"""Loose and packed files: RC+S files are known by their content, and gzip and tar give the same session as a zip."""
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
+import tarfile
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ import pytest
 
 from app.ingest.uploads.incoming import Incoming, arrange
 from app.platform import files
-from tests.app.ingest.conftest import device_zip, loose
+from tests.app.ingest.conftest import device_zip, loose, steady
 
 INFO = {"DeviceId": "NPC1", "SessionId": "1700000000000"}
 
@@ -110,3 +112,36 @@ def test_a_folder_of_an_archive_with_two_implants_is_stored_as_two_recordings_an
     with zipfile.ZipFile(files.path_of(body["files"][0]["stored_sha256"])) as archive:
         folders = {n.rsplit("/", 1)[0] for n in archive.namelist()}
     assert len(folders) == 2
+
+
+def as_tar(archive: bytes, mode: str) -> bytes:
+    """Pack the files of a zip as a tar."""
+    sink = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(archive)) as zipped, tarfile.open(fileobj=sink, mode=mode) as tar:  # type: ignore[call-overload]
+        for name in zipped.namelist():
+            info = tarfile.TarInfo(name)
+            info.size = zipped.getinfo(name).file_size
+            tar.addfile(info, io.BytesIO(zipped.read(name)))
+    return sink.getvalue()
+
+
+@pytest.mark.parametrize("mode", ["w", "w:gz"])
+def test_a_tar_of_a_session_gives_the_session_of_its_zip(send: Any, mode: str) -> None:
+    packed = send(("session.tar.gz", as_tar(device_zip(), mode)), visit=1, controller="random")
+    assert packed.status_code == 201, packed.text
+    assert "a tar archive was unpacked" in packed.text
+    zipped = send(("session.zip", device_zip()), visit=1, controller="random")
+    assert zipped.json()["sessions"] == packed.json()["sessions"]
+
+
+def test_a_table_in_gzip_is_the_table(send: Any) -> None:
+    answer = send(("t.csv.gz", gzip.compress(steady(1.0))), visit=1, controller="cdbs")
+    assert answer.status_code == 201, answer.text
+    assert len(answer.json()["sessions"]) == 1
+
+
+def test_a_7z_archive_is_explained(send: Any) -> None:
+    answer = send(("session.7z", b"7z\xbc\xaf\x27\x1c\0\x04" + bytes(24)))
+    assert answer.status_code == 422
+    assert "this is a 7-Zip archive" in answer.text
+    assert "zip the session's folder" in answer.text

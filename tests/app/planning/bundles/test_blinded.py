@@ -217,7 +217,9 @@ def test_the_bundles_own_runner_runs_a_blinded_session_and_refuses_it_a_second_t
     call = [sys.executable, "-m", "controller", f"--key={key}", "--time=20", "--run", "--log=log.csv", f"--ledger={tmp_path / 'ledger'}"]
     m = json.loads((tmp_path / "manifest.json").read_bytes())
     hello = f"hello 1 P1 - {m['beta_unit']} {m['beta_source']} {1000 * m['period_s']:g}\n"
-    first = subprocess.Popen(call, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1)
+    first = subprocess.Popen(
+        call, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
+    )
     assert first.stdin is not None
     first.stdin.write(hello)
     began, seq = time.monotonic(), 0

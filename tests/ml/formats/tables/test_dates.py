@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ml.formats import UndecodableFile, decode
-from ml.formats.tables.dates import ChangedClocks, in_zone, named_month, spreadsheet_date, zone_named
+from ml.formats.tables.cells.dates import ChangedClocks, in_zone, named_month, spreadsheet_date, zone_named
 
 HEAD = "{time},none,slight,mild,moderate,strong,unknown\n"
 NOON = datetime(2026, 3, 5, 14, 10, tzinfo=UTC)

@@ -11,7 +11,7 @@ import pytest
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import UndecodableFile
 from ml.formats.source import InMemory
-from ml.formats.tables.delimited import TextTable
+from ml.formats.tables.cells.delimited import TextTable
 from ml.formats.tables.mapping import MappedColumn, TableMapping, decode_mapped, preview_of, redact_mapped
 from ml.formats.tables.mapping.model import header_hash
 from ml.formats.tables.mapping.times import read_times

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ml.formats import DecodeOptions, UndecodableFile, decode, sniff
-from ml.formats.tables.numbers import unit_name
+from ml.formats.tables.cells.numbers import unit_name
 
 HEADER = "t_s,beta,amplitude_fraction\n"
 

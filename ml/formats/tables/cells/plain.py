@@ -13,7 +13,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.tables.numbers import Grouping
+from ml.formats.tables.cells.numbers import Grouping
 
 LINES_AT_ONCE = 16_384
 LONGEST_LINE = 10_000

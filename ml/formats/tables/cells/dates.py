@@ -6,7 +6,7 @@ import re
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from ml.formats.tables.numbers import column_name
+from ml.formats.tables.cells.numbers import column_name
 
 _MONTHS = {name: i for i, name in enumerate(["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"], start=1)}
 _LONG = ["january", "february", "march", "april", "may", "june", "july", "august", "september", "october", "november", "december"]

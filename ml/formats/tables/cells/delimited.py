@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ml.formats.recording import UndecodableFile
 from ml.formats.source import Source
-from ml.formats.tables.numbers import TIME_COLUMNS, TIME_UNITS, Grouping, NotANumber, column_name, known_unit, parse_number, shown
+from ml.formats.tables.cells.numbers import TIME_COLUMNS, TIME_UNITS, Grouping, NotANumber, column_name, known_unit, parse_number, shown
 
 MOSTLY = 0.9
 """Share of the letters of a table that are Latin."""
