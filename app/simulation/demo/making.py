@@ -25,6 +25,7 @@ from app.learning.training_configs import POLICY, distillation_config, generatio
 from app.platform import files
 from app.platform.errors import Invalid
 from app.platform.jobs import StepReport
+from app.platform.web.numbers import number
 from app.settings import get_settings
 from app.simulation.demo.data import DAY_WITH_POLICIES, Generation, LearnedPolicy, RecordedSession, Story, write
 from app.simulation.demo.study import trajectories
@@ -253,7 +254,7 @@ class _Participant:
                 tested.sessions += 1
             self.say(
                 f"{self.code} visit {visit}: {one.policy or one.controller}, energy {np.mean((ma / model.cdbs_amplitude_ma) ** 2):.2f}, "
-                f"{', '.join(f'{o.noun} {getattr(ran.qoc, o.field):.3g} {o.entry_unit}' for o in OUTCOMES if o.field in MEASURED)}"
+                f"{', '.join(f'{o.noun} {number(getattr(ran.qoc, o.field))} {o.entry_unit}' for o in OUTCOMES if o.field in MEASURED)}"
             )
 
     def _tests(self, buffer: ReplayBuffer) -> Tests:

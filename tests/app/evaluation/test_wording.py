@@ -24,7 +24,7 @@ from tests.ml.ope.posterior.draws import N, cdbs, constructed
 
 RANKING = "/api/v1/participants/P1/ranking"
 NEARLY_OFF = {"below_cdbs_20_percent": 0.5}
-WORDS = ("text", "decision_reason", "reason", "notes", "stale_reasons", "stale_reason")
+WORDS = ("text", "decision_reason", "reason", "notes", "stale_reasons", "stale_reason", "standing")
 
 
 def without_words(found: Any) -> Any:

@@ -74,7 +74,8 @@ def fault_of_rcs(params: dict[str, Any], workdir: Path, report: StepReport) -> d
 
 def fault_of_cleaning(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
     """Fail with half of the file written, unless it is a table."""
-    with RawFile(Path(params["source"]), Path(params["key"])).open() as source:
+    path, key = params["source"]
+    with RawFile(Path(path), Path(key)).open() as source:
         if source.read(4) == b"PK\x03\x04":
             Path(params["target"]).write_bytes(b"SYN000001H, half cleaned")
             raise ZeroDivisionError("a fault of ours, in the file of Ada Lovelace")

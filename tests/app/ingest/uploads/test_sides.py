@@ -190,5 +190,5 @@ def test_the_control_channel_is_one_of_the_deep_target_that_can_teach_most(send:
     montage = ("m.zip", (recordings / "rcs" / "montage_packet_loss.zip").read_bytes())
     (session,) = send(montage, visit=1, controller="other").json()["sessions"]
     trace = client.get(f"/api/v1/sessions/{session['id']}/trace").json()
-    assert session["control_channel"] == "key 0 +1-0", "channels of motor cortex have more"
-    assert sum(b is not None for b, t in zip(trace["beta"], trace["t_s"], strict=True) if t > 0) == 19
+    assert session["control_channel"] == "key 1 +3-1", "11 usable steps of the STN; channels of motor cortex have more"
+    assert sum(b is not None for b, t in zip(trace["beta"], trace["t_s"], strict=True) if t > 0) == 34
