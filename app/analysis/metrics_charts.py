@@ -16,7 +16,7 @@ from app.platform.kept import kept
 from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, counted, figure, marker, side_by_side
 from app.platform.web.csv_files import download
 from app.platform.web.numbers import hover, p_text
-from app.tables.sessions import Controller
+from app.tables.sessions import LEARNED, Controller
 from ml.outcomes import BY_KEY
 
 
@@ -124,15 +124,15 @@ def points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
 
 
 def above(test: Comparison | None, metric: str) -> str:
-    """What stands above a box: p, with an asterisk where it is below .05 in the desired direction."""
+    """What stands above a box: p, with an asterisk where a learned controller is better at .05."""
     if test is None:
         return "p"
     return "too few" if test.p_value is None else p_text(test.p_value) + (" *" if is_better(test, metric) else "")
 
 
 def is_better(test: Comparison, metric: str) -> bool:
-    """Whether a difference is below .05 and in the desired direction."""
-    if test.p_value is None or test.difference is None or test.p_value >= ALPHA or test.difference == 0:
+    """Decide whether a learned controller differs from cDBS in the desired direction, with p below .05: other arms are not on trial."""
+    if test.controller not in LEARNED or test.p_value is None or test.difference is None or test.p_value >= ALPHA or test.difference == 0:
         return False
     return (test.difference > 0) is HIGHER_IS_BETTER[metric]
 
@@ -171,7 +171,7 @@ def svg(found: Sequence[FiveMetrics], name: str) -> Response:
     """The results figure: a panel per metric, a box per participant and controller, every session a point."""
     shown = [for_readers(one) for one in found]
     panels = [_panel(shown, metric) for metric in METRICS]
-    note = "Two-sided Wilcoxon rank-sum test against cDBS, sessions taken as independent; * p < .05 in the desired direction."
+    note = "Two-sided Wilcoxon rank-sum test against cDBS, sessions taken as independent; * a learned controller is better, p < .05."
     content = boxes_svg([p for p in panels if any(b.values for b in p.boxes)], f"Results {name}", note)
     return Response(content, media_type=SVG, headers={"Content-Disposition": f'inline; filename="{name}-results.svg"'})
 

@@ -13,14 +13,14 @@ from app.analysis import evidence, metrics, primary
 from app.analysis.evidence import Evidence
 from app.analysis.facts import METRICS, BetaKind, LeftOut, comparable_beta, with_comparable_beta
 from app.analysis.metrics import FiveMetrics
-from app.analysis.primary_results import PLANNED, planned_results
+from app.analysis.primary_results import planned_results
 from app.analysis.primary_verdict import VerdictResult
 from app.platform.kept import kept, summaries
 from app.study import repository as study
 from app.study.blinding import CONTROLLER_NAMES, Arm, visible_arms
 from app.tables.jobs import Job, JobStatus, JobStep
 from app.tables.participants import Participant
-from app.tables.sessions import Controller, StudySession
+from app.tables.sessions import LEARNED, Controller, StudySession
 from ml.statistics.pooling import Summary, pool
 from ml.statistics.within_visits.contrasts import Average, Reason, Unavailable
 
@@ -134,7 +134,7 @@ class Saved:
 
 def _saving(held: Evidence) -> Saved | None:
     """Energy saved in one participant; None without a session of a learned controller that the caller may know of and that counts."""
-    ran = [s for s in held.sessions if s.controller in PLANNED and "energy" in s.values]
+    ran = [s for s in held.sessions if s.controller in LEARNED and "energy" in s.values]
     seconds = sum(s.duration_s for s in ran)
     if not seconds:
         return None
@@ -225,7 +225,7 @@ def readable(db: Session, caller: Caller) -> Sequence[Participant]:
 def pooled(db: Session, participants: Sequence[Participant], caller: Caller) -> Pooled:
     """Results of each participant and over all of them."""
     found = outlines(db, participants, caller)
-    controllers = kept(("pooled", tuple(o.key for o in found)), lambda: tuple(_controller(found, c) for c in PLANNED if _ran(found, c)))
+    controllers = kept(("pooled", tuple(o.key for o in found)), lambda: tuple(_controller(found, c) for c in LEARNED if _ran(found, c)))
     return Pooled(tuple(found), controllers, _table([o.time for o in found]))
 
 

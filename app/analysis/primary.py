@@ -14,7 +14,7 @@ from app.accounts.permissions import Caller
 from app.analysis import evidence
 from app.analysis.evidence import Evidence
 from app.analysis.facts import METRICS, BetaKind, Facts, choose, comparable_beta, of_controller, with_comparable_beta
-from app.analysis.primary_results import PLANNED, ControllerResult, results
+from app.analysis.primary_results import ControllerResult, results
 from app.analysis.primary_verdict import LockedMargins, VerdictResult, earlier_verdicts, policy_verdicts, verdicts
 from app.platform.errors import NotFound
 from app.platform.kept import kept
@@ -22,7 +22,7 @@ from app.study.margins import margins_of
 from app.tables.learning import Policy
 from app.tables.participants import Participant
 from app.tables.plans import Plan, PlanItem
-from app.tables.sessions import Controller
+from app.tables.sessions import LEARNED, Controller
 from ml.outcomes import BY_KEY
 from ml.statistics.power import Power, Target, power
 from ml.statistics.within_visits.contrasts import Unavailable
@@ -141,7 +141,7 @@ def _verdicts(held: Evidence, locked: LockedMargins) -> tuple[VerdictResult, ...
 
 def _tested(sessions: Sequence[Facts]) -> list[Controller]:
     """Controllers that have a verdict."""
-    return [c for c in PLANNED if any(s.controller is c for s in sessions)]
+    return [c for c in LEARNED if any(s.controller is c for s in sessions)]
 
 
 def locked_margins(participant: Participant) -> tuple[LockedMargins, ...]:

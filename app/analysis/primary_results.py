@@ -13,7 +13,7 @@ from enum import StrEnum
 from functools import cached_property
 
 from app.analysis.facts import METRICS, Chosen, Facts, choose_each, of_controller
-from app.tables.sessions import Controller
+from app.tables.sessions import LEARNED, Controller
 from ml.statistics.effects import Saving, cliffs_delta, energy_saving
 from ml.statistics.multiplicity import benjamini_hochberg, holm
 from ml.statistics.ranksum import RankSum, as_in_the_paper
@@ -24,7 +24,6 @@ from ml.statistics.within_visits.stratified import StratifiedTest, van_elteren
 
 ALPHA = 0.05
 LEVEL = 0.95
-PLANNED = (Controller.RL, Controller.DISTILLED)
 """Controllers of the planned family."""
 
 
@@ -158,12 +157,12 @@ def results(sessions: Sequence[Facts], names: Mapping[int, str], picked_at: Mapp
 
 def planned_results(sessions: Sequence[Facts]) -> tuple[ControllerResult, ...]:
     """The controllers of the planned family that ran, without policies and adjusted p-values."""
-    return tuple(_of_controller(sessions, c) for c in PLANNED if any(s.controller is c for s in sessions))
+    return tuple(_of_controller(sessions, c) for c in LEARNED if any(s.controller is c for s in sessions))
 
 
 def _of_controller(sessions: Sequence[Facts], controller: Controller) -> ControllerResult:
     mine = tuple(s.session_id for s in sessions if s.controller is controller)
-    role = Role.PLANNED if controller in PLANNED else Role.EXPLORATION
+    role = Role.PLANNED if controller in LEARNED else Role.EXPLORATION
     return _compared(sessions, Tested(controller, None, None, role, Basis.ALL, mine, ()), of_controller(controller))
 
 

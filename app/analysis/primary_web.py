@@ -10,7 +10,7 @@ from fastapi.responses import HTMLResponse
 from app.accounts.deps import CurrentCaller
 from app.analysis import primary, primary_words
 from app.analysis.facts import HIGHER_IS_BETTER, METRICS
-from app.analysis.primary_results import PLANNED, Comparison, Tested
+from app.analysis.primary_results import Comparison, Tested
 from app.analysis.primary_schemas import PrimaryOut, primary_csv, primary_out, unit_of
 from app.platform.database import Db
 from app.platform.errors import NotFound
@@ -19,6 +19,7 @@ from app.platform.web.numbers import hover, number
 from app.platform.web.schemas import problems
 from app.platform.web.templates import Part, make_part, render
 from app.study.deps import CurrentParticipant
+from app.tables.sessions import LEARNED
 from ml.statistics.within_visits.contrasts import Average
 
 # The contrast of every visit, and the average over visits with its interval.
@@ -157,7 +158,7 @@ def models_page(
         power=primary.next_visits(found, result.tested.controller, sessions),
         per_arm=sessions,
         names=primary.policy_names(db, participant),
-        planned=result.tested.controller in PLANNED,
+        planned=result.tested.controller in LEARNED,
         units=_units(found),
         wording=primary_words,
     )

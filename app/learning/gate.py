@@ -17,7 +17,7 @@ from app.platform.errors import Invalid
 from app.study import access, blinding
 from app.tables.learning import BufferGateDecision, GateChoice
 from app.tables.participants import Participant
-from app.tables.sessions import Controller, StudySession
+from app.tables.sessions import LEARNED, Controller, StudySession
 from ml.outcomes import OUTCOMES, Outcome
 from ml.statistics.multiplicity import holm
 from ml.statistics.ranksum import p_greater
@@ -29,7 +29,6 @@ from ml.statistics.ranksum import p_greater
 # clinician may decide otherwise with a reason; the decision stays on record and applies until the next one.
 
 ALPHA = 0.05
-LEARNED = (Controller.RL, Controller.DISTILLED)
 
 
 @dataclass(frozen=True)

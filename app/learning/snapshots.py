@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
 from app.learning import repository
-from app.learning.gate import LEARNED, Gate, gate, gate_grounds
+from app.learning.gate import Gate, gate, gate_grounds
 from app.learning.trajectories import trajectory_of
 from app.platform import files
 from app.platform.errors import Invalid
@@ -32,7 +32,7 @@ from app.study.settings import mdp_settings, suggest_xi_beta
 from app.study.traces import StepTable, TracesOf, traces_of
 from app.tables.learning import BufferSnapshot, SnapshotSession
 from app.tables.participants import CharacteristicsVersion, Hemisphere, Participant, SettingsVersion
-from app.tables.sessions import StudySession
+from app.tables.sessions import LEARNED, StudySession
 from ml.mdp import MdpSettings
 from ml.qoc import Qoc
 from ml.trajectories import ReplayBuffer, SessionTrajectory, to_parquet

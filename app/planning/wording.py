@@ -271,11 +271,17 @@ def schedule_words(planned: Planned, bounds: tuple[SideBound, ...]) -> str:
     return "  ".join(held + after)
 
 
-def session_name(item: PlanItem) -> str:
-    """What a session of a plan is called: its controller, and its letter in a blinded plan; the letter alone while the key is sealed."""
+def session_name(item: PlanItem, policy: str | None = None) -> str:
+    """Name a session of a plan: its controller, and its letter in a blinded plan; the letter alone while the key is sealed.
+
+    Args:
+        item: the session.
+        policy: name of its policy, since each policy counts its sessions from 1; None where the name is next to it.
+    """
     if not item.controller:
         return f"Session {item.label}"
     name = "Held" if is_held(item) else CONTROLLER_NAMES[Controller(item.controller)]
+    name += f" {policy}" if policy else ""
     name += f" {item.repeat}" if item.repeat > 1 else ""
     return f"{name} ({item.label})" if item.label else name
 

@@ -39,6 +39,10 @@ class Controller(StrEnum):
     OTHER = "other"
 
 
+LEARNED = (Controller.RL, Controller.DISTILLED)
+"""Controllers that were learned from data."""
+
+
 class Activity(StrEnum):
     """Activity of a participant in the half hour before a session."""
 

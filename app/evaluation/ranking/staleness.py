@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.evaluation import repository
 from app.learning import repository as learning
-from app.learning.gate import LEARNED, gate
+from app.learning.gate import gate
 from app.platform.errors import Invalid
 from app.platform.kept import kept
 from app.study import blinding
@@ -26,7 +26,7 @@ from app.study.traces import Sources, sources
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot, SnapshotSession
 from app.tables.participants import Participant, SettingsVersion
-from app.tables.sessions import StudySession
+from app.tables.sessions import LEARNED, StudySession
 from ml.ope import Flag
 
 NAMED = 5

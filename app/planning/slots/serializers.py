@@ -12,7 +12,8 @@ from app.tables.sessions import Controller
 
 def comparison_out(found: Comparison) -> VisitComparisonOut:
     """For the API and the page."""
-    names = {line.item.position: wording.session_name(line.item) for line in shown(found.view).lines}
+    lines = shown(found.view).lines
+    names = {line.item.position: wording.session_name(line.item, line.policy.name if line.policy else None) for line in lines}
     return VisitComparisonOut(
         plan_id=found.view.plan.id,
         planned=found.planned,

@@ -19,7 +19,7 @@ from app.study.sessions import designs, usable_steps
 from app.study.sessions.stimulation import SILENT_MA, Delivered, contradicts, delivered
 from app.study.traces import step_table
 from app.tables.recordings import Recording
-from app.tables.sessions import Controller, StudySession
+from app.tables.sessions import LEARNED, Controller, StudySession
 
 
 class Kind(StrEnum):
@@ -96,7 +96,7 @@ def contradictions(db: Session, session: StudySession, visit_open: bool = False,
     if arm is None:
         return found
     found += _of_controller(session, arm.controller, sides)
-    if arm.controller in (Controller.RL, Controller.DISTILLED) and arm.policy_id is None:
+    if arm.controller in LEARNED and arm.policy_id is None:
         found.append(Contradiction(Kind.NO_POLICY))
     return found
 

@@ -140,13 +140,14 @@ def test_the_table_has_every_comparison(client: TestClient, four: dict[str, floa
 def test_an_asterisk_stands_only_in_the_desired_direction(client: TestClient, add_session: Callable[..., int]) -> None:
     for i in range(5):
         add_session("cdbs", fraction=1.0 - 0.001 * i, grasp=2 + 0.01 * i, tremor=5 + i)
+        add_session("no_dbs", fraction=0.0)  # saves by definition
         add_session("rl", fraction=0.7 + 0.001 * i, grasp=1 + 0.01 * i, tremor=50 + i)  # saves energy, and is worse in everything else
     charts = client.get("/participants/P1/analyses/paper").text
     assert charts.count("*") - charts.count("/*") >= 1
     svg = ElementTree.fromstring(client.get("/participants/P1/analyses/paper.svg").text)
     labels = [t.text or "" for t in svg.iter("{http://www.w3.org/2000/svg}text")]
     assert [t for t in labels if t.endswith(" *")] == [".008 *"]
-    assert labels.count(".008") == 2
+    assert labels.count(".008") == 3
 
 
 def test_computation_time_counts_ended_steps(client: TestClient, db: Session, participant_code: str) -> None:
