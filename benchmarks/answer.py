@@ -51,7 +51,7 @@ World = list[Row]
 
 def harmful(own: Truth, cdbs: Truth) -> bool:
     """Decide whether an outcome is truly worse than under cDBS by more than twice its margin."""
-    return any(o.slack(getattr(own, o.field).value, getattr(cdbs, o.field).value, 2 * MARGINS.of(o)) < 0 for o, _ in PREDICTED)
+    return any(o.slack(own.qocs[o.field].value, cdbs.qocs[o.field].value, 2 * MARGINS.of(o)) < 0 for o, _ in PREDICTED)
 
 
 def cell(part: str, index: int, population: int, truth: int) -> World:
