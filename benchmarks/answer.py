@@ -98,10 +98,15 @@ def pick(rows: World) -> Row:
     return max(tests, key=lambda r: r["value"]) if tests else rows[-1]
 
 
-def loss(rows: World) -> float:
-    """Compute what the pick lacks of the best safe policy, share of the range."""
+def loss(rows: World, choice: Row) -> float:
+    """Compute what a choice lacks of the best safe policy, share of the range."""
     best = max(r["true"] for r in rows if r["safe"])
-    return max(0.0, best - float(pick(rows)["true"])) / width(rows)
+    return max(0.0, best - float(choice["true"])) / width(rows)
+
+
+def safe_pick(rows: World) -> Row:
+    """Choose the best by value among those that are truly safe: what a perfect judgement of harm would leave of the loss."""
+    return max((r for r in rows if r["safe"]), key=lambda r: r["value"])
 
 
 def following_pays(rows: World) -> bool:
@@ -152,8 +157,9 @@ def aims(worlds: Sequence[World]) -> dict[str, tuple[float, float]]:
     cover = [sum(covered(r, rows[-1]) for r in candidates(rows)) for rows in worlds]
     widths = [float(np.median([r["gain"][1] - r["gain"][0] for r in candidates(rows)])) / width(rows) for rows in worlds]
     return {
-        "loss of the pick": ratio([loss(rows) for rows in worlds], ones),
-        "pick within 5 % of the best safe": ratio([loss(rows) <= LEAST for rows in worlds], ones),
+        "loss of the pick": ratio([loss(rows, pick(rows)) for rows in worlds], ones),
+        "pick within 5 % of the best safe": ratio([loss(rows, pick(rows)) <= LEAST for rows in worlds], ones),
+        "loss, were harm known": ratio([loss(rows, safe_pick(rows)) for rows in worlds], ones),
         "pick truly harmful": ratio([pick(rows)["harm"] for rows in worlds], ones),
         "test: precision": share_of(worlds, lambda r: r["worth"], lambda r: r["code"] == "test"),
         "test: recall": share_of(worlds, lambda r: r["code"] == "test", lambda r: r["worth"]),

@@ -40,7 +40,8 @@ def test_the_pick_is_the_first_test_and_its_loss_is_to_the_best_safe_policy(answ
         CDBS,
     ]
     assert answer.pick(rows)["name"] == "a"
-    assert answer.loss(rows) == pytest.approx((8.0 - 4.0) / 10.0)
+    assert answer.loss(rows, answer.pick(rows)) == pytest.approx((8.0 - 4.0) / 10.0)
+    assert answer.safe_pick(rows)["name"] == "d", "c is worth more and not safe"
     assert answer.following_pays(rows)
     found = answer.aims([rows])
     assert found["test: precision"][0] == 1.0
@@ -52,7 +53,7 @@ def test_the_pick_is_the_first_test_and_its_loss_is_to_the_best_safe_policy(answ
 def test_without_a_test_the_pick_is_cdbs(answer: Any) -> None:
     rows = [row("a", "undecided", 5.0, 4.0), row("b", "likely_worse", 1.0, -6.0), CDBS]
     assert answer.pick(rows) is CDBS
-    assert answer.loss(rows) == pytest.approx(4.0 / 10.0)
+    assert answer.loss(rows, answer.pick(rows)) == pytest.approx(4.0 / 10.0)
 
 
 def test_a_ratio_has_the_error_of_a_mean_where_all_worlds_weigh_the_same(answer: Any) -> None:
