@@ -139,6 +139,7 @@ def test_the_start_of_a_newer_worker_strands_no_later_job_of_this_version(ran, f
     launch()
     _enqueue("later")
     _wait(lambda: ids == ["later"])
+    assert _row("later", "application_version") == (str(engine.PROTOCOL),), "of this version, whatever a newer one left behind"
 
 
 def test_params_of_a_kind_change_with_the_protocol():
