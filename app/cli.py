@@ -234,13 +234,13 @@ def control_(
         raise typer.Exit(1)
 
 
-@control_app.command("check-port", epilog="Example: betaloop control check-port answers.csv --bundle P1-policy-3.zip --page check.html")
+@control_app.command("check-port", epilog="Example: betaloop control check-port answers.csv --bundle P1-policy-3.zip --page check.pdf")
 def check_port_(
     copy: Annotated[Path, typer.Argument(metavar="ANSWERS", help="CSV of answers; or a copy: .onnx, .tflite, a shared library.")],
     bundle: Annotated[Path, typer.Option(help="Controller bundle.")],
     key: Annotated[str | None, typer.Option(help="Public key, or a file with it; that of this installation by default.")] = None,
     target: Annotated[str | None, typer.Option(help="What was converted, by what: 'TFLite, onnx2tf 1.29.24'.")] = None,
-    page: Annotated[Path | None, typer.Option(help="One page for the study's file, HTML.")] = None,
+    page: Annotated[Path | None, typer.Option(help="One page for the study's file, .pdf or .html.")] = None,
     answers: Annotated[Path | None, typer.Option(help="CSV of the answers of a copy that ran here, to be uploaded.")] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -17,6 +17,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,7 @@ from ml.deploy.manifest import BundleManifest
 from ml.deploy.ports.answers import Answers, write_answers
 from ml.deploy.ports.check import check_port, port_vectors
 from ml.deploy.ports.report import fault_words, verdict_words
-from ml.deploy.ports.targets import run_target
+from ml.deploy.ports.targets import TargetError, run_target
 from ml.deploy.ports.vectors import PortVectors
 from ml.deploy.ports.windows import Recorded
 from ml.rl import MlpPolicy
@@ -38,6 +39,8 @@ from ml.rl import MlpPolicy
 PROGRAM = "import converters; converters.main()"
 SUPPORT = Path(__file__).parent / "support"
 MAKE_S, CONVERT_S = 3600, 900
+RUN_HERE = ("onnx2tf", "onnx2tf_int8")
+"""Functions whose TFLite files `check-port` runs too."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,9 @@ CONVERTERS = (
     Converter("emlearn 0.23.2, scaling folded in", "emlearn", "emlearn", ("emlearn==0.23.2", "onnx==1.23.2", "setuptools")),
     Converter("tinygrad 0.14.0, DEV=PYTHON", "tinygrad", "tinygrad", ("tinygrad==0.14.0", "onnx==1.23.2"), ("uV",)),
     Converter("onnx2tf 1.29.24, 2-D input", "onnx2tf", "onnx2tf", ONNX2TF),
-    Converter("onnx2tf 1.29.24, Flatten first", "onnx2tf_flatten", "onnx2tf", ONNX2TF, ("uV",)),
+    Converter("onnx2tf 1.29.24, Flatten first, order of the ONNX file", "onnx2tf_flatten", "onnx2tf", ONNX2TF, ("uV",)),
+    Converter("onnx2tf 1.29.24, Flatten first, order of its declared shape", "onnx2tf_declared", "onnx2tf", ONNX2TF, ("uV",)),
+    Converter("onnx2tf 1.29.24, int8", "onnx2tf_int8", "onnx2tf", ONNX2TF, ("uV",)),
     Converter("hls4ml 1.3.0, defaults, scaling folded in", "hls4ml", "hls4ml", ("hls4ml[onnx]==1.3.0",), ("uV",)),
     Converter("executorch 1.5.1", "executorch", "executorch", ("executorch==1.5.1", "torch==2.13.0", "onnx==1.23.2")),
 )
@@ -175,12 +180,26 @@ def convert_all(converter: Converter, folder: Path, cases: dict[str, Case]) -> I
         except (RuntimeError, subprocess.TimeoutExpired) as error:
             yield f"| {converter.name} | {policy} | not converted | {error} | |"
             continue
+        copy = case.folder / f"{converter.function}.tflite"
+        run_here = run_by_check(converter, policy, case, copy) if copy.exists() and converter.function in RUN_HERE else None
         try:
             lost = answers_of(python, converter.function, case.folder / "model-lost-sample.onnx", case)[case.vectors.without_dose]
             passes_on = "not passed on" if converter.function in ("emlearn", "hls4ml") else "yes" if np.isnan(lost).all() else "no"
         except (RuntimeError, subprocess.TimeoutExpired):
             passes_on = "not converted"
         yield row(converter.name, policy, case, Answers(answers, None), passes_on)
+        if run_here is not None:
+            yield run_here
+
+
+def run_by_check(converter: Converter, policy: str, case: Case, copy: Path) -> str:
+    """Write the row of a TFLite file that `check-port` runs itself, with `betaloop[ports]` installed here."""
+    try:
+        answers = run_target(copy, case.vectors, case.opened.manifest)
+    except TargetError as error:
+        return f"| {converter.name}, run by check-port | {policy} | not tried | {error} | |"
+    name = f"{converter.name}, run by check-port with ai-edge-litert {version('ai-edge-litert')}"
+    return row(name, policy, case, answers, "see above")
 
 
 def own(cases: dict[str, Case]) -> Iterator[str]:

@@ -66,6 +66,7 @@ def _recorded(event: AuditEvent, names: Names) -> str:
         ("export", "upload_file"): lambda: f"took the original of file {number}",
         ("export", "audit"): lambda: "exported the audit trail" + _filtered(event),
         ("download", "plan"): lambda: f"printed {names.plan(number)}",
+        ("download", "policy"): lambda: f"printed a check of a copy of {names.policy(number)}",
         ("refuse", "sign_in"): lambda: f"refused a sign-in of {event.entity_id}",
         ("refuse", "confirmation"): lambda: f"refused {event.entity_id} a signature or a new password",
         ("accept", "audit_event"): lambda: f"accepted that row {number} of the trail has a false time",

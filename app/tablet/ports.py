@@ -12,7 +12,7 @@ from app.tablet.command import verified
 from ml.deploy.manifest import BundleError
 from ml.deploy.ports.answers import AnswersError, write_answers
 from ml.deploy.ports.check import NOT, check_port, port_vectors
-from ml.deploy.ports.report import fault_words, headline, lines, page
+from ml.deploy.ports.report import fault_words, headline, lines, page, page_pdf
 from ml.deploy.ports.targets import RUNNABLE, TargetError, run_target
 
 
@@ -57,7 +57,9 @@ def check(copy: Path, bundle: Path, key: str | None, outputs: Outputs) -> tuple[
     if outputs.answers is not None:
         _write(outputs.answers, table)
     if outputs.page is not None:
-        _write(outputs.page, page(found, target, f"{date.today():%d %B %Y}").encode())
+        day = f"{date.today():%d %B %Y}"
+        printed = page_pdf(found, target, day) if outputs.page.suffix.lower() == ".pdf" else page(found, target, day).encode()
+        _write(outputs.page, printed)
     said = {"target": target, "headline": headline(found, target), "faults_in_words": [fault_words(f, found) for f in found.faults]}
     return said | found.to_json(), lines(found, target), found.verdict != NOT
 

@@ -8,6 +8,7 @@ quoted in the table.
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,6 +20,8 @@ import numpy as np
 
 Array = Any
 Convert = Callable[[Path, Array, Array, Path], Array]
+COPY = "copy.tflite"
+"""A converted file that betaloop can run too; `main` keeps it with the answers."""
 
 
 def run_onnx(model: Path, windows: Array) -> Array:
@@ -118,8 +121,16 @@ def convert_tinygrad(model: Path, windows: Array, _calibration: Array, _folder: 
     )
 
 
-def convert_onnx2tf(model: Path, windows: Array, _calibration: Array, folder: Path, *, flatten: bool = False) -> Array:
-    """Convert to TFLite by onnx2tf; with `flatten` the input is [1, W / 2, 2] and a Flatten comes first."""
+def convert_onnx2tf(
+    model: Path, windows: Array, calibration: Array, folder: Path, *, flatten: bool = False, declared: bool = False, whole: bool = False
+) -> Array:
+    """Convert to TFLite by onnx2tf.
+
+    Args:
+        flatten: the input is [1, W / 2, 2] and a Flatten comes first.
+        declared: feed the window in the order of the copy's declared shape.
+        whole: quantise to int8, input and output too.
+    """
     import onnx
     import onnx2tf
     import tensorflow as tf
@@ -136,21 +147,44 @@ def convert_onnx2tf(model: Path, windows: Array, _calibration: Array, folder: Pa
     graph.graph.input.append(helper.make_tensor_value_info("beta_window", TensorProto.FLOAT, shape))
     graph.graph.output.append(helper.make_tensor_value_info("amplitude_fraction", TensorProto.FLOAT, [1, 1]))
     onnx.save(graph, str(folder / "fixed.onnx"))
-    onnx2tf.convert(str(folder / "fixed.onnx"), output_folder_path=str(folder / "tf"), non_verbose=True)
-    interpreter = tf.lite.Interpreter(str(folder / "tf" / "fixed_float32.tflite"))
+    more: dict[str, Any] = {}
+    if whole:
+        np.save(folder / "calibration.npy", calibration.astype(np.float32))
+        unscaled = [["beta_window", str(folder / "calibration.npy"), [[[[0.0]]]], [[[[1.0]]]]]]
+        more = {"output_integer_quantized_tflite": True, "custom_input_op_name_np_data_path": unscaled}
+    onnx2tf.convert(str(folder / "fixed.onnx"), output_folder_path=str(folder / "tf"), non_verbose=True, **more)
+    made = folder / "tf" / f"fixed_{'full_integer_quant' if whole else 'float32'}.tflite"
+    shutil.copy(made, folder / COPY)
+    interpreter = tf.lite.Interpreter(str(made))
     interpreter.allocate_tensors()
     (entry,), (answer,) = interpreter.get_input_details(), interpreter.get_output_details()
     out = []
     for window in windows:
-        interpreter.set_tensor(entry["index"], window.astype(np.float32).reshape(entry["shape"]))
+        ordered = window.reshape(shape).swapaxes(1, 2) if declared else window
+        given = np.ascontiguousarray(ordered).reshape(entry["shape"])
+        (scale, zero), (scale_out, zero_out) = entry["quantization"], answer["quantization"]
+        if whole:
+            given = np.clip(np.nan_to_num(np.rint(given / scale + zero)), -128, 127)
+        interpreter.set_tensor(entry["index"], given.astype(entry["dtype"]))
         interpreter.invoke()
-        out.append(float(interpreter.get_tensor(answer["index"]).ravel()[0]))
+        value = float(interpreter.get_tensor(answer["index"]).ravel()[0])
+        out.append((value - zero_out) * scale_out if whole else value)
     return np.array(out)
 
 
 def convert_onnx2tf_flatten(model: Path, windows: Array, calibration: Array, folder: Path) -> Array:
     """Convert a graph whose first operator is Flatten."""
     return convert_onnx2tf(model, windows, calibration, folder, flatten=True)
+
+
+def convert_onnx2tf_declared(model: Path, windows: Array, calibration: Array, folder: Path) -> Array:
+    """Convert a graph whose first operator is Flatten, and feed it in the order that the copy declares."""
+    return convert_onnx2tf(model, windows, calibration, folder, flatten=True, declared=True)
+
+
+def convert_onnx2tf_int8(model: Path, windows: Array, calibration: Array, folder: Path) -> Array:
+    """Quantise by onnx2tf to int8, calibrated on recorded windows."""
+    return convert_onnx2tf(model, windows, calibration, folder, whole=True)
 
 
 def convert_hls4ml(model: Path, windows: Array, _calibration: Array, folder: Path) -> Array:
@@ -219,4 +253,6 @@ def main() -> None:
     chosen, model_path, *arrays, target = sys.argv[1:]
     with tempfile.TemporaryDirectory() as made_in:
         answers = CONVERTERS[chosen](Path(model_path).resolve(), *(np.load(path) for path in arrays), Path(made_in))
+        if (Path(made_in) / COPY).exists():
+            shutil.copy(Path(made_in) / COPY, Path(target).with_suffix(".tflite"))
     np.save(target, answers)

@@ -45,6 +45,7 @@ READABLE = (
     "/api/v1/policies/{policy_id}/release",
     "/api/v1/policies/{policy_id}/port-checks",
     "/api/v1/policies/{policy_id}/port-checks/{check_id}/page",
+    "/api/v1/policies/{policy_id}/port-checks/{check_id}/page.pdf",
     "/api/v1/bundle-key",
     "/api/v1/bundle-withdrawals",
     "/api/v1/participants/{code}/analyses",

@@ -35,6 +35,7 @@ PAIRS: dict[tuple[str, str], dict[str, Any]] = {
     ("POST", "/participants/{code}/policies/{policy_id}/retire"): {"data": {"reason": "worn out"}},
     ("GET", "/participants/{code}/policies/{policy_id}/bundle"): {},
     ("GET", "/api/v1/policies/{policy_id}/port-checks/{check_id}/page"): {},
+    ("GET", "/api/v1/policies/{policy_id}/port-checks/{check_id}/page.pdf"): {},
     ("POST", PORTS): {"data": {"target": "TFLite"}},  # and the answers of a copy of the policy
     ("POST", "/participants/{code}/policies/{policy_id}/bundle"): BUNDLE_FORM,
     ("PATCH", "/api/v1/studies/{study_code}/sites/{site_code}"): {"json": {"name": "Moved", "reason": "new house"}},

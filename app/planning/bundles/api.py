@@ -13,13 +13,14 @@ from app.accounts.deps import CurrentCaller
 from app.learning.deps import CurrentPolicy
 from app.planning.bundles import ports, slots
 from app.planning.bundles import service as bundles
+from app.platform.audit import record
 from app.platform.database import Db
 from app.platform.web.schemas import Model, RowId, Text, problems
 from app.study.deps import CurrentVisit
 from app.tables.participants import Hemisphere, Participant
 from app.tables.plans import PortCheck
 from ml.deploy.ports.answers import MAX_BYTES
-from ml.deploy.ports.report import fault_words
+from ml.deploy.ports.report import fault_words, page_pdf
 from ml.deploy.ports.report import page as printed_check
 
 router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
@@ -104,6 +105,19 @@ def print_port_check(policy: CurrentPolicy, check_id: RowId, db: Db) -> HTMLResp
     """Show one page about a check of a converted copy, for the study's file."""
     row = ports.find_check(db, policy, check_id)
     return HTMLResponse(printed_check(ports.result_of(row), row.target, f"{row.created_at:%d %B %Y}, {row.created_by}"))
+
+
+@router.get(
+    "/policies/{policy_id}/port-checks/{check_id}/page.pdf",
+    response_class=Response,
+    responses={200: {"content": {"application/pdf": {}}, "description": "The page as PDF."}},
+)
+def print_port_check_pdf(policy: CurrentPolicy, check_id: RowId, db: Db) -> Response:
+    """Return one page about a check of a converted copy as PDF, for the study's file."""
+    row = ports.find_check(db, policy, check_id)
+    record(db, "download", "policy", policy.id)
+    content = page_pdf(ports.result_of(row), row.target, f"{row.created_at:%d %B %Y}, {row.created_by}")
+    return Response(content, media_type="application/pdf")
 
 
 def _port_check_out(row: PortCheck) -> PortCheckOut:

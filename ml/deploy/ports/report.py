@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime
 from html import escape
 
 from ml.deploy.ports.check import NOT, SAME, Fault, PortCheck
 
+_EPOCH = datetime(1980, 1, 1, tzinfo=UTC)
+_SCOPE = "The check is about the 400 windows of the bundle alone: not about the device's clock, its link or its stimulator."
 _STYLE = """
 @page { size: A4; margin: 12mm 14mm; }
 body { font: 9.5pt/1.4 system-ui, Roboto, Arial, sans-serif; color: #14202b; max-width: 182mm; margin: 0 auto; }
@@ -119,10 +122,7 @@ def page(check: PortCheck, target: str, when: str) -> str:
         for k in check.by_kind
     )
     number = "" if check.policy_id is None else f", policy {check.policy_id}"
-    digests = (("Bundle", check.bundle_sha256), ("Network", check.model_sha256), ("Vectors", check.vectors_sha256))
-    hashes = "".join(
-        f"<tr><th>{name}</th><td><code>{digest}</code></td></tr>" for name, digest in (*digests, ("Answers", check.answers_sha256))
-    )
+    hashes = "".join(f"<tr><th>{name}</th><td><code>{digest}</code></td></tr>" for name, digest in _digests(check))
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>Check of a port, {escape(check.participant)}</title><style>{_STYLE}</style></head><body>
 <h1>{escape(check.participant)}: check of a port</h1>
@@ -134,10 +134,55 @@ def page(check: PortCheck, target: str, when: str) -> str:
 <h2>Difference by kind of window, mA</h2>
 <table><tr><th>Kind</th><th>Windows</th><th>Answered</th><th>Largest</th><th>Mean</th></tr>{kinds}</table>
 <h2>SHA-256</h2><table>{hashes}</table>
-<p>The check is about the 400 windows of the bundle alone: not about the device's clock, its link or its stimulator.</p>
+<p>{escape(_SCOPE, quote=False)}</p>
 <div class="lines"><div>Engineer, date: this copy was checked</div><div>Clinician, date: seen</div></div>
 </body></html>
 """
+
+
+def page_pdf(check: PortCheck, target: str, when: str) -> bytes:
+    """Render the same page as PDF, the same bytes for the same check. Letters that the built-in font lacks become `?`."""
+    from fpdf import FPDF  # loaded for this page alone
+
+    pdf = FPDF(format="A4")
+    pdf.set_creation_date(_EPOCH)
+    pdf.set_margins(14, 12)
+    pdf.set_auto_page_break(False)
+    pdf.add_page()
+
+    def write(text: str, size: float, style: str = "") -> None:
+        pdf.set_font("Helvetica", style, size)
+        pdf.multi_cell(0, size * 0.47, text.encode("latin-1", "replace").decode("latin-1"), new_x="LMARGIN", new_y="NEXT")
+
+    number = "" if check.policy_id is None else f", policy {check.policy_id}"
+    write(f"{check.participant}: check of a port", 16, "B")
+    write(f"{target}, {when}. Copy of {check.policy_name}{number}; cDBS {check.cdbs_ma:g} mA.", 9)
+    write(f"\n{_first_upper(verdict_words(check))}.", 12, "B")
+    for title, texts in (
+        ("", [f"{_first_upper(fault_words(f, check))}." for f in check.faults]),
+        ("What to do", advice(check)),
+        ("What was found", [f"{label}: {text}" for label, text in facts(check)]),
+        (
+            "Difference by kind of window, mA",
+            [
+                f"{k.kind}: {k.answered} of {k.windows} answered, largest {_worst(k.worst_ma)}, mean {_worst(k.mean_ma)}"
+                for k in check.by_kind
+            ],
+        ),
+        ("SHA-256", [f"{name}: {digest}" for name, digest in _digests(check)]),
+    ):
+        if title and texts:
+            write(f"\n{title}", 10, "B")
+        for text in texts:
+            write(text, 8.5)
+    write(f"\n{_SCOPE}", 8.5)
+    write("\n\nEngineer, date: this copy was checked ____________________     Clinician, date: seen ____________________", 8.5)
+    return bytes(pdf.output())
+
+
+def _digests(check: PortCheck) -> tuple[tuple[str, str], ...]:
+    hashes = (check.bundle_sha256, check.model_sha256, check.vectors_sha256, check.answers_sha256)
+    return tuple(zip(("Bundle", "Network", "Vectors", "Answers"), hashes, strict=True))
 
 
 def ma(value: float | None) -> str:

@@ -81,20 +81,27 @@ def _one(answer: Any) -> float:
 
 
 def _tflite(path: Path, windows: Windows) -> NDArray[np.float64]:
-    interpreter = _interpreter()(model_path=str(path))
-    interpreter.allocate_tensors()
-    (entry,), (answer,) = interpreter.get_input_details(), interpreter.get_output_details()
-    if math.prod(entry["shape"]) != windows.shape[1]:
-        shape = list(map(int, entry["shape"]))
-        raise TargetError(f"{path.name} takes an input of {shape}, not a window of {windows.shape[1]}", "Convert with one window per call.")
-    out = []
-    for window in windows:
-        interpreter.set_tensor(entry["index"], _to_type(window, entry).reshape(entry["shape"]))
-        interpreter.invoke()
-        scale, zero = answer["quantization"]
-        value = _one(interpreter.get_tensor(answer["index"]))
-        out.append((value - zero) * scale if scale else value)
-    return np.array(out)
+    try:
+        interpreter = _interpreter()(model_content=path.read_bytes())
+        interpreter.allocate_tensors()
+        (entry,), (answer,) = interpreter.get_input_details(), interpreter.get_output_details()
+        if math.prod(entry["shape"]) != windows.shape[1]:
+            shape = list(map(int, entry["shape"]))
+            what = f"{path.name} takes an input of {shape}, not a window of {windows.shape[1]}"
+            raise TargetError(what, "Convert with one window per call.")
+        out = []
+        for window in windows:
+            interpreter.set_tensor(entry["index"], _to_type(window, entry).reshape(entry["shape"]))
+            interpreter.invoke()
+            scale, zero = answer["quantization"]
+            value = _one(interpreter.get_tensor(answer["index"]))
+            out.append((value - zero) * scale if scale else value)
+        return np.array(out)
+    except TargetError:
+        raise
+    except (ValueError, RuntimeError) as error:  # what the interpreter raises for a file that it cannot run
+        what = f"the interpreter cannot run {path.name}: {str(error)[:300]}"
+        raise TargetError(what, "Convert it again, with one input, one output and the interpreter's own operators.") from error
 
 
 def _to_type(window: NDArray[np.float64], entry: dict[str, Any]) -> NDArray[Any]:

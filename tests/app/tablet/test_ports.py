@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from pypdf import PdfReader
 from typer.testing import CliRunner
 
 from app.cli import app
@@ -68,6 +70,17 @@ def test_an_onnx_file_runs_here_and_its_answers_can_be_taken_along(world: tuple[
     assert run(tmp_path / "answers.csv", "--bundle", bundle, "--key", key).exit_code == 0
     with pytest.raises(Invalid, match="cannot be written: File exists"):
         check(tmp_path / "copy.onnx", bundle, key, Outputs(answers=tmp_path / "answers.csv"))
+
+
+def test_the_page_as_pdf_is_one_page_with_verdict_and_hashes(world: tuple[Path, str, PortVectors], tmp_path: Path) -> None:
+    bundle, key, vectors = world
+    (tmp_path / "answers.csv").write_bytes(write_answers(vectors, Answers(np.nan_to_num(vectors.dose, nan=0.25), None)))
+    run(tmp_path / "answers.csv", "--bundle", bundle, "--key", key, "--page", tmp_path / "page.pdf", "--target", "TFLite µ → int8")
+    (printed,) = PdfReader(tmp_path / "page.pdf").pages
+    text = " ".join(printed.extract_text().split())
+    assert "Not this policy: not to be connected. A lost sample gets 0.75 mA." in text
+    assert hashlib.sha256((tmp_path / "answers.csv").read_bytes()).hexdigest() in text
+    assert "Clinician, date: seen" in text
 
 
 def test_an_unusable_table_names_file_line_and_remedy(world: tuple[Path, str, PortVectors], tmp_path: Path) -> None:
