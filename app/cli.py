@@ -97,6 +97,7 @@ def serve(
     """Serve the web pages and the REST interface. Jobs need a worker beside it (`betaloop worker`)."""
     import uvicorn
 
+    from app.accounts.commands import say_how_to_begin
     from app.accounts.sign_on_provider import configured, provider
     from app.ingest.uploads.interrupted import keep_resuming
     from app.main import create_app
@@ -119,6 +120,7 @@ def serve(
     if configured():
         provider()  # settings that do not fit are said now, not to the first person who signs on
     service = create_app()
+    say_how_to_begin()
     # beside the service, for reading what a crash left behind may take minutes
     threading.Thread(target=keep_resuming, args=("the service", threading.Event()), daemon=True).start()
     threading.Thread(target=keep_sealing, args=(threading.Event(),), daemon=True).start()

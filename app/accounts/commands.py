@@ -20,6 +20,16 @@ from app.platform.errors import Invalid, NotFound
 from app.platform.terminal import ACTOR, AsJson, Why, bad_call, reason, show
 from app.tables.accounts import Role, Scope
 
+FIRST_ACCOUNT = "No account exists yet. Make the first one on this machine: betaloop user add YOU@CLINIC.EXAMPLE --role admin"
+
+
+def say_how_to_begin() -> None:
+    """Print how the first account is made, where there is none."""
+    with transaction(ACTOR) as db:
+        if not repository.has_users(db):
+            typer.echo(FIRST_ACCOUNT)
+
+
 user_app = typer.Typer(no_args_is_help=True, help="Users.")
 token_app = typer.Typer(no_args_is_help=True, help="API tokens.")
 

@@ -45,7 +45,9 @@ def sign_in_page(request: Request, db: Db, next: str = "/") -> Response:
     token = request.cookies.get(COOKIE)
     if token and service.caller_of_cookie(db, token):
         return RedirectResponse(local_path(next), 303)
-    return HTMLResponse(render(request, "accounts/sign_in.html", problem=None, email="", next=local_path(next)))
+    return HTMLResponse(
+        render(request, "accounts/sign_in.html", problem=None, email="", next=local_path(next), first=not repository.has_users(db))
+    )
 
 
 @router.post("/sign-in")
@@ -77,7 +79,7 @@ def _sign_in(request: Request, values: FormData) -> Response:
 
 def _sign_in_refused(request: Request, values: FormData, error: BetaloopError) -> Response:
     email, target = str(values.get("email", "")), local_path(str(values.get("next", "/")))
-    page = render(request, "accounts/sign_in.html", problem=error.problem(request.url.path), email=email, next=target)
+    page = render(request, "accounts/sign_in.html", problem=error.problem(request.url.path), email=email, next=target, first=False)
     headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, TooMany) else {}
     return HTMLResponse(page, error.status, headers)
 

@@ -142,6 +142,12 @@ class Caller:
         """True where the caller is a blinded assessor anywhere: then only what `app.accounts.permissions` lists is open to them."""
         return any(g.role is Role.BLINDED_ASSESSOR for g in self.grants)
 
+    def may_open(self, url: str, study_id: int | None = None, site_id: int | None = None) -> bool:
+        """Decide whether a page opens for this caller, at a site or, without one, at any."""
+        path = re.split("[?#]", url)[0]
+        needed = next((permission for pattern, permission in _PAGE_NEEDS if pattern.fullmatch(path)), READ)
+        return (not self.is_blinded or is_open("GET", path)) and self.may(needed, study_id, site_id)
+
     @property
     def role(self) -> Role | None:
         """The strongest role, for display."""
@@ -190,3 +196,18 @@ _PATTERNS = [(method, re.compile(path)) for method, path in OPEN]
 def is_open(method: str, path: str) -> bool:
     """Decide whether a blinded assessor may call this."""
     return any(m == ("GET" if method == "HEAD" else method) and p.fullmatch(path) for m, p in _PATTERNS)
+
+
+# Pages that ask for more than to read. Links are shown to those alone whom their page does not refuse.
+
+_PAGE_NEEDS = tuple(
+    (re.compile(path), permission)
+    for path, permission in (
+        ("/accounts|/studies", MANAGE_ACCOUNTS),
+        (r"/audit(\.csv)?", READ_AUDIT),
+        ("/participants/new|/participants/[^/]+/visits/new", WRITE_STUDY),
+        ("/participants/[^/]+/upload", UPLOAD),
+        ("/participants/[^/]+/next-generation", RUN_JOBS),
+        ("/uploaded-files/[0-9]+/mapping", UPLOAD),
+    )
+)

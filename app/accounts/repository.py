@@ -49,6 +49,11 @@ def users(db: Session) -> Sequence[User]:
     return db.scalars(select(User).options(selectinload(User.memberships)).order_by(User.email)).all()
 
 
+def has_users(db: Session) -> bool:
+    """Return whether any account exists."""
+    return db.scalar(select(User.id).limit(1)) is not None
+
+
 def studies(db: Session) -> Sequence[Study]:
     """List all studies, oldest first."""
     return db.scalars(select(Study).order_by(Study.id)).all()

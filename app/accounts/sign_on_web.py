@@ -126,7 +126,7 @@ def _refusal(request: Request, error: BetaloopError, way: _Way | None) -> Respon
         problem = error.problem(RETURN_PATH) | {"request_id": request.state.request_id}
         page = render(request, "error.html", problem=problem, title=error.title, advice="", only_advice=False, entries=[], again="")
         return HTMLResponse(page, error.status, headers)
-    page = render(request, "accounts/sign_in.html", problem=error.problem(RETURN_PATH), email="", next=target)
+    page = render(request, "accounts/sign_in.html", problem=error.problem(RETURN_PATH), email="", next=target, first=False)
     return HTMLResponse(page, error.status, headers)
 
 

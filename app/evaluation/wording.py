@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
+from app.evaluation.schemas import EstimateSummary, FlagOut, ReasonOut
 from app.platform.web.charts import counted
-from ml.ope import Flag, shown
+from ml.ope import Estimate, Flag, shown
 from ml.outcomes import ALL, ANY, OUTCOMES
 
 UNSUPPORTED = "not supported by the data"
@@ -264,3 +265,24 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         + "."
     ),
 }
+
+
+# Estimates and their flags as types of the API.
+
+Shown = TypeVar("Shown", bound=EstimateSummary)
+
+
+def flag_out(flag: Flag) -> FlagOut:
+    """Return a flag with its sentence."""
+    return FlagOut(code=flag.code, value=flag.value, limit=flag.limit, unit=flag.unit, text=sentence(flag))
+
+
+def reason_out(flag: Flag) -> ReasonOut:
+    """Return a flag as values alone."""
+    return ReasonOut(code=flag.code, value=flag.value, limit=flag.limit, unit=flag.unit)
+
+
+def estimate_out(estimate: Estimate, shape: type[Shown]) -> Shown:
+    """Return an estimate in one of the shapes of the API: each of its fields is the estimate's of the same name."""
+    values = {name: getattr(estimate, name) for name in shape.model_fields}
+    return shape.model_validate(values | {"flags": [flag_out(flag) for flag in estimate.flags]})

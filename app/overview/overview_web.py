@@ -25,7 +25,7 @@ from app.analysis.standing import standing_sentences
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.staleness import stale_reasons
 from app.evaluation.ranking.verdict_wording import what_next
-from app.overview import repository, state
+from app.overview import repository, state, worklist
 from app.overview.package import export_participant
 from app.overview.state import State
 from app.overview.story import story_chart
@@ -98,7 +98,7 @@ SOON = 12
 def overview(
     request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery, withdrawn: Annotated[str, Query(max_length=3)] = "no"
 ) -> HTMLResponse:
-    """Today: the next visits with what each waits for, then all participants as cards, those that need attention marked."""
+    """Show what waits for the reader, visits as a status board, and all participants as cards, those that need attention marked."""
     rows, total = study.participants(db, caller, paging.limit, paging.offset, withdrawn=withdrawn == "yes")
     today = datetime.now(UTC).date()
     # of the whole study: whoever is seen tomorrow may stand on another page of participants
@@ -111,6 +111,11 @@ def overview(
         coming=[(p, states[p.id]) for p in coming],
         soon=SOON,
         today=today,
+        work=worklist.worklist(db, caller, today),
+        board=worklist.board(db, caller, coming[:SOON], today),
+        board_columns=worklist.COLUMNS,
+        waiting={p.code: states[p.id].blocked_by for p in coming},
+        first_steps=worklist.FIRST_STEPS,
         what=state.what,
         actors=state.ACTORS,
         progress=state.progress,

@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Row, false, func, select
-from sqlalchemy.orm import Session, joinedload
+from sqlalchemy import TIMESTAMP, Row, Select, cast, false, func, select, true
+from sqlalchemy.dialects.postgresql import distinct_on
+from sqlalchemy.orm import Session, joinedload, lazyload
 
 from app.accounts.permissions import Caller
 from app.evaluation.schemas import RANKING_KINDS
 from app.study.repository import in_scope
+from app.tables.accounts import Site, Study
+from app.tables.adverse_events import AdverseEvent, AdverseEventRevision, EventKind, Severity
+from app.tables.data_queries import DataQuery, DataQueryEntry, QueryState
 from app.tables.evaluations import EstimateRow, Evaluation
 from app.tables.jobs import Job, JobStatus
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.outcomes import QocRevision
-from app.tables.participants import Participant
-from app.tables.plans import Plan
+from app.tables.participants import MarginsLock, MarginsVersion, Participant
+from app.tables.plans import Plan, PlanItem
 from app.tables.sessions import StudySession
-from app.tables.visits import Visit
+from app.tables.uploads import Upload, UploadFile
+from app.tables.visits import Dose, Visit, VisitLock
 
 
 def visit_days(db: Session, ids: Sequence[int], today: dt.date) -> Iterable[Row[int, int, dt.date | None, dt.date | None]]:
@@ -92,6 +98,135 @@ def live_ranking_jobs(db: Session, ids: Sequence[int]) -> Sequence[Job]:
     live = Job.status.in_([JobStatus.QUEUED, JobStatus.RUNNING])
     query = select(Job).where(Job.participant_id.in_(ids), live, Job.kind.in_(RANKING_KINDS))
     return db.scalars(query.order_by(Job.created_at.desc())).all()
+
+
+# Work of the running studies that the caller may read. Each query gives a row per participant: key, code, study, site, count, oldest.
+
+Waiting = Iterable[Row[Any, str, int, int, int, dt.datetime | None]]
+
+
+def _waiting(caller: Caller, key: Any, oldest: Any) -> Select[Any]:
+    columns = key, Participant.code, Site.study_id, Site.id, func.count(), func.min(oldest)
+    query = select(*columns).select_from(Participant).join(Participant.site).join(Study, Study.id == Site.study_id)
+    return query.where(in_scope(caller), Study.ended_at.is_(None)).group_by(key, Participant.code, Site.study_id, Site.id)
+
+
+def events_to_clear(db: Session, caller: Caller) -> Waiting:
+    """Count adverse events that no clinician has cleared; the key says whether they are serious, else they are stops."""
+    newer = AdverseEventRevision.__table__.alias()
+    is_newest = ~select(newer.c.id).where(newer.c.event_id == AdverseEvent.id, newer.c.revision > AdverseEventRevision.revision).exists()
+    blocks = AdverseEventRevision.serious | (AdverseEventRevision.kind == EventKind.STOPPED)
+    query = _waiting(caller, AdverseEventRevision.serious, AdverseEvent.created_at)
+    query = query.join(AdverseEvent, AdverseEvent.participant_id == Participant.id).join(AdverseEventRevision)
+    return db.execute(
+        query.where(is_newest, blocks, AdverseEventRevision.severity != Severity.NONE, AdverseEventRevision.cleared_reason.is_(None))
+    )
+
+
+def queries_not_closed(db: Session, caller: Caller) -> Waiting:
+    """Count data queries by their state, open or answered."""
+    later = DataQueryEntry.__table__.alias()
+    is_newest = ~select(later.c.id).where(later.c.query_id == DataQuery.id, later.c.id > DataQueryEntry.id).exists()
+    query = _waiting(caller, DataQueryEntry.state, DataQueryEntry.created_at)
+    query = query.join(DataQuery, DataQuery.participant_id == Participant.id).join(DataQueryEntry)
+    return db.execute(query.where(is_newest, DataQueryEntry.state != QueryState.CLOSED))
+
+
+def files_in_quarantine(db: Session, caller: Caller) -> Waiting:
+    """Count files that could not be freed of identity and wait for a decision."""
+    query = _waiting(caller, Participant.id, Upload.created_at).join(UploadFile, UploadFile.participant_id == Participant.id)
+    return db.execute(query.join(Upload, Upload.id == UploadFile.upload_id).where(UploadFile.quarantine_sha256.is_not(None)))
+
+
+def plans_to_sign(db: Session, caller: Caller) -> Waiting:
+    """Count visit plans that are drafts."""
+    query = _waiting(caller, Participant.id, Plan.created_at).join(Visit, Visit.participant_id == Participant.id)
+    return db.execute(query.join(Plan, Plan.visit_id == Visit.id).where(Plan.status == "draft"))
+
+
+def margins_to_lock(db: Session, caller: Caller, today: dt.date) -> Waiting:
+    """Count plans that test a policy from today on, of participants whose present margins are not locked."""
+    newest = select(MarginsVersion.id).where(MarginsVersion.participant_id == Participant.id).order_by(MarginsVersion.id.desc()).limit(1)
+    locked = select(MarginsLock.id).where(MarginsLock.margins_version_id == newest.correlate(Participant).scalar_subquery()).exists()
+    tests = select(PlanItem.id).where(PlanItem.plan_id == Plan.id, PlanItem.policy_id.is_not(None)).exists()
+    query = _waiting(caller, Participant.id, Plan.created_at).join(Visit, Visit.participant_id == Participant.id)
+    query = query.join(Plan, Plan.visit_id == Visit.id).where(Plan.status != "superseded", Visit.date >= today)
+    return db.execute(query.where(tests, ~locked))
+
+
+def sessions_to_confirm(db: Session, caller: Caller) -> Waiting:
+    """Count sessions that were proposed and not confirmed."""
+    query = _waiting(caller, Participant.id, StudySession.created_at).join(Visit, Visit.participant_id == Participant.id)
+    return db.execute(query.join(StudySession, StudySession.visit_id == Visit.id).where(StudySession.status != "confirmed"))
+
+
+def sessions_without_outcomes(db: Session, caller: Caller) -> Waiting:
+    """Count confirmed sessions that count and have no outcome."""
+    query = _waiting(caller, Participant.id, StudySession.created_at).join(Visit, Visit.participant_id == Participant.id)
+    counts = (StudySession.status == "confirmed") & StudySession.excluded_reason.is_(None)
+    has_qoc = select(QocRevision.id).where(QocRevision.session_id == StudySession.id).exists()
+    return db.execute(query.join(StudySession, StudySession.visit_id == Visit.id).where(counts, ~has_qoc))
+
+
+_NEWEST_LOCK = select(VisitLock.locked).where(VisitLock.visit_id == Visit.id).order_by(VisitLock.id.desc()).limit(1)
+_LOCKED = func.coalesce(_NEWEST_LOCK.correlate(Visit).scalar_subquery(), false())
+
+
+def latest_visits(db: Session, caller: Caller, first: dt.date, today: dt.date, most: int) -> Sequence[Row[Visit, str, bool]]:
+    """List visits from `first` to yesterday with code and whether they are locked: unlocked ones first, then the newest."""
+    query = select(Visit, Participant.code, _LOCKED).join(Visit.participant).join(Participant.site).join(Study, Study.id == Site.study_id)
+    query = query.where(in_scope(caller), Study.ended_at.is_(None), Participant.status != "withdrawn")
+    query = query.where(Visit.date >= first, Visit.date < today)
+    return db.execute(query.order_by(_LOCKED, Visit.date.desc(), Participant.code).limit(most).options(lazyload("*"))).all()
+
+
+def visits_to_come(db: Session, ids: Sequence[int], today: dt.date) -> Sequence[Visit]:
+    """Load each participant's first visit from today on."""
+    query = select(Visit).where(Visit.participant_id.in_(ids), Visit.date >= today)
+    query = query.ext(distinct_on(Visit.participant_id)).order_by(Visit.participant_id, Visit.date, Visit.number)
+    return db.scalars(query.options(lazyload("*"))).all()
+
+
+def late_logs(db: Session, caller: Caller, today: dt.date) -> Waiting:
+    """Count slots of signed plans without a confirmed session, of past visits that are not locked; the oldest is the visit's day."""
+    filled = select(StudySession.id).where(StudySession.plan_item_id == PlanItem.id, StudySession.status == "confirmed").exists()
+    query = _waiting(caller, Visit.id, cast(Visit.date, TIMESTAMP(timezone=True))).join(Visit, Visit.participant_id == Participant.id)
+    query = query.join(Plan, Plan.visit_id == Visit.id).join(PlanItem, PlanItem.plan_id == Plan.id)
+    query = query.where(Visit.date < today, Plan.status == "approved", PlanItem.max_ma.is_not(None), ~_LOCKED, ~filled)
+    return db.execute(query)
+
+
+@dataclass(frozen=True)
+class VisitCounts:
+    """Numbers of one visit: its plan's status, its slots and those that a confirmed session fills, sessions, and doses."""
+
+    plan: str | None
+    slots: int
+    filled: int
+    sessions: int
+    without_outcomes: int
+    proposed: int
+    doses: int
+
+
+def visit_counts(db: Session, visit_ids: Sequence[int]) -> dict[int, VisitCounts]:
+    """Count by visit what its day has brought."""
+    confirmed = StudySession.status == "confirmed"
+    has_qoc = select(QocRevision.id).where(QocRevision.session_id == StudySession.id).exists()
+    of_visit = select(
+        func.count().filter(confirmed).label("sessions"),
+        func.count().filter(confirmed & StudySession.excluded_reason.is_(None) & ~has_qoc).label("without"),
+        func.count().filter(~confirmed).label("proposed"),
+    ).where(StudySession.visit_id == Visit.id)
+    sessions = of_visit.correlate(Visit).lateral()
+    doses = select(func.count()).where(Dose.visit_id == Visit.id, Dose.removed_at.is_(None)).correlate(Visit).scalar_subquery()
+    plan = select(Plan.status).where(Plan.visit_id == Visit.id, Plan.status != "superseded").correlate(Visit).scalar_subquery()
+    of_plan = select(func.count()).select_from(PlanItem).join(Plan, Plan.id == PlanItem.plan_id)
+    of_plan = of_plan.where(Plan.visit_id == Visit.id, Plan.status == "approved", PlanItem.max_ma.is_not(None)).correlate(Visit)
+    filled = select(StudySession.id).where(StudySession.plan_item_id == PlanItem.id, confirmed).exists()
+    columns = plan, of_plan.scalar_subquery(), of_plan.where(filled).scalar_subquery(), sessions.c.sessions, sessions.c.without
+    query = select(Visit.id, *columns, sessions.c.proposed, doses).join(sessions, true())
+    return {key: VisitCounts(*counts) for key, *counts in db.execute(query.where(Visit.id.in_(visit_ids)))}
 
 
 def policies(db: Session, participant_id: int) -> Sequence[Policy]:

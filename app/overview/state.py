@@ -261,7 +261,7 @@ ACTORS = {
     Actor.CLINICIAN: "Clinician",
     Actor.COORDINATOR: "Coordinator",
     Actor.ENGINEER: "Engineer",
-    Actor.SERVICE: "Nobody: the service works",
+    Actor.SERVICE: "Running automatically",
 }
 
 _TASKS: dict[Task, str | Callable[[int], str]] = {

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from app.evaluation.schemas import CheckOut, CoverageOut
-from app.evaluation.shown import flag_out
+from app.evaluation.wording import flag_out
 from app.tables.evaluations import Evaluation
 from ml.ope import Estimate, Flag, distinct
 

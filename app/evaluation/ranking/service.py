@@ -16,7 +16,7 @@ from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.evaluation.ranking.judged import Judged, judged
 from app.evaluation.ranking.staleness import stale_reasons
 from app.evaluation.schemas import CoverageOut, EstimateOut, FlagOut, GainOut, RankedPolicy, RankedSnapshot, RankingFilter, RankingOut
-from app.evaluation.shown import estimate_out, flag_out, reason_out
+from app.evaluation.wording import estimate_out, flag_out, reason_out
 from app.platform.errors import NotFound
 from app.study import access
 from app.study import repository as study_repository

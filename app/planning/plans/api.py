@@ -8,7 +8,7 @@ from fastapi import APIRouter, Response
 from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
-from app.evaluation.shown import estimate_out
+from app.evaluation.wording import estimate_out
 from app.planning import wording
 from app.planning.bundles.ports import lines_of
 from app.planning.bundles.repository import releases_of_slots
