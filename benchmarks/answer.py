@@ -7,9 +7,10 @@
     python benchmarks/answer.py --calibrate                  the monotone map of chances that part A gives (`verdict.CALIBRATION`)
 
 A candidate is worth a test if all QoCs are truly within the margins of cDBS and it saves energy. It is safe if they are within the margins.
-The pick is the first *test* of the page by estimated return, else cDBS. Its loss is to the best safe policy, cDBS among them, as a share of
-the range of true returns. Following pays in a world if its best safe closed loop beats its best safe constant by 5 % of that range. Errors
-are standard errors over worlds; those of a ratio of sums are linearised. True returns only measure. CPU seconds of one thread.
+The page is ordered by estimated return, candidates with a hazard last. The pick is its first *test*, else cDBS. Its loss is to the best
+safe policy, cDBS among them, as a share of the range of true returns. Following pays in a world if its best safe closed loop beats its
+best safe constant by 5 % of that range. Errors are standard errors over worlds; those of a ratio of sums are linearised. True returns
+only measure. CPU seconds of one thread.
 """
 
 from __future__ import annotations
@@ -43,8 +44,6 @@ TRUTH, QUICK_TRUTH, QUICK_WORLDS = 150, 40, 8
 CDBS = "cDBS"
 LEAST = 0.05
 """Share of the range that counts as a difference."""
-PLACES = ("test", "test_with_care", "undecided", "cannot_tell", "same_as_cdbs", "likely_worse", "unsafe")
-"""Order of a page by verdict; within a verdict by estimated return."""
 Row = dict[str, Any]
 World = list[Row]
 
@@ -64,10 +63,12 @@ def cell(part: str, index: int, population: int, truth: int) -> World:
     found = []
     for name, own in estimates.items():
         gain, true = gain_over(own, reference), truths[name]
+        result = verdict(own, reference, Margins(), Levels())
         found.append(
             {
                 "name": name,
-                "code": verdict(own, reference, Margins(), Levels()).code,
+                "code": result.code,
+                "hazard": bool(result.hazards),
                 "share": share_within(own, reference, Margins()),
                 "value": own.value,
                 "gain": [gain.low, gain.high],
@@ -131,25 +132,19 @@ def share_of(worlds: Sequence[World], question: Callable[[Row], bool], group: Ca
     return ratio([sum(map(question, rows)) for rows in inside], [len(rows) for rows in inside])
 
 
-def orders(worlds: Sequence[World]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Compute the rank correlations with true returns of the order by value and of the page's order."""
-    by_value, by_page = [], []
+def order(worlds: Sequence[World], last: Callable[[Row], bool], key: str = "value") -> tuple[float, float]:
+    """Compute the rank correlation with true returns of an order by a number, some candidates last; its mean over worlds."""
+    found = []
     for rows in map(candidates, worlds):
-        true = np.array([r["true"] for r in rows])
-        value = np.array([r["value"] for r in rows])
-        order = sorted(range(len(rows)), key=lambda i: (PLACES.index(rows[i]["code"]), -rows[i]["value"]))
         place = np.empty(len(rows))
-        place[order] = np.arange(len(rows))
-        by_value.append(spearman(true, value) or 0.0)
-        by_page.append(spearman(true, -place) or 0.0)
-    ones = [1.0] * len(worlds)
-    return ratio(by_value, ones), ratio(by_page, ones)
+        place[sorted(range(len(rows)), key=lambda i: (last(rows[i]), -rows[i][key]))] = np.arange(len(rows))
+        found.append(spearman(np.array([r["true"] for r in rows]), -place) or 0.0)
+    return ratio(found, [1.0] * len(worlds))
 
 
 def aims(worlds: Sequence[World]) -> dict[str, tuple[float, float]]:
     """Measure every aim that three visits of one data set can show, with its standard error."""
     ones, pays = [1.0] * len(worlds), [rows for rows in worlds if following_pays(rows)]
-    by_value, by_page = orders(worlds)
 
     def covered(r: Row, cdbs: Row) -> bool:
         return bool(r["gain"][0] <= r["true"] - cdbs["true"] <= r["gain"][1])
@@ -169,8 +164,10 @@ def aims(worlds: Sequence[World]) -> dict[str, tuple[float, float]]:
         "unsafe that are worth a test": share_of(worlds, lambda r: r["worth"], lambda r: r["code"] == "unsafe"),
         "harmful called unsafe": share_of(worlds, lambda r: r["code"] == "unsafe", lambda r: r["harm"]),
         "harmful called test": share_of(worlds, lambda r: r["code"] == "test", lambda r: r["harm"]),
-        "rank correlation by value": by_value,
-        "rank correlation of the page": by_page,
+        "rank correlation by value": order(worlds, lambda r: False),
+        "rank correlation of the page": order(worlds, lambda r: r["hazard"]),
+        "the same, were harm known": order(worlds, lambda r: r["harm"]),
+        "the same, were harm and value known": order(worlds, lambda r: r["harm"], "true"),
         "worlds where following pays": ratio([following_pays(rows) for rows in worlds], ones),
         "there, a closed loop is a test": ratio(
             [any(r["code"] == "test" and not r["constant"] for r in candidates(rows)) for rows in pays], [1.0] * len(pays)

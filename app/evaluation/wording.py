@@ -260,9 +260,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
         "whether it improves on cDBS in return is open."
     ),
     "placed_below": lambda f: (
-        "Hardly any session came near what these do, so that their values are guesses; they stand last, whatever the value: "
-        + ", ".join(f.fact("policies"))
-        + "."
+        "Hardly any session came near what these do; value and place are guesses: " + ", ".join(f.fact("policies")) + "."
     ),
 }
 

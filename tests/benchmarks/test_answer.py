@@ -24,7 +24,7 @@ def answer(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 def row(name: str, code: str, value: float, true: float, **changed: Any) -> dict[str, Any]:
     """Make a row whose candidate is safe and saves energy."""
-    usual = {"gain": [-1.0, 1.0], "constant": False, "safe": True, "harm": False, "worth": True}
+    usual = {"gain": [-1.0, 1.0], "constant": False, "safe": True, "harm": False, "hazard": False, "worth": True}
     return {"name": name, "code": code, "value": value, "true": true, **usual, **changed}
 
 
@@ -35,7 +35,7 @@ def test_the_pick_is_the_first_test_and_its_loss_is_to_the_best_safe_policy(answ
     rows = [
         row("a", "test", 5.0, 4.0),
         row("b", "test", 3.0, 8.0),
-        row("c", "unsafe", 9.0, 10.0, safe=False, harm=True, worth=False),
+        row("c", "unsafe", 9.0, 10.0, safe=False, harm=True, hazard=True, worth=False),
         row("d", "undecided", 8.0, 0.0, constant=True),
         CDBS,
     ]
@@ -48,6 +48,10 @@ def test_the_pick_is_the_first_test_and_its_loss_is_to_the_best_safe_policy(answ
     assert found["test: recall"][0] == pytest.approx(2 / 3)
     assert found["unsafe that are worth a test"][0] == 0.0
     assert found["intervals to cDBS that cover"][0] == pytest.approx(1 / 4)
+    # true returns 4, 8, 10, 0 have ranks 2, 3, 4, 1: by value a, b, c, d are 2, 1, 4, 3, and with c last 3, 2, 1, 4
+    assert found["rank correlation by value"][0] == pytest.approx(1 - 6 * (0 + 4 + 0 + 4) / 60)
+    assert found["rank correlation of the page"][0] == pytest.approx(1 - 6 * (1 + 1 + 9 + 9) / 60)
+    assert found["the same, were harm and value known"][0] == pytest.approx(1 - 6 * (1 + 1 + 9 + 1) / 60)
 
 
 def test_without_a_test_the_pick_is_cdbs(answer: Any) -> None:

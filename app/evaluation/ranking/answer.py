@@ -16,7 +16,7 @@ from ml.ope import SAME_AMPLITUDE, BehaviourMap, Estimate, chance_within, interv
 from ml.outcomes import FIELDS
 
 ORDER = ("test", "test_with_care", "undecided", "cannot_tell", "likely_worse", "not_advised", "unsafe", "same_as_cdbs")
-"""Rows by what to do with them; within a verdict as the ranking has them."""
+"""Rows by what to do with them, where the data cannot order policies."""
 
 MAP = "map"
 """Member of what `check_coverage` found."""
@@ -102,7 +102,7 @@ class Answer:
     """The candidates for a reader: what is worth a visit, what is not, and what is cDBS or no stimulation by another name.
 
     Attributes:
-        rows: distinct behaviours, what to test first. like_cdbs, like_off: folded away.
+        rows: distinct behaviours, by value, those with a hazard last. like_cdbs, like_off: folded away.
         ordered: whether the data can order policies. under_cdbs: what is expected under cDBS itself, by quantity, less energy.
         cdbs_ma: its amplitude, mA; None where it is not known. sessions: that the estimates rest on; None without any.
         fixed: the best fixed amplitude; None where that is cDBS, or none was evaluated.
@@ -123,8 +123,9 @@ class Answer:
 
     @property
     def hazards(self) -> list[Row]:
-        """What is not to be run without a clinician's word, whatever its verdict; less what `off` holds."""
-        return [r for r in (*self.rows, *self.like_off) if _held_back(r) and r not in self.off]
+        """What is not to be run without a clinician's word, whatever its verdict, events first; less what `off` holds."""
+        found = [r for r in (*self.rows, *self.like_off) if _held_back(r) and r not in self.off]
+        return sorted(found, key=lambda r: (not _happened(r), not r.decided.hazards))
 
     @property
     def off(self) -> list[Row]:
@@ -153,7 +154,7 @@ class Answer:
         return sum(1 + len(row.twins) for row in rows)
 
     def everyone(self) -> dict[int, Row]:
-        """Every candidate's own row by the id of its policy, what to test first, twins after what they do the same as."""
+        """Every candidate's own row by the id of its policy, as ordered, twins after what they do the same as."""
         rows = (*self.rows, *self.like_cdbs, *self.like_off)
         return {own.one.policy.id: own for r in rows for own in (r, *r.twins)}
 
@@ -177,7 +178,8 @@ class Answer:
 def answer(found: Assessment) -> Answer:
     """What to say of an assessment's candidates."""
     rows = [_row(found, one, tuple(_row(found, twin) for twin in twins)) for one, *twins in behaviours(found)]
-    rows.sort(key=lambda r: ORDER.index(r.decided.standing))  # stable: within a verdict as ranked
+    if not found.ordered:
+        rows.sort(key=lambda r: ORDER.index(r.decided.standing))
     off = [r for r in rows if _nearly_off(r.one.posterior) > OFF_SHARE]
     same = [r for r in rows if r.decided.decision == "same_as_cdbs" and r not in off]
     distinct = tuple(r for r in rows if r not in off and r not in same)

@@ -19,7 +19,7 @@ from app.study import cdbs_amplitude
 from app.tables.evaluations import Evaluation
 from app.tables.participants import Participant, SettingsVersion
 from ml.mdp import MdpSettings
-from ml.ope import POSTERIOR, Estimate, Flag, rank_policies
+from ml.ope import POSTERIOR, SETTLED_BY_SESSIONS, Estimate, Flag, rank_policies
 from ml.ope.posterior.further_sessions import Place
 from ml.outcomes import FIELDS
 from ml.returns import ActualReturn, actual_return
@@ -66,8 +66,8 @@ def mean_of(values: Sequence[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-_LAST = ("unsafe", "likely_worse")
-"""Verdicts that come last whatever is estimated, beside policies that the data do not support."""
+_NOT_BEST = ("unsafe", "likely_worse")
+"""Verdicts of policies that are not asked for their probability of being best, like policies that the data do not support."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,9 @@ class Assessed:
 
 @dataclass(frozen=True)
 class Assessment:
-    """All policies of an evaluation, candidates from best to worst (by name where the data cannot order them), then references.
+    """All policies of an evaluation: candidates, then references.
+
+    Candidates are in the order of their values, those with a hazard last; by name where the data cannot order them.
 
     Attributes:
         method: whose estimates rank. cdbs_ma: the cDBS amplitude now, mA; None where it is not known or differs by side.
@@ -222,9 +224,9 @@ def assess(
     }
     own = {i: by[POSTERIOR] for i, by in table.items() if POSTERIOR in by}
     ordered = ordering_told({i: e for i, e in own.items() if i not in references} or own)
-    # who is unsafe comes last, as who is not supported does
-    held_back = {str(i): replace(e, supported=e.supported and decided[i].decision not in _LAST) for i, e in candidates.items()}
-    places = {int(r.policy): r for r in rank_policies({method: held_back}, method)} if candidates else {}
+    eligible = {str(i): replace(e, supported=e.supported and decided[i].decision not in _NOT_BEST) for i, e in candidates.items()}
+    tiers = {str(i): _tier(decided[i], e) for i, e in candidates.items()}
+    places = {int(r.policy): r for r in rank_policies({method: eligible}, method, tiers=tiers)} if candidates else {}
     order = sorted(places, key=lambda i: places[i].rank) if ordered else sorted(places, key=lambda i: (policies[i].name, i))
     order += sorted(references, key=lambda i: -(by_method[i].value if i in by_method else 0.0))
     found = tuple(
@@ -242,6 +244,17 @@ def assess(
         for i in order
     )
     return Assessment(evaluation, participant, method, found, cdbs_ma, ordered)
+
+
+def _tier(verdict: Decided, estimate: Estimate) -> int:
+    """Find the tier of a candidate, before its value counts: 2 with a hazard, 1 where the data refuse its estimate, else 0.
+
+    A verdict is no tier. Nor is it one that few sessions came near a policy: on virtual patients its value still orders better than none.
+    """
+    if verdict.hazards or verdict.decision == "unsafe":
+        return 2
+    refusing = {flag.code for flag in estimate.flags if flag.refuses}
+    return int(not estimate.supported and not (refusing and refusing <= SETTLED_BY_SESSIONS))
 
 
 def _references(policies: Mapping[int, PolicyHead], by_method: Mapping[int, Estimate]) -> dict[int, str]:

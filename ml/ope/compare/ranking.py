@@ -17,7 +17,7 @@ class Ranked:
     """One policy's place.
 
     Attributes:
-        policy: its name. rank: 1 is best; policies that the data do not support come after all others.
+        policy: its name. rank: 1 is best.
         probability_best: that its return is the highest among supported policies; 0 for the others.
         supported: whether the ranking's method may speak about it.
         estimate: of the ranking's method.
@@ -45,14 +45,19 @@ def default_method(estimates: Mapping[str, Mapping[str, Estimate]]) -> str:
 
 
 def rank_policies(
-    estimates: Mapping[str, Mapping[str, Estimate]], method: str | None = None, draws: int = 4000, seed: int = 0
+    estimates: Mapping[str, Mapping[str, Estimate]],
+    method: str | None = None,
+    draws: int = 4000,
+    seed: int = 0,
+    tiers: Mapping[str, int] | None = None,
 ) -> list[Ranked]:
-    """Rank policies from best to worst by one method.
+    """Rank policies from best to worst by one method: by tier, then by value.
 
     Args:
         estimates: method -> policy -> estimate.
         method: whose estimates rank; `default_method` where not given.
         draws: draws behind the probability of being best. seed: theirs.
+        tiers: by policy, a lower one first; where not given, policies that the data do not support come after all others.
 
     Raises:
         ValueError: the method has no estimate.
@@ -63,7 +68,8 @@ def rank_policies(
             f"there is no estimate by {chosen} to rank by; methods with estimates: {', '.join(m for m in estimates if estimates[m])}"
         )
     table = estimates[chosen]
-    names = sorted(table, key=lambda name: (not table[name].supported, -table[name].value, name))
+    tier = {name: int(not e.supported) for name, e in table.items()} if tiers is None else tiers
+    names = sorted(table, key=lambda name: (tier[name], -table[name].value, name))
     best = dict.fromkeys(names, 0.0) | probability_best({n: table[n] for n in names if table[n].supported}, draws, seed)
     return [Ranked(name, k + 1, best[name], table[name].supported, table[name]) for k, name in enumerate(names)]
 

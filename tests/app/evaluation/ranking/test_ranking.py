@@ -332,8 +332,7 @@ def test_an_evaluation_without_a_posterior_proposes_nothing_and_says_so(
             (44.0, True), (99.0, False),
             ["The cDBS reference is estimated at 47.0, above every supported candidate (best: p0, 44.0): by this estimate no supported "
              "candidate improves on cDBS in return.",
-             "Hardly any session came near what these do, so that their values are guesses; "
-             "they stand last, whatever the value: p1 (99.0)."],
+             "Hardly any session came near what these do; value and place are guesses: p1 (99.0)."],
         ),
         (
             (44.0, False), (40.0, False),

@@ -54,7 +54,7 @@ def test_the_posterior_ranks_and_its_verdicts_stand_in_the_contract(client: Test
     judge({a: judged(50.0), b: judged(60.0, **WORSE), c: judged(70.0, supported=False)})
     body = ranked(client)
     assert (body["default_method"], body["methods"], body["choice"]) == ("posterior", ["posterior"], None)
-    # b is worth more by its return and c most of all; unsafe and unsupported ones come last
+    # b is worth more by its return and c most of all; unsafe ones come last, those at amplitudes hardly tried before them
     assert [(p["policy_id"], p["rank"], p["decision"]) for p in body["policies"]] == [
         (a, 1, "test"), (c, 2, "test_with_care"), (b, 3, "unsafe")
     ]  # fmt: skip
@@ -65,6 +65,32 @@ def test_the_posterior_ranks_and_its_verdicts_stand_in_the_contract(client: Test
     ]
     assert body["policies"][0]["gain"]["value"] == 50.0
     assert "likely within the margins of grasp, rating and tremor" in body["policies"][0]["decision_reason"]
+
+
+def test_the_page_follows_values_and_the_first_proposal_is_a_test_all_the_same(
+    client: TestClient, policies: list[int], judge: Judge
+) -> None:
+    """A likely worse policy keeps the place of its value with its label; only a hazard is a place of its own."""
+    a, b, c = policies
+    likely_worse = {"outcome_draws": {"tremor_percent": [33.0] * N}}
+    judge({a: judged(50.0), b: judged(60.0, **likely_worse), c: judged(70.0, **WORSE)})
+    found = ranked(client)["policies"]
+    assert [(p["policy_id"], p["rank"], p["decision"]) for p in found] == [(b, 1, "likely_worse"), (a, 2, "test"), (c, 3, "unsafe")]
+    assert {p["policy_id"]: p["probability_best"] for p in found} == {a: 1.0, b: 0.0, c: 0.0}
+    page = client.get(PAGE).text
+    rows = re.findall(r"<tr.*?</tr>", page.split('id="candidates"')[1].split("</table>")[0], re.S)[1:]
+    assert [re.findall(r">(p\d)</a>", r)[0] for r in rows] == ["p1", "p0", "p2"]
+    assert ['type="checkbox"' in r for r in rows] == [False, True, False]
+    words = first_screen(client)
+    assert words.index("Worth a test") < words.index("p0 :") < words.index("p1 :"), "what is likely worse is no proposal"
+    assert "p1 :" in words.split("Not advised:")[1]
+
+
+def test_a_value_that_few_sessions_came_near_is_a_place(client: TestClient, policies: list[int], judge: Judge) -> None:
+    a, b, c = policies
+    few = Flag.of("few_near_sessions", 0.0, 2.0, "sessions", refuses=True).to_json()
+    judge({a: judged(50.0), b: judged(60.0, supported=False) | {"flags": [few]}, c: judged(70.0, supported=False)})
+    assert [p["policy_id"] for p in ranked(client)["policies"]] == [b, a, c], "amplitudes that were hardly tried come after what was"
 
 
 def test_a_change_of_margins_changes_the_verdict_at_once(client: TestClient, policies: list[int], judge: Judge) -> None:

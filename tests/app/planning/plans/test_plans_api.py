@@ -238,8 +238,7 @@ def test_a_plan_repeats_what_its_ranking_says_of_unsupported_policies(client: Te
     )
     db.commit()
     assert [w["text"] for w in _draft(client, study_world).json()["warnings"]] == [
-        "Hardly any session came near what these do, so that their values are guesses; "
-        "they stand last, whatever the value: rl-02-small (99.0)."
+        "Hardly any session came near what these do; value and place are guesses: rl-02-small (99.0)."
     ]
 
 
