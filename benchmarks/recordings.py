@@ -46,6 +46,11 @@ work()
 """
 READERS = {
     "edf": ("from ml.formats.edf.read import read_edf as reader", "import edfio", "x = [s.data for s in edfio.read_edf(path).signals]"),
+    "nwb": (
+        "from ml.formats.nwb.read import read_nwb as reader\nimport h5py",
+        "import pynwb",
+        "x = [s.data[:] for s in pynwb.NWBHDF5IO(str(path), 'r').read().acquisition.values()]",
+    ),
     "xdf": ("from ml.formats.xdf.read import read_xdf as reader\nimport pyxdf", "import pyxdf", "x = pyxdf.load_xdf(str(path))"),
 }
 """By kind: import of our reader, import of the library, and how the library loads all samples."""
@@ -110,7 +115,7 @@ def main() -> None:
             size = (folder / "clean").stat().st_size
             theirs, own = [], []
             for _ in range(3):
-                theirs.append(measure(folder / "clean", library, load))
+                theirs.append(measure(folder / "large", library, load))
                 own.append(measure(folder / "clean", f"from ml.formats.recording import FileReport\n{ours}", OURS.format(reader="reader")))
             cpu, cpu_own = (min(r[0] for r in runs) for runs in (theirs, own))
             memory, memory_own = (max(r[1] for r in runs) / size for runs in (theirs, own))

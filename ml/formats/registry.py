@@ -110,6 +110,15 @@ DEVICES = (
         magic=(b"0       ", b"\xffBIOSEMI"),
     ),
     DeviceFormat(
+        kind="nwb",
+        device="NWB",
+        file="NWB recording",
+        upload="an NWB recording",
+        package="ml.formats.nwb",
+        sources={},
+        magic=(b"\x89HDF\r\n\x1a\n",),
+    ),
+    DeviceFormat(
         kind="brainvision",
         device="BrainVision",
         file="BrainVision recording",

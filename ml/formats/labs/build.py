@@ -122,7 +122,7 @@ def _stretches(channel: Channel, origin_s: float, report: FileReport) -> list[St
             "Check the unit of the channel.",
         )
     good = measured_samples(x) & ~absurd
-    lost = int(x.size - good.sum())
+    lost = sum(int((~good[p.begin : p.end]).sum()) for p in channel.timing.pieces)
     if lost:
         report.flagged.append(f"{channel.shown}: {lost} samples are zero in a row, no number or impossible: gaps. Were they recorded?")
     rate = channel.timing.rate_hz

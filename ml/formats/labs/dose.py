@@ -116,12 +116,14 @@ def _of_marks(
     for mark in sorted(marks, key=lambda m: m.t_s):
         dose = mark.statement.dose_ma
         value = np.nan if dose is None or dose >= UPPER_PLAUSIBLE_MA else dose
-        knots.append((mark.t_s, 2, value))
+        # to the microsecond: an end that is the next one's begin is not after it
+        knots.append((round(mark.t_s, 6), 2, value))
         if mark.duration_s:
-            knots.append((mark.t_s + mark.duration_s, 1, np.nan))
+            knots.append((round(mark.t_s + mark.duration_s, 6), 1, np.nan))
     if content.marks_pause:
         # what was set while nothing was recorded is in no mark
-        knots += [(end, 0, np.nan) for end, _ in _pauses(content)]
+        lasting = [(m.t_s, m.t_s + m.duration_s) for m in marks if m.lasting and m.duration_s]
+        knots += [(at, 0, np.nan) for at, _ in _pauses(content) if not any(begin <= at < end for begin, end in lasting)]
     if content.cut_s is not None:
         knots.append((content.cut_s, 3, np.nan))
     knots.sort(key=lambda k: (k[0], k[1]))

@@ -68,11 +68,17 @@ class Statement:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A marker: its time in s of the file's clock, its cleaned label, and how long it lasts; None: it is of one moment."""
+    """A marker.
+
+    Attributes:
+        t_s: time, s of the file's clock. label: cleaned. duration_s: how long it lasts; None: it is of one moment.
+        lasting: whether it holds for its duration whatever was recorded, as a row of a table of events does.
+    """
 
     t_s: float
     label: str
     duration_s: float | None = None
+    lasting: bool = False
 
     @property
     def statement(self) -> Statement:

@@ -6,7 +6,7 @@ a stretch, and one rate is fitted to all stretches.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -141,7 +141,8 @@ def of_stamps(t_s: Floats, nominal_hz: float) -> Timing:
         begin, end = int(part[0]), int(part[-1]) + 1
         own = t_s[begin:end]
         if precise:
-            found = (np.flatnonzero(np.diff(own) > GAP * period) + 1).tolist()
+            moves = np.diff(own)
+            found = (np.flatnonzero((moves > GAP * period) | (moves < -0.5 * period)) + 1).tolist()
         else:
             found, blind = _find_hidden(own, period)
             unseen = max(unseen, blind)
@@ -158,6 +159,17 @@ def of_stamps(t_s: Floats, nominal_hz: float) -> Timing:
         pieces.append(Piece(a, b, start))
     joined = of_pieces(pieces, rate)
     return Timing(rate, joined.pieces, jitter, joined.gaps, joined.lost, unseen, joined.backward, joined.dropped)
+
+
+def only(timing: Timing, good: NDArray[np.bool_]) -> Timing:
+    """Take lost samples out of a stream; `good` [n] marks those that are there."""
+    pieces = []
+    for p in timing.pieces:
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], good[p.begin : p.end].astype(np.int8), [0]))))
+        for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            pieces.append(Piece(p.begin + begin, p.begin + end, p.start_s + begin / timing.rate_hz))
+    cut = of_pieces(pieces, timing.rate_hz)
+    return replace(timing, pieces=cut.pieces, gaps=cut.gaps, lost=cut.lost)
 
 
 def _period(t_s: Floats, nominal_hz: float, parts: list[NDArray[np.int64]]) -> float:

@@ -5,12 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import edfio
 import numpy as np
+import pynwb
 import pytest
 from fastapi.testclient import TestClient
+from pynwb.ecephys import ElectricalSeries
 
 from app.platform import files
 from tests.ml.formats.brainvision.test_brainvision import three
+from tests.ml.formats.peers import nwb
 from tests.ml.formats.peers.xdf import Stream, write
 
 
@@ -83,9 +87,35 @@ def xdf_file(path: Path) -> bytes:
     return path.read_bytes()
 
 
-FILES = {"xdf": xdf_file}
+SIDES = ("STN L 1-3", "STN R 1-3")
+MARKS = ((10.0, "stim on 2.5 mA"), (20.0, f"{NAME} feels well"), (50.0, "stim off"))
 
 
+def edf_file(path: Path) -> bytes:
+    """Write the same as EDF+."""
+    x = np.random.default_rng(0).normal(0, 2, (2, 15_000))
+    signals = [edfio.EdfSignal(v, 250.0, label=n, physical_dimension="uV", physical_range=(-50, 50)) for n, v in zip(SIDES, x, strict=True)]
+    notes = [edfio.EdfAnnotation(t, None, text) for t, text in MARKS]
+    edfio.Edf(signals, patient=edfio.Patient(name=NAME), data_record_duration=1.0, annotations=notes).write(path)
+    return path.read_bytes()
+
+
+def nwb_file(path: Path) -> bytes:
+    """Write the same as NWB."""
+    file = nwb.new_file(subject=pynwb.file.Subject(subject_id=NAME), experimenter=[NAME], institution=NAME, notes=NAME)
+    region = nwb.add_electrodes(file, list(SIDES), NAME)
+    x = np.random.default_rng(0).normal(0, 2e-6, (15_000, 2))
+    file.add_acquisition(ElectricalSeries(name="LFP", data=x, electrodes=region, rate=250.0))
+    notes = pynwb.misc.AnnotationSeries(name=NAME, data=[text for _, text in MARKS], timestamps=[t for t, _ in MARKS])
+    file.add_acquisition(notes)
+    nwb.write(path, file)
+    return path.read_bytes()
+
+
+FILES = {"edf": edf_file, "nwb": nwb_file, "xdf": xdf_file}
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("kind", sorted(FILES))
 def test_a_lab_s_recording_is_one_session_of_both_sides_without_a_name(
     kind: str, client: TestClient, participant_code: str, tmp_path: Path

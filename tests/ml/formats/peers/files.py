@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pybv
+from pynwb.ecephys import ElectricalSeries
 
-from tests.ml.formats.peers import xdf
+from tests.ml.formats.peers import nwb, xdf
 from tests.ml.formats.peers.truth import Truth, make_truth
 
 
@@ -145,7 +146,28 @@ def write_brainvision(path: Path, rng: np.random.Generator) -> Written:
     return Written(truth, names, 2 * lsb, pause=True, steps=inside)
 
 
-WRITERS: dict[str, Callable[[Path, np.random.Generator], Written]] = {"brainvision": write_brainvision, "edf": write_edf, "xdf": write_xdf}
+def write_nwb(path: Path, rng: np.random.Generator) -> Written:
+    """Write NWB by pynwb: integers with scales or volts; timestamps, a series per stretch, NaN or invalid times; three ways of doses."""
+    truth = make_truth(rng, rate_hz=float(rng.choice([250.0, 500.0, 1000.0])), gaps=int(rng.integers(0, 5)), steps=int(rng.integers(0, 5)))
+    file, begin_s = nwb.new_file(), float(rng.choice([0.0, 12.3456]))
+    place = str(rng.choice(["left STN", "Left subthalamic nucleus", "unknown"]))
+    lsb = nwb.add_signal(file, truth, rng, nwb.add_electrodes(file, list(truth.channels), place), begin_s)
+    pause = nwb.add_dose(file, truth, rng, WORDS, begin_s)
+    if rng.integers(2):
+        # what another sensor recorded meanwhile shows that the recording went on, and so did its marks
+        nwb.add_others(file, truth)
+        pause = False
+    nwb.write(path, file)
+    target = "" if place == "unknown" else "STN "
+    return Written(truth, {n: target + n.replace(" 0", " +0").replace(" 1-", " +1-") for n in truth.channels}, lsb, pause=pause)
+
+
+WRITERS: dict[str, Callable[[Path, np.random.Generator], Written]] = {
+    "brainvision": write_brainvision,
+    "edf": write_edf,
+    "nwb": write_nwb,
+    "xdf": write_xdf,
+}
 """By kind."""
 
 
@@ -169,5 +191,15 @@ def large_xdf(path: Path, megabytes: int) -> None:
     xdf.write(path, [xdf.Stream("LFP", "LFP", 1000.0, 100.0 + np.arange(n) / 1000, x, names, ["uV"] * 8, per_chunk=100)])
 
 
-LARGE = {"edf": large_edf, "xdf": large_xdf}
+def large_nwb(path: Path, megabytes: int) -> None:
+    """Write an NWB of eight channels at 1 kHz, as integers of 16 bits."""
+    n = megabytes * 1_000_000 // 16
+    file = nwb.new_file()
+    region = nwb.add_electrodes(file, [f"LFP L {k}-{k + 2}" for k in range(8)], "left STN")
+    x = np.random.default_rng(0).normal(0, 300, (n, 8)).astype(np.int16)
+    file.add_acquisition(ElectricalSeries(name="LFP", data=x, electrodes=region, rate=1000.0, conversion=1e-8))
+    nwb.write(path, file)
+
+
+LARGE = {"edf": large_edf, "nwb": large_nwb, "xdf": large_xdf}
 """Large files by kind, for what reading takes."""
