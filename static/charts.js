@@ -65,6 +65,9 @@ async function draw(figure, onPaper = false) {
     const theme = colours(onPaper);
     const { data, layout } = theme.walk(await content(source));
     theme.done();
+    const { synthetic } = document.body.dataset;
+    // within the picture, so that a saved figure says it too
+    if (synthetic) layout.annotations = [...(layout.annotations ?? []), { text: `${synthetic}: synthetic`, xref: "paper", yref: "paper", x: 1, y: 1, xanchor: "right", yanchor: "bottom", showarrow: false, font: { size: 10 } }];
     const shown = zooms.get(figure.dataset.zoom);
     if (shown) Object.assign(layout.xaxis, { range: shown, autorange: false });
     // a sheet is narrower than most windows, and nothing tells the library how wide it is

@@ -13,7 +13,7 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.analysis import evaluations
 from app.analysis.evaluations import LEAST_POLICIES, WANTED_SEEDS, BySeed, SeedRow
-from app.analysis.figures import Box, Panel, boxes_svg, csv_of
+from app.analysis.figures import SYNTHETIC, Box, Panel, boxes_svg, csv_of
 from app.platform.database import Db
 from app.platform.web.charts import TEXT, Cell, Chart, axis, counted, figure, side_by_side
 from app.platform.web.csv_files import download
@@ -163,9 +163,10 @@ def table_of(found: BySeed) -> Response:
     return download(csv_of(CSV_COLUMNS, csv_rows(found)), f"{found.participant}-methods-by-seed.csv")
 
 
-def figure_of(found: BySeed) -> Response:
+def figure_of(found: BySeed, *, synthetic: bool) -> Response:
     """A panel per metric, a point per seed."""
     note = f"Snapshot {found.snapshot_id}, seeds {', '.join(map(str, found.seeds))}; against sessions recorded after the snapshot."
+    note = f"{SYNTHETIC} {note}" if synthetic else note
     shown = panels(found) if found.rows else []
     content = boxes_svg(shown, f"Methods of evaluation, {found.participant}", note if shown else missing(found))
     return Response(content, media_type="image/svg+xml")
@@ -190,7 +191,7 @@ def read_by_seed(
     """Every method of evaluation over seeds on one snapshot, against the returns of the sessions recorded after it."""
     found = evaluations.by_seed(db, participant, caller)
     if format != "json":
-        return table_of(found) if format == "csv" else figure_of(found)
+        return table_of(found) if format == "csv" else figure_of(found, synthetic=participant.synthetic)
     return by_seed_out(found)
 
 
@@ -223,4 +224,4 @@ def by_seed_table(participant: CurrentParticipant, db: Db, caller: CurrentCaller
 @pages.get("/participants/{code}/analyses/evaluations.svg")
 def by_seed_figure(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
     """Methods by seed as a figure."""
-    return figure_of(evaluations.by_seed(db, participant, caller))
+    return figure_of(evaluations.by_seed(db, participant, caller), synthetic=participant.synthetic)

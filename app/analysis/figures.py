@@ -14,6 +14,8 @@ from app.platform.web.numbers import stated
 
 COLOURS = {"cdbs": "#0067a8", "rl": "#c24e00", "distilled": "#9b3f86", "no_dbs": "#5d6770", "random": "#00795a", "other": "#7a6200"}
 PANEL_W, PANEL_H, LEFT, TOP, BOTTOM, GAP, EMPTY_W = 250, 190, 52, 44, 52, 18, 1000
+SYNTHETIC = "Synthetic: a simulation and no person."
+"""Begins the note of figures about simulations."""
 CHARACTER_W = 6.3
 """Of the figures' font, px, on average."""
 DOT = 2.4

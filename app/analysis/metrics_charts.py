@@ -10,7 +10,7 @@ from fastapi import Response
 
 from app.analysis import primary_words
 from app.analysis.facts import HIGHER_IS_BETTER, METRICS
-from app.analysis.figures import COLOURS, Box, Panel, boxes_svg, csv_of
+from app.analysis.figures import COLOURS, SYNTHETIC, Box, Panel, boxes_svg, csv_of
 from app.analysis.metrics import ALPHA, Comparison, FiveMetrics, Group, MetricResult, PolicyResult
 from app.platform.kept import kept
 from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, counted, figure, marker, side_by_side
@@ -167,11 +167,12 @@ def table(found: Sequence[FiveMetrics], name: str) -> Response:
     return download(csv_of(EXPORTED, (row for one in found for row in _rows(one))), f"{name}-as-in-the-paper.csv")
 
 
-def svg(found: Sequence[FiveMetrics], name: str) -> Response:
+def svg(found: Sequence[FiveMetrics], name: str, *, synthetic: bool) -> Response:
     """The results figure: a panel per metric, a box per participant and controller, every session a point."""
     shown = [for_readers(one) for one in found]
     panels = [_panel(shown, metric) for metric in METRICS]
     note = "Two-sided Wilcoxon rank-sum test against cDBS, sessions taken as independent; * a learned controller is better, p < .05."
+    note = f"{SYNTHETIC} {note}" if synthetic else note
     content = boxes_svg([p for p in panels if any(b.values for b in p.boxes)], f"Results {name}", note)
     return Response(content, media_type=SVG, headers={"Content-Disposition": f'inline; filename="{name}-results.svg"'})
 

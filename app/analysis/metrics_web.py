@@ -145,7 +145,9 @@ def read_analyses(
     """Return the metrics by controller and policy, each compared with cDBS."""
     found = metrics.five_metrics(db, participant, caller)
     if format != "json":
-        return (metrics_charts.table if format == "csv" else metrics_charts.svg)([found], participant.code)
+        if format == "svg":
+            return metrics_charts.svg([found], participant.code, synthetic=participant.synthetic)
+        return metrics_charts.table([found], participant.code)
     return FiveMetricsOut.model_validate(found)
 
 
@@ -169,4 +171,4 @@ def paper_table(participant: CurrentParticipant, db: Db, caller: CurrentCaller) 
 @pages.get("/participants/{code}/analyses/paper.svg")
 def paper_figure(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
     """The results figure of one participant."""
-    return metrics_charts.svg([metrics.five_metrics(db, participant, caller)], participant.code)
+    return metrics_charts.svg([metrics.five_metrics(db, participant, caller)], participant.code, synthetic=participant.synthetic)

@@ -218,8 +218,9 @@ class Pooled:
 
 
 def readable(db: Session, caller: Caller) -> Sequence[Participant]:
-    """All participants that the caller may read, by code."""
-    return study.participants(db, caller, None, 0)[0]
+    """List by code the readable participants that are summed up: the real ones, or the synthetic ones where there are no others."""
+    found = study.participants(db, caller, None, 0)[0]
+    return [p for p in found if not p.synthetic] or found
 
 
 def pooled(db: Session, participants: Sequence[Participant], caller: Caller) -> Pooled:

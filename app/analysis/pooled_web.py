@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import Field
 from sqlalchemy.orm import Session
@@ -29,7 +29,6 @@ from app.platform.web.charts import figure as empty
 from app.platform.web.csv_files import download
 from app.platform.web.schemas import Model, PagingQuery, problems
 from app.platform.web.templates import render
-from app.study import repository as study
 from app.study.access import withdrawn_codes
 from app.tables.participants import Participant
 from app.tables.sessions import Controller
@@ -219,6 +218,24 @@ def _chart(found: Sequence[FiveMetrics], metric: str, which: str) -> Chart:
     )
 
 
+# Participants that are summed up.
+
+
+def find_summed(request: Request, db: Db, caller: CurrentCaller) -> Sequence[Participant]:
+    """Return the participants that are summed up; the answer says where they are simulations."""
+    participants = pooled.readable(db, caller)
+    if participants and all(p.synthetic for p in participants):
+        request.state.synthetic = "Every participant here"
+    return participants
+
+
+Summed = Annotated[Sequence[Participant], Depends(find_summed)]
+
+
+def _svg(comparisons: Sequence[metrics.FiveMetrics], participants: Sequence[Participant]) -> Response:
+    return metrics_charts.svg(comparisons, "all", synthetic=any(p.synthetic for p in participants))
+
+
 # REST routes of all participants together.
 
 api = APIRouter(tags=["analysis"], responses=problems(401, 403, 422))
@@ -230,6 +247,7 @@ api = APIRouter(tags=["analysis"], responses=problems(401, 403, 422))
     responses={200: {"content": {"text/csv": {"schema": {"type": "string"}}, "image/svg+xml": {"schema": {"type": "string"}}}}},
 )
 def read_pooled(
+    participants: Summed,
     db: Db,
     caller: CurrentCaller,
     format: Annotated[
@@ -241,11 +259,11 @@ def read_pooled(
     ] = "comparisons",
 ) -> PooledOut | Response:
     """Every participant that the caller may read, and all together: verdicts, random-effects summary, trial time, computation time."""
-    participants = pooled.readable(db, caller)
     if format == "csv" and table == "computation_time":
         return download(csv_of(*computation_table(pooled.computation_times(db, participants))), "computation-time.csv")
     if format != "json" and not (format == "csv" and table == "trial_time"):
-        return (metrics_charts.table if format == "csv" else metrics_charts.svg)(pooled.paper(db, participants, caller), "all")
+        comparisons = pooled.paper(db, participants, caller)
+        return metrics_charts.table(comparisons, "all") if format == "csv" else _svg(comparisons, participants)
     found = pooled.pooled(db, participants, caller)
     if format == "csv":
         return download(csv_of(*trial_table(found.trial)), "trial-time.csv")
@@ -256,9 +274,8 @@ pages = APIRouter()
 
 
 @pages.get("/analyses")
-def pooled_page(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
+def pooled_page(request: Request, participants: Summed, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
     """Show what the visits of all participants have shown: together, and each on its page of the list."""
-    participants = pooled.readable(db, caller)
     found = pooled.pooled(db, participants, caller)
     shown = slice(paging.offset, paging.offset + paging.limit)
     page = render(
@@ -278,11 +295,11 @@ def pooled_page(request: Request, db: Db, caller: CurrentCaller, paging: PagingQ
 
 
 @pages.get("/analyses/figure")
-def figure_page(db: Db, caller: CurrentCaller, paging: PagingQuery, metric: str = METRICS[0]) -> JSONResponse:
+def figure_page(participants: Summed, db: Db, caller: CurrentCaller, paging: PagingQuery, metric: str = METRICS[0]) -> JSONResponse:
     """Send the results figure's chart of one metric, which its page draws when it comes into view."""
     if metric not in METRICS:
         raise NotFound(f"There is no metric '{metric[:40]}'.", f"The metrics are {', '.join(METRICS)}.")
-    shown, _ = study.participants(db, caller, paging.limit, paging.offset)
+    shown = participants[paging.offset : paging.offset + paging.limit]
     charts = {c.id: c.figure for c in _charts(db, shown, caller)}
     return JSONResponse(charts.get(f"all-{metric}") or empty([]))
 
@@ -295,20 +312,19 @@ def _charts(db: Session, participants: Sequence[Participant], caller: Caller, wh
 
 
 @pages.get("/analyses/results.csv")
-def results_table(db: Db, caller: CurrentCaller) -> Response:
+def results_table(participants: Summed, db: Db, caller: CurrentCaller) -> Response:
     """The paper's comparisons of all participants as a table."""
-    return metrics_charts.table(pooled.paper(db, pooled.readable(db, caller), caller), "all")
+    return metrics_charts.table(pooled.paper(db, participants, caller), "all")
 
 
 @pages.get("/analyses/results.svg")
-def results_figure(db: Db, caller: CurrentCaller) -> Response:
+def results_figure(participants: Summed, db: Db, caller: CurrentCaller) -> Response:
     """The results figure of all participants."""
-    return metrics_charts.svg(pooled.paper(db, pooled.readable(db, caller), caller), "all")
+    return _svg(pooled.paper(db, participants, caller), participants)
 
 
 @pages.get("/trial-time")
-def trial_time_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
+def trial_time_page(request: Request, participants: Summed, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Minutes of every controller in every participant that the caller may read."""
-    participants = pooled.readable(db, caller)
     trial = trial_time(db, participants, caller)
     return HTMLResponse(render(request, "analysis/trial_time.html", trial=trial, withdrawn=withdrawn_codes(participants)))

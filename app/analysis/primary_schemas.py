@@ -141,6 +141,7 @@ class PrimaryOut(Model):
     """Controllers and policies against the same visit's cDBS."""
 
     participant: str
+    synthetic: bool = Field(description="A simulation and no person: no verdict is evidence of a patient.")
     level: float
     family: str
     margins: MarginsLockedOut
@@ -162,10 +163,11 @@ CSV_COLUMNS = (
 VERDICT_NAMES = {NonInferiorAndSaving: "non_inferior_and_saving", Inferior: "inferior", Inconclusive: "inconclusive"}
 
 
-def primary_out(found: Primary, standings: Mapping[int, str]) -> PrimaryOut:
+def primary_out(found: Primary, synthetic: bool, standings: Mapping[int, str]) -> PrimaryOut:
     """Convert the results of one participant; `standings` has a sentence by policy."""
     return PrimaryOut(
         participant=found.evidence.participant,
+        synthetic=synthetic,
         level=LEVEL,
         family=primary_words.FAMILY,
         margins=margins_out(found.locked),

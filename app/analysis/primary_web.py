@@ -86,7 +86,7 @@ def read_primary(
     """Each controller and policy against the same visit's cDBS, with the visit as the unit of evidence, and the verdicts on the margins."""
     found = primary.primary(db, participant, caller)
     standings = make_part(Part.STANDINGS, db, participant, caller)
-    return primary_csv(found, standings) if format == "csv" else primary_out(found, standings)
+    return primary_csv(found, standings) if format == "csv" else primary_out(found, participant.synthetic, standings)
 
 
 pages = APIRouter()

@@ -18,7 +18,7 @@ from app.study import repository as study
 from app.study.recordings.facts import unknown_clock
 from app.study.sessions import designs
 from app.study.sessions import repository as session_repository
-from app.study.sessions.usable_steps import CONTROL_STREAMS
+from app.study.sessions.usable_steps import CONTROL_STREAMS, simulated
 from app.study.traces import AMPLITUDE_STREAM, pack, unpack
 from app.study.visits import require_unlocked
 from app.tables.participants import Hemisphere, Participant
@@ -255,8 +255,24 @@ def refuse_overlap(db: Session, session: StudySession) -> None:
                 )
 
 
+def invented(participant: Participant, recordings: Sequence[Recording]) -> bool:
+    """Return whether the log of a simulated device is among the recordings of a real participant."""
+    return not participant.synthetic and any(simulated(r) for r in recordings)
+
+
 def count(db: Session, session: StudySession) -> None:
-    """Let a session count. Raises Conflict where another one with the same minutes of its device was let count at the same time."""
+    """Let a session count.
+
+    Raises:
+        Invalid: the log of a simulated device, of a real participant. Conflict: another session with the same minutes of its device was let
+            count at the same time.
+    """
+    participant = session.visit.participant
+    if invented(participant, [s.recording for s in session.segments]):
+        raise Invalid(
+            f"Session {session.id} cannot count for {participant.code}, who is a real participant: its log is of a simulated device.",
+            "Drop it. Logs of simulations belong to a participant that was enrolled as synthetic.",
+        )
     session.status = "confirmed"
     try:
         db.flush()

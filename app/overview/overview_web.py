@@ -20,7 +20,8 @@ from app.accounts.repository import studies
 from app.analysis import metrics as analysis
 from app.analysis.evidence import Evidence, evidence
 from app.analysis.metrics_charts import view
-from app.analysis.pooled import outlines, overall, readable
+from app.analysis.pooled import outlines, overall
+from app.analysis.pooled_web import Summed
 from app.analysis.standing import standing_sentences
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.staleness import stale_reasons
@@ -194,9 +195,8 @@ def _story(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsV
 
 
 @pages.get("/energy-saved", dependencies=[ResultsViewed])
-def energy_saved_page(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
+def energy_saved_page(request: Request, participants: Summed, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Energy saved so far; the home page takes its numbers from here once it stands."""
-    participants = readable(db, caller)
     saved = [outline.saved for outline in outlines(db, participants, caller) if outline.saved is not None]
     page = render(request, "overview/energy_saved.html", saved=saved, overall=overall(saved), withdrawn=withdrawn_codes(participants))
     return HTMLResponse(page)

@@ -78,7 +78,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
     ]
     contents |= {
         "characteristics.json": json.dumps(stated, indent=2),
-        "datapackage.json": json.dumps(descriptor(participant.code, contents), indent=2, ensure_ascii=False),
+        "datapackage.json": json.dumps(descriptor(participant.code, participant.synthetic, contents), indent=2, ensure_ascii=False),
         "settings.json": json.dumps(settings, indent=2),
         "recompute.py": Path(__file__).with_name("recompute.py").read_text("utf-8"),
         "README.txt": _readme(participant, caller),
@@ -187,6 +187,7 @@ def _readme(participant: Participant, caller: Caller) -> str:
     listed = "\n".join(f"{name + '.csv':22}{text}" for name, text in TITLES.items())
     return (
         f"betaloop {__version__}: record of participant {participant.code}, as a Frictionless data package.\n\n"
+        f"{'The participant is synthetic: a simulation and no person.' + chr(10) * 2 if participant.synthetic else ''}"
         "datapackage.json      the dictionary: every column of every table with its type, unit and meaning\n"
         f"{listed}\n"
         "settings.json         every settings version\n"

@@ -200,7 +200,7 @@ FIELDS: dict[str, tuple[Field, ...]] = {
 }
 
 
-def descriptor(code: str, contents: Mapping[str, str]) -> dict[str, Any]:
+def descriptor(code: str, synthetic: bool, contents: Mapping[str, str]) -> dict[str, Any]:
     """datapackage.json of these tables, as Frictionless Data Package v1 has it."""
     resources = []
     for name, fields in FIELDS.items():
@@ -218,7 +218,8 @@ def descriptor(code: str, contents: Mapping[str, str]) -> dict[str, Any]:
     return {
         "profile": "tabular-data-package",
         "name": f"betaloop-{code.lower()}",
-        "title": f"Record of participant {code}",
+        "title": f"Record of {'synthetic ' * synthetic}participant {code}",
+        "synthetic": synthetic,
         "description": f"Made by betaloop {__version__}. Times are days since enrolment; names, dates and serial numbers are not in it.",
         "resources": resources,
     }

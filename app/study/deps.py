@@ -23,19 +23,33 @@ from app.tables.sessions import StudySession
 from app.tables.visits import Visit
 
 
-def current_participant(code: Annotated[str, Path(max_length=40, pattern=r"^[^\x00]*$")], db: Db, caller: CurrentCaller) -> Participant:
+def mark_synthetic(request: Request, participant: Participant) -> None:
+    """Note that the answer is about a simulation: its page, its figures and the names of its files say so."""
+    if participant.synthetic:
+        request.state.synthetic = participant.code
+
+
+def current_participant(
+    request: Request, code: Annotated[str, Path(max_length=40, pattern=r"^[^\x00]*$")], db: Db, caller: CurrentCaller
+) -> Participant:
     """The participant that the path names."""
-    return repository.participant_by_code(db, code, caller)
+    found = repository.participant_by_code(db, code, caller)
+    mark_synthetic(request, found)
+    return found
 
 
-def current_visit(visit_id: RowId, db: Db, caller: CurrentCaller) -> Visit:
+def current_visit(request: Request, visit_id: RowId, db: Db, caller: CurrentCaller) -> Visit:
     """The visit that the path names."""
-    return repository.visit(db, visit_id, caller)
+    found = repository.visit(db, visit_id, caller)
+    mark_synthetic(request, found.participant)
+    return found
 
 
-def current_session(session_id: RowId, db: Db, caller: CurrentCaller) -> StudySession:
+def current_session(request: Request, session_id: RowId, db: Db, caller: CurrentCaller) -> StudySession:
     """The session that the path names."""
-    return repository.session(db, session_id, caller)
+    found = repository.session(db, session_id, caller)
+    mark_synthetic(request, found.visit.participant)
+    return found
 
 
 CurrentParticipant = Annotated[Participant, Depends(current_participant)]

@@ -141,6 +141,7 @@ class ParticipantIn(Model):
     site: Text | None = Field(
         None, max_length=81, description="Code of the site; needed when there are several. `STUDY/SITE` where two studies share a code."
     )
+    synthetic: Bool = Field(False, description="A simulation and no person; fixed at enrolment. It alone takes logs of simulated devices.")
     settings: SettingsIn = Field(default_factory=SettingsIn)
     sure: list[Literal["cdbs_amplitude_ma"]] | None = Field(None, max_length=1, description=SURE)
 
@@ -171,7 +172,7 @@ def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
     if asked:
         set_reason(db, CODE_CONFIRMED)
     require_sure(draft.settings.model_dump(exclude_unset=True), draft.sure)
-    participant = Participant(site_id=site.id, code=draft.code)
+    participant = Participant(site_id=site.id, code=draft.code, synthetic=draft.synthetic)
     db.add(participant)
     try:
         db.flush()

@@ -31,7 +31,12 @@ from app.study.settings_web import settings_page
 
 pages = APIRouter()
 
-_LABELS = {"code": "Code (letters, digits, - and _)", "site": "Site", "is_study_code": "This is a study code"}
+_LABELS = {
+    "code": "Code (letters, digits, - and _)",
+    "site": "Site",
+    "is_study_code": "This is a study code",
+    "synthetic": "Synthetic participant",
+}
 
 
 @pages.get("/participants/new")

@@ -27,6 +27,7 @@ class ParticipantOut(Model):
 
     code: str
     status: str
+    synthetic: bool = Field(description="A simulation and no person: what ran is evidence of no patient.")
     site: str
     created_at: datetime
     settings: SettingsOut

@@ -33,7 +33,12 @@ def outcome_out(session: StudySession, derived: outcome_values.Derived) -> Outco
 def participant_out(p: Participant) -> ParticipantOut:
     """A participant for the API."""
     return ParticipantOut(
-        code=p.code, status=p.status, site=p.site.code, created_at=p.created_at, settings=SettingsOut.model_validate(p.current_settings)
+        code=p.code,
+        status=p.status,
+        synthetic=p.synthetic,
+        site=p.site.code,
+        created_at=p.created_at,
+        settings=SettingsOut.model_validate(p.current_settings),
     )
 
 

@@ -133,7 +133,7 @@ class MarginsLock(Base):
 
 
 class Participant(Base):
-    """A person in the study, known by code only."""
+    """A person in the study, known by code only, or a simulation of one."""
 
     __tablename__ = "participant"
     __table_args__ = (
@@ -145,6 +145,8 @@ class Participant(Base):
     site_id: Mapped[int] = mapped_column(ForeignKey("site.id"), index=True)
     code: Mapped[str] = mapped_column(String(40), unique=True)
     status: Mapped[str] = mapped_column(String(20), server_default="active")
+    synthetic: Mapped[bool] = mapped_column(server_default="false")
+    """Whether this is a simulation and no person; fixed at enrolment."""
     created_at: Mapped[datetime] = mapped_column(server_default=func.now())
     site: Mapped[Site] = relationship()
     settings: Mapped[list[SettingsVersion]] = relationship(back_populates="participant", order_by="SettingsVersion.version")

@@ -6,7 +6,7 @@ import sqlalchemy as sa
 from alembic import op
 from sqlalchemy.dialects import postgresql
 
-revision = "first_d67afdff"
+revision = "first_e7e55bd2"
 down_revision = None
 branch_labels = None
 depends_on = None
@@ -226,6 +226,10 @@ NEVER_CHANGED = (
     "visit_lock",
 )
 NEVER_EMPTIED = ("audit_event", "audit_link", "audit_seal")
+ENROLLED_AS = (
+    "create trigger enrolled_as before update on participant for each row"
+    " when (old.synthetic is distinct from new.synthetic) execute function refuse_change()"
+)
 NEVER_DELETED = (
     "create trigger never_deleted before delete on session for each row when (old.status = 'confirmed') execute function refuse_change()"
 )
@@ -449,6 +453,7 @@ def upgrade() -> None:
         sa.Column("site_id", sa.Integer(), nullable=False),
         sa.Column("code", sa.String(length=40), nullable=False),
         sa.Column("status", sa.String(length=20), server_default="active", nullable=False),
+        sa.Column("synthetic", sa.Boolean(), server_default="false", nullable=False),
         sa.Column("created_at", sa.DateTime(timezone=True), server_default=sa.text("now()"), nullable=False),
         sa.CheckConstraint("status in ('active', 'completed', 'withdrawn')", name=op.f("ck_participant_status")),
         sa.ForeignKeyConstraint(["site_id"], ["site.id"], name=op.f("fk_participant_site_id_site")),
@@ -1465,6 +1470,7 @@ def upgrade() -> None:
     for table in NEVER_EMPTIED:
         op.execute(f"create trigger never_emptied before truncate on {table} for each statement execute function refuse_change()")
     op.execute(NEVER_DELETED)
+    op.execute(ENROLLED_AS)
     op.execute(
         "create constraint trigger chained after insert on audit_event deferrable initially deferred for each row execute function audit_chain()"
     )

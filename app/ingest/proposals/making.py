@@ -16,11 +16,12 @@ from app.ingest.proposals.service import renew
 from app.ingest.proposals.slots import differs_from_slot, visit_of_slot
 from app.ingest.sessions import Placement, StatedSession, add_session
 from app.ingest.uploads import outcomes as outcomes_intake
+from app.platform.database import now
 from app.platform.web import numbers
 from app.study import repository as study
 from app.study.sessions import conditions
 from app.study.sessions import usable_steps as usable_steps_rules
-from app.study.sessions.contradictions import contradictions, control_recording, local_day
+from app.study.sessions.contradictions import begins_later, contradictions, control_recording, local_day
 from app.study.sessions.usable_steps import sentence, usable_steps
 from app.study.sessions.wording import sentences
 from app.tables.participants import Participant
@@ -63,8 +64,11 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     day = local_day(placement.control, placement.started_at) if placement.started_at else None
     slot = usable_steps_rules.slot_of_recording(db, placement.control)
     visits = study.visits(db, participant.id, 1000, 0)[0] if stated.visit is None or slot is not None else []
-    if usable_steps_rules.rehearsed(placement.control) or differs_from_slot(slot, stated):
-        # a log of a bench, or of another session than the sender says, is for a person to look at
+    if usable_steps_rules.rehearsed(placement.control) or sessions.invented(participant, group) or differs_from_slot(slot, stated):
+        # a log of a bench, of a simulation, or of another session than the sender says, is for a person to look at
+        stated = replace(stated, confirm=False)
+    if begins_later(placement.started_at, now()) and not participant.synthetic:
+        # a clock is wrong, and a person says which
         stated = replace(stated, confirm=False)
     if any(r.details.get("quality", {}).get("amplitude_conflicts") for r in group):
         # two sources differ about the amplitude: a person looks at both before the session counts

@@ -45,7 +45,7 @@ class _Sheet(FPDF):  # type: ignore[misc]
         plan, visit = self._view.plan, self._view.visit
         self.set_text_color(*INK)
         self.set_font("Helvetica", "B", 17)
-        self.cell(0, 8, latin(f"Visit plan  {visit.participant.code}  visit {visit.number}"))
+        self.cell(0, 8, latin(f"Visit plan  {visit.participant.code}{' (synthetic)' * visit.participant.synthetic}  visit {visit.number}"))
         self.set_xy(self.l_margin, self.t_margin)
         self.set_font("Helvetica", "", 11)
         day = visit.date.strftime("%A, %d %B %Y") if visit.date else "Date: ____________________"

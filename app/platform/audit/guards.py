@@ -36,12 +36,16 @@ KNOWN = {
     ("never_changed", "refuse_change", _BEFORE_CHANGE),
     ("never_emptied", "refuse_change", _BEFORE_TRUNCATE),
     ("never_deleted", "refuse_change", _BEFORE_DELETION),
+    ("enrolled_as", "refuse_change", 19),
     ("count_time", "count_time_of_recording", 17),
     ("count_time", "count_time_of_session", 17),
     ("count_time", "count_time_of_segment", _EACH_WRITE),
 }
 """Every trigger that migrations give to an audited table or to the trail: name, function, and when it runs."""
-WHEN = {"never_deleted": "(((old.status)::text = 'confirmed'::text))"}
+WHEN = {
+    "never_deleted": "(((old.status)::text = 'confirmed'::text))",
+    "enrolled_as": "((old.synthetic IS DISTINCT FROM new.synthetic))",
+}
 """On what a trigger depends; the others on nothing."""
 
 _FUNCTIONS = """
@@ -115,7 +119,7 @@ def _triggers(db: Session) -> Iterator[Break]:
     }
     wanted = {(table, "audit") for table in AUDITED}
     wanted |= {(table, name) for table in NEVER_CHANGED for name in ("never_changed", "never_emptied")}
-    wanted |= {("audit_event", "chained"), ("session", "never_deleted")}
+    wanted |= {("audit_event", "chained"), ("session", "never_deleted"), ("participant", "enrolled_as")}
     good = set()
     for table, name, function, moment, own, enabled, condition, columns, given in db.execute(text(_TRIGGERS)):
         if table not in AUDITED and table not in NEVER_CHANGED:

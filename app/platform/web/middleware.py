@@ -78,6 +78,10 @@ def _add_headers(request: Request, response: Response) -> Response:
     response.headers["Content-Security-Policy"] = CONTENT_SECURITY_POLICY
     response.headers["X-Content-Type-Options"] = "nosniff"
     response.headers["Referrer-Policy"] = "same-origin"
+    if (synthetic := getattr(request.state, "synthetic", None)) is not None:
+        response.headers["X-Synthetic-Participant"] = synthetic
+        attachment = response.headers.get("Content-Disposition", "")
+        response.headers.update({"Content-Disposition": attachment.replace('filename="', 'filename="synthetic-', 1)} if attachment else {})
     if get_settings().cookie_secure:
         response.headers["Strict-Transport-Security"] = "max-age=31536000"
     if not request.url.path.startswith("/static/"):

@@ -35,12 +35,20 @@ _environment = Environment(
 
 
 def render(request: Request, template: str, **values: Any) -> str:
-    """Render a page as text. `me` (who is signed in, or None) and `path` are there for every template.
+    """Render a page as text. `me` (who is signed in, or None), `path` and `synthetic` (code of the simulation that it is about, or None)
+    are there for every template.
 
     Not `caller`: that word belongs to Jinja inside `call` blocks, where it would silently mean something else.
     """
+    shown = values.get("participant")
+    if getattr(shown, "synthetic", False):
+        request.state.synthetic = getattr(shown, "code", "")
     return _environment.get_template(template).render(
-        request=request, me=getattr(request.state, "caller", None), path=request.url.path, **values
+        request=request,
+        me=getattr(request.state, "caller", None),
+        path=request.url.path,
+        synthetic=getattr(request.state, "synthetic", None),
+        **values,
     )
 
 

@@ -131,6 +131,7 @@ def participant_body(code: str) -> dict[str, Any]:
     model = PARTICIPANTS[code]
     return {
         "code": code,
+        "synthetic": True,
         "settings": {
             "xi_beta": model.reference.xi_beta,
             "beta_unit": "uV",

@@ -12,6 +12,7 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.platform.database import now
 from app.platform.errors import Invalid
 from app.study import blinding
 from app.study.doses import disagreement_h
@@ -21,6 +22,8 @@ from app.study.traces import step_table
 from app.tables.recordings import Recording
 from app.tables.sessions import LEARNED, Controller, StudySession
 
+CLOCKS_DIFFER = timedelta(minutes=5)
+
 
 class Kind(StrEnum):
     """What contradicts what; behind each the facts that a sentence about it needs."""
@@ -29,6 +32,8 @@ class Kind(StrEnum):
     """`day`, `utc_offset_h` (None: UTC), `visit`, `visit_date`."""
     START = "start"
     """`stated`, `by_clock`: moments."""
+    FUTURE = "future"
+    """`begins`, `now`: moments."""
     SIDE = "side"
     """`stated`, `recorded`: hemispheres; `recording`: its number."""
     UNREADABLE = "unreadable"
@@ -136,7 +141,15 @@ def _of_day(session: StudySession, visit_open: bool) -> Iterator[Contradiction]:
         yield Contradiction(Kind.DAY, facts)
 
 
+def begins_later(started_at: datetime | None, moment: datetime) -> bool:
+    """Return whether a session of a real participant would begin after a moment, by more than clocks differ."""
+    return started_at is not None and started_at > moment + CLOCKS_DIFFER
+
+
 def _of_start(session: StudySession) -> Iterator[Contradiction]:
+    moment = now()
+    if begins_later(session.started_at, moment) and not session.visit.participant.synthetic:
+        yield Contradiction(Kind.FUTURE, {"begins": session.started_at, "now": moment})
     segment = next(s for s in session.segments if s.is_control)
     began = segment.recording.started_at
     if began is None or session.started_at is None:
@@ -173,7 +186,7 @@ def _of_slot(db: Session, session: StudySession) -> Iterator[Contradiction]:
     recording = control_recording(session)
     if usable_steps.rehearsed(recording):
         yield Contradiction(Kind.BENCH)
-    elif usable_steps.simulated(recording):
+    elif usable_steps.simulated(recording) and not session.visit.participant.synthetic:
         yield Contradiction(Kind.SIMULATED)
     slot = usable_steps.slot_of_recording(db, recording)
     if slot is None:

@@ -137,6 +137,10 @@ def excluded_as_seldom_decided(session_id: int, why: str) -> str:
 _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.DAY: _day,
     Kind.START: _start,
+    Kind.FUTURE: lambda f: (
+        f"Starts at {f['begins']:%Y-%m-%d %H:%M} UTC, which is in the future: it is {f['now']:%Y-%m-%d %H:%M} UTC. Correct the start, "
+        "or the clock of the recording."
+    ),
     Kind.SIDE: _side,
     Kind.UNREADABLE: lambda f: f"{f['detail']} {f['hint']}".strip(),
     Kind.LOGGED_SLOT: _logged_slot,
@@ -145,8 +149,7 @@ _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
         "The controller's log is of a trial on a bench, at which no participant was connected: it is no session. Drop it."
     ),
     Kind.SIMULATED: lambda f: (
-        "The controller's log is of a simulated device: nobody was stimulated. It counts in a study of synthetic participants alone; "
-        "of a real participant drop it."
+        "The controller's log is of a simulated device: nobody was stimulated. It counts for synthetic participants alone. Drop it."
     ),
     Kind.ABOVE_CDBS: _above_cdbs,
     Kind.AMPLITUDE: _amplitude,

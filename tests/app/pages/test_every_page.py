@@ -21,6 +21,11 @@ METHODS_EXPLAINED = {"/glossary": "says what the words of the folds mean"}
 """Pages that are about these words."""
 WITHOUT_A_READER = {"/sign-in", "/visit-day/shell"}
 """Pages that are shown to nobody in particular."""
+OF_NO_PARTICIPANT = {
+    "/", "/account", "/accounts", "/api-reference", "/audit", "/glossary", "/jobs", "/participants/new", "/search", "/studies",
+    "/studies/{study_code}/column-mappings", "/visit-day/shell",
+}  # fmt: skip
+"""Pages about no participant, or about several participants, whose rows say which are synthetic."""
 STATIC = Path(__file__).resolve().parents[3] / "static"
 
 
@@ -48,6 +53,23 @@ def test_every_address_of_a_browser_answers_and_every_page_is_small(world: World
     assert large == {}
     assert inline == {}, "scripts stand in files of our own, which the policy of the page's content allows alone"
     assert pages >= 50
+
+
+def test_every_page_and_file_about_synthetic_participants_says_so(world: World) -> None:
+    reader = TestClient(world.app, headers={"Accept": "text/html"}, follow_redirects=False)
+    assert reader.post("/sign-in", data={"email": "admin@clinic.example", "password": PASSWORD}).status_code == 303
+    silent, files = set(), []
+    for route, path in addresses(world).items():
+        with reader.stream("get", path) as answer:
+            if answer.status_code != 200:
+                continue
+            if "filename=" in answer.headers.get("content-disposition", ""):
+                files.append((route, answer.headers["content-disposition"]))
+            elif answer.headers["content-type"].startswith("text/html") and 'id="synthetic"' not in answer.read().decode():
+                silent.add(route)
+    assert silent == OF_NO_PARTICIPANT
+    assert len(files) >= 8
+    assert [route for route, name in files if 'filename="synthetic-' not in name] == ["/audit.csv"], "which is of every participant"
 
 
 def test_no_page_meets_its_reader_with_words_of_the_methods_and_energy_has_one_unit(world: World) -> None:

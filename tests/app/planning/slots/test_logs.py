@@ -6,7 +6,7 @@ import csv
 import io
 import zipfile
 from collections.abc import Callable
-from datetime import date, datetime, timedelta
+from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
 import pytest
@@ -221,6 +221,26 @@ def test_the_log_of_a_simulated_device_is_said_to_be_one(client: TestClient, stu
     assert "is of a simulated device: nobody was stimulated" in " ".join(body["report"][0]["flagged"])
     other = send(client, log_of(plan, 2, 20, number=3))
     assert "simulated" not in str(other["report"])
+
+
+def test_a_simulated_log_never_counts_for_a_real_participant(client: TestClient, study_world: Any, plan: Plan) -> None:
+    log = log_of(plan, 1, 0, simulated=True)
+    sent = send(client, log, visit="2", controller="rl")
+    assert [s["status"] for s in sent["sessions"]] == ["proposed"], "not even where visit and controller are stated"
+    proposal = client.get("/api/v1/participants/P1/proposals").json()[0]
+    stated = {"version": proposal["version"], "visit": 2, "controller": "rl"}
+    refused = client.post(f"/api/v1/proposals/{proposal['session']['id']}/confirm", json=stated)
+    assert (refused.status_code, "real participant" in refused.json()["detail"]) == (422, True), refused.text
+    assert client.post(f"/api/v1/visits/{study_world.visit}/slots/confirm", json={}).status_code in (409, 422)
+    assert client.get("/api/v1/participants/P1").json()["synthetic"] is False
+
+
+def test_a_session_that_begins_in_the_future_waits_for_a_person(client: TestClient, study_world: Any, plan: Plan) -> None:
+    later = datetime.now(UTC) + timedelta(days=400)
+    log = log_of(plan, 1, 0, started_at=later.isoformat())
+    sent = send(client, log, visit="2", controller="rl")
+    assert [s["status"] for s in sent["sessions"]] == ["proposed"]
+    assert "which is in the future" in " ".join(sent["report"][0]["flagged"])
 
 
 def test_the_page_of_a_visit_shows_its_slots_and_takes_its_logs(

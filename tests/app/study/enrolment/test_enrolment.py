@@ -7,7 +7,8 @@ from datetime import date
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import select
+from sqlalchemy import select, text
+from sqlalchemy.exc import IntegrityError
 
 from app.platform.database import new_session
 from app.study.participation import CodeQuestion, questions
@@ -15,6 +16,20 @@ from app.tables.audit import AuditEvent
 
 TODAY = date(2026, 11, 22)
 NAME, YEAR, DATE = CodeQuestion.NAME, CodeQuestion.BIRTH_YEAR, CodeQuestion.BIRTH_DATE
+
+
+def test_synthetic_is_stated_at_enrolment_and_never_changed(client: TestClient) -> None:
+    for code, stated in (("S1", {"synthetic": True}), ("R1", {})):
+        made = client.post("/api/v1/participants", json={"code": code, **stated})
+        assert (made.status_code, made.json()["synthetic"]) == (201, bool(stated))
+    for change in ({"synthetic": False, "status": "active", "reason": "x"},):
+        assert client.patch("/api/v1/participants/S1", json=change).status_code == 422
+    form = {"code": "S2", "synthetic": "yes"}
+    assert client.post("/participants", data=form, follow_redirects=False).status_code == 303
+    assert client.get("/api/v1/participants/S2").json()["synthetic"] is True
+    for code, value in (("S1", "false"), ("R1", "true")):
+        with new_session() as db, pytest.raises(IntegrityError, match="never changed"):
+            db.execute(text(f"update participant set synthetic = {value} where code = '{code}'"))
 
 
 @pytest.mark.parametrize(
