@@ -8,6 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from app.platform.web.schemas import Int, Model, Moment, Number, Text
+from app.study.recordings.amplitude_sources import AmplitudeChoice, AmplitudeConflictOut
 from app.study.schemas import SessionOut, VisitOut
 from app.tables.participants import Hemisphere
 from app.tables.sessions import Controller
@@ -98,7 +99,15 @@ class ProposalOut(Model):
     changed_by: str
     parts: list[PartOut]
     usable_steps: list[UsableStepsOut] = Field(description="By channel of the control recording, the control channel first.")
+    amplitude_conflicts: list[AmplitudeConflictOut] = Field(description="Where sources of the amplitude differ: one must be chosen.")
+    clock_unknown: bool = Field(description="Whether the start is on a clock of unknown offset from UTC.")
     usable_on_any: int = Field(description="Steps that are usable on one time-domain channel or another, each counted once.")
+
+
+class AmplitudeChoiceIn(AmplitudeChoice):
+    """Choice among the sources of the amplitude of a proposed session."""
+
+    version: Int = Field(ge=1, description="Of the proposal, as it was read.")
 
 
 class ConfirmedOut(Model):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,8 +16,34 @@ from ml.signals import BandRows, Stretch, band_rows, spectrum
 LARGEST_UV = 1e5
 """No electrode in a brain gives a tenth of a volt: a larger sample is damage, or in another unit."""
 
+FLAT_S = 0.5
+"""A living electrode never gives one value for so long: the input was open, at its rail, or filled in by a writer."""
+
 ERROR_STREAM = "beta_error"
 """Standard error of each row of `beta` for what is missing of it; there where something is."""
+
+
+def flat_runs(x: NDArray[np.float64], rate_hz: float) -> list[tuple[int, int]]:
+    """Find the runs of one value that last `FLAT_S` or longer, as begin and end in samples.
+
+    Args:
+        x: samples that follow each other, [n]; NaN is no value. rate_hz: of them.
+    """
+    least = max(2, math.ceil(FLAT_S * rate_hz))
+    # a run of that length has two equal samples half of it apart
+    step = max(1, least // 2)
+    if x.size < least or not np.any(x[:-step:step] == x[step::step]):
+        return []
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], (x[1:] == x[:-1]).astype(np.int8), [0]))))
+    return [(a, b + 1) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True) if b + 1 - a >= least]
+
+
+def living(x: NDArray[np.float64], rate_hz: float) -> NDArray[np.bool_]:
+    """Mark the samples that are numbers and within no flat run, [n]."""
+    good = np.isfinite(x)
+    for begin, end in flat_runs(x, rate_hz):
+        good[begin:end] = False
+    return good
 
 
 def step_trace(

@@ -105,8 +105,10 @@ def stimulating(programs: Sequence[Program]) -> tuple[int, ...]:
 def _amplitude(program: Program) -> tuple[float, str | None]:
     """Compute the amplitude of a program that stimulates, mA, and why it is unknown."""
     amplitude = program.amplitude_ma
-    if amplitude is None or not 0 <= amplitude < UPPER_PLAUSIBLE_MA:
-        return UNKNOWN, None
+    if amplitude is None:
+        return UNKNOWN, "the settings or the log state no amplitude that can be read"
+    if not 0 <= amplitude < UPPER_PLAUSIBLE_MA:
+        return UNKNOWN, f"{amplitude:g} mA is stated, which is a sign for no amplitude: it is unknown"
     highest = program.limits_ma[1] if program.limits_ma else 0.0
     if highest > 0 and amplitude > highest + LIMIT_TOLERANCE_MA:
         return UNKNOWN, f"{amplitude:g} mA is set where the clinician's limits allow {highest:g} mA at most"

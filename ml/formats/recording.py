@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-DECODE_VERSION = 10
+DECODE_VERSION = 11
 """Raised whenever a decoder would give other numbers for the same bytes; traces are stored per version."""
 
 TraceSource = Literal["time_domain", "device_power", "percept_lfp", "device_log", "table"]

@@ -16,6 +16,22 @@ LAG_MS = 2000.0
 """A reading may follow the change that it shows, or precede the log's record of it, by so much. A real recording has 1.1 s at most."""
 
 
+@dataclass(frozen=True, slots=True)
+class Disagreement:
+    """Time in which two sources state different doses, in ms of their clock.
+
+    Attributes:
+        at_ms: of the reading. begin_ms, end_ms: from the last statement before it that agrees to the next one; `end_ms` may be infinite.
+        logged: times and doses by the log, the first at `begin_ms`. read: dose by the reading, from `at_ms` on.
+    """
+
+    at_ms: float
+    begin_ms: float
+    end_ms: float
+    logged: tuple[tuple[float, Dose], ...]
+    read: Dose
+
+
 @dataclass(slots=True)
 class Vouching(Generic[T]):
     """Collected statements, in ms of one clock.
@@ -30,7 +46,7 @@ class Vouching(Generic[T]):
     log: list[tuple[float, T]] = field(default_factory=list)
     readings: list[tuple[float, T]] = field(default_factory=list)
 
-    def combine(self, times_ms: Sequence[float], states: Sequence[T]) -> tuple[list[tuple[float, T]], list[tuple[float, Dose, Dose]]]:
+    def combine(self, times_ms: Sequence[float], states: Sequence[T]) -> tuple[list[tuple[float, T]], list[Disagreement]]:
         """Combine both sources.
 
         Where the log is unknown it stays so. Readings that agree say nothing of the time between them: what is changed and changed back
@@ -41,7 +57,7 @@ class Vouching(Generic[T]):
             times_ms: from which the log's states hold, [n], ascending. states: of the log, [n].
 
         Returns:
-            States with the times from which they hold; contradictions as (time, dose by the log, dose by the reading).
+            States with the times from which they hold; where the sources differ.
         """
         read = [(t, s) for t, s in self.readings if _known(self.dose_of(s)) and times_ms and t >= times_ms[0] - LAG_MS]
         agreed, against = [], []
@@ -51,14 +67,18 @@ class Vouching(Generic[T]):
             if not all(map(_known, near)) or any(_same(dose, self.dose_of(state)) for dose in near):
                 agreed.append((t, state))
             else:
-                against.append((t, self.dose_of(states[max(0, bisect_right(times_ms, t) - 1)]), self.dose_of(state)))
+                against.append((t, state))
         points = sorted([*self.log, *agreed], key=lambda point: point[0])
-        out = list(zip(times_ms, states, strict=True))
-        for t, _, _ in against:
+        course = list(zip(times_ms, states, strict=True))
+        out, found = course, []
+        for t, state in against:
             begin = max((p for p, _ in points if p <= t), default=times_ms[0])
             end = min((p for p, _ in points if p > t), default=math.inf)
             out = _replace(out, begin, end, self.unknown)
-        return out, against
+            logged = [(max(at, begin), self.dose_of(s)) for at, s in course if at < end]
+            since = max((i for i, (at, _) in enumerate(logged) if at <= begin), default=0)
+            found.append(Disagreement(t, begin, end, tuple(logged[since:]), self.dose_of(state)))
+        return out, found
 
 
 def _replace(course: list[tuple[float, T]], begin: float, end: float, state: T) -> list[tuple[float, T]]:

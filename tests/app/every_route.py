@@ -180,6 +180,7 @@ class World:
                 "session_id": dated,
                 "json": {"ahead_s": 60, "uncertainty_s": 5, "reason": "compared on the day"},
             },
+            ("put", "/proposals/{session_id}/amplitude-source"): self.conflict(),
             ("get", "/proposals/{session_id}"): self.proposal(),
             ("patch", "/proposals/{session_id}"): self.proposal(),
             ("post", "/proposals/{session_id}/confirm"): self.proposal(controller="random"),
@@ -277,6 +278,14 @@ class World:
         body = self.upload(f"p{self.made}.csv", TABLE.replace(b"2,1,1", b"2,1.%d,1" % self.made, 1), visit="3")
         (proposal,) = body["proposals"]
         return {"session_id": proposal["session"]["id"], "json": {"version": proposal["version"]} | change}
+
+    def conflict(self) -> Json:
+        """Make a proposal whose two columns of the amplitude contradict each other, and the choice of one."""
+        rows = "".join(f"{2 * k},1,2,{0.5 if k == 5 else 1}\n" for k in range(1, 21))
+        body = self.upload("conflict.csv", f"t_s,beta,amplitude_ma,amplitude_fraction\n{rows}".encode(), visit="3")
+        (proposal,) = body["proposals"]
+        choice = {"source": "amplitude_ma", "reason": "seen on the tablet", "version": proposal["version"]}
+        return {"session_id": proposal["session"]["id"], "json": choice}
 
     def proposal_of_another_day(self) -> Json:
         """A proposal on whose day there is no visit, for the route that adds one."""

@@ -94,6 +94,7 @@ NEEDS: dict[tuple[str, str], str] = {
     ("post", "/api/v1/uploads"): can.UPLOAD,
     ("patch", "/api/v1/proposals/{session_id}"): can.WRITE_STUDY,
     ("put", "/api/v1/sessions/{session_id}/clock"): can.WRITE_STUDY,
+    ("put", "/api/v1/proposals/{session_id}/amplitude-source"): can.WRITE_STUDY,
     ("post", "/api/v1/proposals/{session_id}/confirm"): can.WRITE_STUDY,
     ("post", "/api/v1/proposals/{session_id}/split"): can.WRITE_STUDY,
     ("post", "/api/v1/proposals/{session_id}/visit"): can.WRITE_STUDY,

@@ -16,6 +16,7 @@ from app.ingest.proposals.clocks import ClockIn, ClockOut
 from app.ingest.proposals.serializers import proposal_out, proposals_out
 from app.ingest.proposals.visit_of_recording import add_visit_of_recording
 from app.ingest.schemas import (
+    AmplitudeChoiceIn,
     AttachedOut,
     AttachIn,
     ConfirmedOut,
@@ -33,6 +34,7 @@ from app.platform.web.schemas import RowId, problems
 from app.study import access
 from app.study import repository as study
 from app.study.deps import CurrentParticipant
+from app.study.recordings.amplitude_sources import AmplitudeConflictOut
 from app.study.serializers import session_out, visit_out
 from app.tables.sessions import StudySession
 
@@ -56,6 +58,12 @@ def correct_proposal(session: CurrentProposal, change: ProposalChange, db: Db, c
     """Correct a proposal without confirming it. 409 where somebody changed it after the stated version."""
     row = proposals.change(db, session, change, caller)
     return proposal_out(db, session, row, caller)
+
+
+@router.put("/proposals/{session_id}/amplitude-source", responses=problems(409))
+def choose_amplitude(session: CurrentProposal, choice: AmplitudeChoiceIn, db: Db, caller: CurrentCaller) -> list[AmplitudeConflictOut]:
+    """Choose which of the sources counts that state different amplitudes, or `unknown`; until then the session cannot be confirmed."""
+    return proposals.choose_amplitude(db, session, choice.version, choice, caller)
 
 
 @router.put("/sessions/{session_id}/clock", responses=problems(409))

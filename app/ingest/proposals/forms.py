@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -18,6 +18,7 @@ from app.platform.errors import Invalid
 from app.platform.web.forms import FieldNote, parse
 from app.study import blinding
 from app.study import repository as study
+from app.study.recordings.amplitude_sources import AmplitudeConflictOut
 from app.study.sessions.usable_steps import UsableSteps
 from app.tables.sessions import SessionSegment, StudySession
 from app.tables.uploads import SessionProposal
@@ -51,6 +52,9 @@ class ProposalForm:
         thumbnail: beta and amplitude at a glance, None where neither is known or they must stay hidden.
         problem: why the form was refused. remarks: its parts, by field; `part-2` is a row of the form that cuts, `parts` all.
         to_add: the visit that can be made of the recording.
+        conflicts: where sources of the amplitude differ.
+        clock: what its times rest on, where they can be corrected; else empty. clock_unknown: whether its offset from UTC is unknown.
+        own: what was typed into the forms of amplitude and clock, by field.
     """
 
     session: StudySession
@@ -69,6 +73,15 @@ class ProposalForm:
     problem: dict[str, Any] | None = None
     remarks: Mapping[str, FieldNote] = field(default_factory=dict)
     to_add: VisitToAdd | None = None
+    conflicts: Sequence[AmplitudeConflictOut] = ()
+    clock: str = ""
+    clock_unknown: bool = False
+    own: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def sources(self) -> list[str]:
+        """Names of the sources of the amplitude that differ."""
+        return list(dict.fromkeys(name for c in self.conflicts for name in c.sources))
 
     @property
     def seen(self) -> str:
@@ -124,6 +137,15 @@ def typed_parts(values: Mapping[str, Any], session_id: int) -> list[dict[str, st
     """Read the rows of the form that cuts a recording, filled in or not."""
     names = ("from", "to", "controller")
     return [{name: str(values.get(f"part-{session_id}-{i}-{name}", "")).strip() for name in names} for i in range(PARTS)]
+
+
+OWN = {"ahead_s": "Ahead of UTC", "uncertainty_s": "Within", "clock_reason": "Reason", "source": "Source", "source_reason": "Reason"}
+"""Fields of the forms of clock and amplitude, which have buttons of their own."""
+
+
+def typed_own(values: Mapping[str, Any], session_id: int) -> dict[str, str]:
+    """Read what the form sent of clock and amplitude of a proposal."""
+    return {name: str(values.get(f"{name}-{session_id}", "")).strip() for name in OWN}
 
 
 def as_change(session: StudySession, version: str, stored: Mapping[str, str], typed: Mapping[str, str]) -> ProposalChange:

@@ -11,9 +11,9 @@ from sqlalchemy.orm import Session
 from app.ingest import repository, sessions, wording
 from app.ingest.proposals import control_channel, guesses
 from app.ingest.proposals.evidence import BY_UPLOAD, Evidence, Reason, Source, guess_visit
+from app.ingest.proposals.guesses import differs_from_slot, visit_of_slot
 from app.ingest.proposals.parts import placement_of
 from app.ingest.proposals.service import renew
-from app.ingest.proposals.slots import differs_from_slot, visit_of_slot
 from app.ingest.sessions import Placement, StatedSession, add_session
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.platform.database import now
@@ -28,6 +28,7 @@ from app.tables.participants import Participant
 from app.tables.recordings import Recording
 from app.tables.sessions import StudySession
 from app.tables.uploads import SessionProposal, Upload
+from ml.formats.disagreements import CONFLICTS
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
     if begins_later(placement.started_at, now()) and not participant.synthetic:
         # a clock is wrong, and a person says which
         stated = replace(stated, confirm=False)
-    if any(r.details.get("quality", {}).get("amplitude_conflicts") for r in group):
+    if any(r.details.get("quality", {}).get(CONFLICTS) for r in group):
         # two sources differ about the amplitude: a person looks at both before the session counts
         stated = replace(stated, confirm=False)
     guess = visit_of_slot(visits, slot, stated.visit) or guess_visit(visits, day, stated.visit)

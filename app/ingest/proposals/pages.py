@@ -14,23 +14,41 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.ingest import repository, wording
 from app.ingest.deps import CurrentProposal
+from app.ingest.proposals import clocks
 from app.ingest.proposals import service as proposals
-from app.ingest.proposals.forms import FIELDS, HIDDEN, ProposalForm, as_change, as_parts, is_clocked, own_texts, texts, typed_parts
+from app.ingest.proposals.clocks import ClockIn
+from app.ingest.proposals.forms import (
+    FIELDS,
+    HIDDEN,
+    OWN,
+    ProposalForm,
+    as_change,
+    as_parts,
+    is_clocked,
+    own_texts,
+    texts,
+    typed_own,
+    typed_parts,
+)
 from app.ingest.proposals.thumbnail import thumbnail
 from app.ingest.proposals.visit_of_recording import add_visit_of_recording, visit_to_add
 from app.ingest.uploads import service
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid, about
-from app.platform.web.forms import FormValues, field_notes, renamed
+from app.platform.web.forms import FormValues, field_notes, parse, renamed
 from app.platform.web.schemas import RowId
 from app.platform.web.templates import render
 from app.study import access
 from app.study import repository as study
 from app.study.blinding import CONTROLLER_NAMES, may_know
 from app.study.deps import CurrentParticipant
+from app.study.recordings import amplitude_sources
+from app.study.recordings.amplitude_sources import AmplitudeChoice
+from app.study.recordings.facts import clock_words, unknown_clock
 from app.study.sessions import designs
+from app.study.sessions import pages as session_pages
 from app.study.sessions.charts import control_chart
-from app.study.sessions.contradictions import contradictions
+from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.usable_steps import SessionData, session_data, usable_steps
 from app.study.sessions.wording import drawn_words, sentences
 from app.study.traces import control_programs
@@ -40,6 +58,9 @@ from app.tables.uploads import SessionProposal
 from app.tables.visits import Visit
 
 router = APIRouter()
+
+DONE = {v: v for v in ("visit", "amplitude", "clock")} | {"discard": "dropped", "split": "cut", "confirm": "confirmed"}
+"""What the page says was done, by the verb of the pressed button."""
 
 SHOWN = 40
 """Proposals on one page; the next ones follow when these are decided."""
@@ -84,7 +105,7 @@ def decide(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
         return _page(request, db, participant, caller, error=gone)
     if refused:
         return _page(request, db, participant, caller, refused=refused, sent=typed, confirmed=confirmed)
-    done = {"discard": "dropped", "split": "cut", "confirm": "confirmed", "visit": "visit"}.get(verb, "saved")
+    done = DONE.get(verb, "saved")
     listed = f"&confirmed={','.join(map(str, confirmed))}" if confirmed else ""
     return RedirectResponse(f"/participants/{participant.code}/proposals?done={done}{listed}", 303)
 
@@ -106,6 +127,20 @@ def attach(request: Request, file_id: RowId, db: Db, caller: CurrentCaller, valu
     return RedirectResponse(f"/participants/{participant.code}/proposals?done=attached", 303)
 
 
+@router.post("/sessions/{session_id}/clock")
+def correct_clock(request: Request, session_id: RowId, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """State how far the clock of a session's recording was ahead of UTC; its recordings move, and their sessions with them."""
+    session = study.session(db, session_id, caller)
+    typed = {name: str(values.get(name, "")).strip() for name in ("ahead_s", "uncertainty_s", "clock_reason")}
+    try:
+        fields = {"ahead_s": typed["ahead_s"], "uncertainty_s": typed["uncertainty_s"], "reason": typed["clock_reason"]}
+        clocks.correct(db, session, parse(ClockIn, fields, OWN, {"reason": "clock_reason"}), caller)
+    except BetaloopError as error:
+        db.rollback()
+        return session_pages.shown_again(request, db, study.session(db, session_id, caller), caller, error, typed)
+    return RedirectResponse(f"/sessions/{session_id}?done=clock", 303)
+
+
 def _decide_one(
     db: Session,
     session: StudySession,
@@ -121,6 +156,7 @@ def _decide_one(
     own = own_texts(values, session.id, stored)
     typed = {**stored, **own}
     version = values[f"version-{session.id}"]
+    mine_typed = typed_own(values, session.id)
     if mine and verb == "discard":
         why = values.get(f"reason-{session.id}", "").strip()
         if not why:
@@ -128,6 +164,16 @@ def _decide_one(
         proposals.discard(db, session, _version(version), why[:1000], caller)
     elif mine and verb == "split":
         _cut(db, session, _version(version), typed_parts(values, session.id), caller)
+    elif mine and verb == "amplitude":
+        with about("source"):
+            chosen = {"source": mine_typed["source"], "reason": mine_typed["source_reason"]}
+            choice = parse(AmplitudeChoice, chosen, OWN, {"reason": "source_reason"})
+            proposals.choose_amplitude(db, session, _version(version), choice, caller)
+    elif mine and verb == "clock":
+        offset = {"ahead_s": mine_typed["ahead_s"], "uncertainty_s": mine_typed["uncertainty_s"], "reason": mine_typed["clock_reason"]}
+        with about("ahead_s"):
+            proposals.locked(db, session, _version(version), caller)
+            clocks.correct(db, session, parse(ClockIn, offset, OWN, {"reason": "clock_reason"}), caller)
     elif mine and verb == "visit":
         if own:
             version = str(proposals.change(db, session, as_change(session, version, stored, typed), caller).version)
@@ -214,6 +260,7 @@ def _form(
 ) -> ProposalForm:
     stored = texts(db, session, proposal, caller)
     data = _steps(db, session)
+    control = control_recording(session)
     told = may_know(session.visit, caller)
     found = designs.of_session(db, session, data.table, caller) if data and told else None
     remarks = field_notes(renamed(error, FIELDS) if error else None, stored)
@@ -234,6 +281,10 @@ def _form(
         error.problem(request.url.path) if error else None,
         remarks,
         visit_to_add(session, proposal, visits),
+        [c.as_api(told) for c in amplitude_sources.of_session(session)],
+        clock_words(control) if control.started_at is not None else "",
+        unknown_clock(control),
+        typed_own(sent if error else {}, session.id),
     )
 
 

@@ -14,7 +14,11 @@ from app.ingest.schemas import (
     UsableStepsOut,
 )
 from app.study import repository as study
+from app.study.blinding import may_know
+from app.study.recordings import amplitude_sources
+from app.study.recordings.facts import unknown_clock
 from app.study.serializers import session_out
+from app.study.sessions.contradictions import control_recording
 from app.study.sessions.usable_steps import on_any, usable_steps
 from app.tables.sessions import StudySession
 from app.tables.uploads import SessionProposal
@@ -51,4 +55,6 @@ def proposal_out(db: Session, session: StudySession, row: SessionProposal, calle
         ],
         usable_steps=[UsableStepsOut(**{name: value for name, value in asdict(u).items() if name != "at"}) for u in usable],
         usable_on_any=on_any(usable),
+        amplitude_conflicts=[c.as_api(may_know(session.visit, caller)) for c in amplitude_sources.of_session(session)],
+        clock_unknown=unknown_clock(control_recording(session)),
     )

@@ -20,6 +20,8 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import access, blinding, data_queries
 from app.study import repository as study
+from app.study.recordings import amplitude_sources
+from app.study.recordings.amplitude_sources import AmplitudeChoice, AmplitudeConflictOut
 from app.study.sessions import conditions, usable_steps
 from app.study.sessions import wording as session_wording
 from app.study.sessions.changes import POLICY_CONTROLLERS
@@ -126,6 +128,7 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
             f"Session {session.id} cannot be confirmed yet: its {' and '.join(missing)} is open ({why}).", "State it.", field=missing[0]
         )
     require_unlocked(session.visit)
+    amplitude_sources.refuse_open(session)
     sessions.refuse_overlap(db, session)
     sessions.count(db, session)
     kept_as_fractions = sessions.fix_milliamperes(db, session)
@@ -145,6 +148,16 @@ def _exclude_where_not_run(session: StudySession) -> list[str]:
         return []
     session.excluded_reason = session_wording.seldom_decided(share, usable_steps.LEAST_SHARE)
     return [session_wording.excluded_as_seldom_decided(session.id, session.excluded_reason)]
+
+
+def choose_amplitude(
+    db: Session, session: StudySession, version: int, choice: AmplitudeChoice, caller: Caller
+) -> list[AmplitudeConflictOut]:  # fmt: skip
+    """Let one of the sources of the amplitude count that differ, and guess again what rests on it. Raises Conflict as `change`; Invalid."""
+    locked(db, session, version, caller)
+    found = amplitude_sources.choose(db, session, choice, caller)
+    renew(db, session)
+    return found
 
 
 def split(db: Session, session: StudySession, version: int, parts: Sequence[PartIn], caller: Caller) -> list[StudySession]:

@@ -29,6 +29,7 @@ from app.platform.database import transaction
 from app.platform.errors import Conflict, NotFound
 from app.platform.jobs.children.child import places
 from app.study import repository as study
+from app.study.recordings import amplitude_sources
 from app.study.traces import AMPLITUDE_STREAM, unpack
 from app.tables.participants import Participant
 from app.tables.recordings import Recording, Trace
@@ -200,9 +201,10 @@ def _renew(db: Session, recording: Recording, fresh: RecordingLog) -> tuple[str,
         fixed = before[key].details.get("cdbs_ma") if key in before else None
         if row.stream == AMPLITUDE_STREAM and row.unit == "fraction" and fixed is not None:
             in_milliamperes(row, float(fixed))  # what was delivered does not change with today's settings
+    found = amplitude_sources.keep_choice(recording.details, recordings.details(fresh), rows)
     db.add_all(rows)
     recording.fingerprint, recording.duration_s = fresh.fingerprint, fresh.duration_s
-    recording.details = recordings.details(fresh)
+    recording.details = found
     db.flush()
     differences = [_difference(key, before.get(key), after.get(key)) for key in sorted({*before, *after})]
     listed = "; ".join(d for d in differences if d) or "the same numbers"

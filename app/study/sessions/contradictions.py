@@ -16,6 +16,8 @@ from app.platform.database import now
 from app.platform.errors import Invalid
 from app.study import blinding
 from app.study.doses import disagreement_h
+from app.study.recordings import amplitude_sources
+from app.study.recordings.facts import unknown_clock
 from app.study.sessions import designs, usable_steps
 from app.study.sessions.stimulation import SILENT_MA, Delivered, contradicts, delivered
 from app.study.traces import step_table
@@ -59,6 +61,10 @@ class Kind(StrEnum):
     SIMULATED = "simulated"
     LAST_DOSE = "last_dose"
     """`stated`, `by_doses`: hours from the last dose to the start."""
+    AMPLITUDE_SOURCES = "amplitude_sources"
+    """`names`: of the sources that differ; `seconds`: in all."""
+    UNKNOWN_CLOCK = "unknown_clock"
+    """`recording`."""
     REPEATED = "repeated"
     """`session`, `recording`: of the other one; `seconds`: that both hold; `counts`: whether the other one counts; `own`: recording."""
 
@@ -81,7 +87,7 @@ def contradictions(db: Session, session: StudySession, visit_open: bool = False,
         steps_shown: the reader sees elsewhere why steps cannot be read, and which lie above the cDBS amplitude.
     """
     found = [*_of_minutes(db, session), *_of_day(session, visit_open), *_of_start(session), *_of_side(session)]
-    found += [*_of_slot(db, session), *_of_dose(session)]
+    found += [*_of_slot(db, session), *_of_dose(session), *_of_sources(session)]
     if session.visit.sealed:
         return found  # what follows tells what ran, and these sentences are kept in reports that everybody reads
     try:
@@ -104,6 +110,17 @@ def contradictions(db: Session, session: StudySession, visit_open: bool = False,
     if arm.controller in LEARNED and arm.policy_id is None:
         found.append(Contradiction(Kind.NO_POLICY))
     return found
+
+
+def _of_sources(session: StudySession) -> Iterator[Contradiction]:
+    """Find sources of the amplitude that differ and among which none was chosen, and a start that is on an unknown clock."""
+    left = [c for c in amplitude_sources.of_session(session) if c.open]
+    if left:
+        names = list(dict.fromkeys(name for c in left for name in c.stored["sources"]))
+        yield Contradiction(Kind.AMPLITUDE_SOURCES, {"names": names, "seconds": sum(c.stored["to_s"] - c.stored["from_s"] for c in left)})
+    control = control_recording(session)
+    if unknown_clock(control):
+        yield Contradiction(Kind.UNKNOWN_CLOCK, {"recording": control.id})
 
 
 def utc_offset_h(recording: Recording) -> float | None:

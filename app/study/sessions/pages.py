@@ -26,6 +26,7 @@ from app.study.data_queries import not_closed_of_session
 from app.study.deps import CurrentSession, SessionViewed
 from app.study.doses import since_last_dose
 from app.study.recordings import history
+from app.study.recordings.facts import clock_words, unknown_clock
 from app.study.schemas import ConditionsChange, DerivedChoice, QocIn, SessionChange
 from app.study.sessions import changes as study_changes
 from app.study.sessions import conditions, designs
@@ -312,6 +313,9 @@ def _page(
         qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
         correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},
         seen=seen,
+        clock=clock_words(control_recording(session)) if control_recording(session).started_at is not None else "",
+        clock_unknown=unknown_clock(control_recording(session)),
+        clock_typed={n: (typed or {}).get(n, "") for n in ("ahead_s", "uncertainty_s", "clock_reason")},
         open_queries=not_closed_of_session(db, session.id),
         since=since_last_dose(session),
         activities=ACTIVITIES,
@@ -331,6 +335,10 @@ def _page(
         remarks=field_notes(error, typed or {}),
     )
     return HTMLResponse(page, error.status if error else 200)
+
+
+shown_again = _page
+"""Page of a session with what was wrong in a form of another phase, and what was typed there."""
 
 
 def _sealed_page(

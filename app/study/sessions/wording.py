@@ -155,6 +155,14 @@ _SENTENCES: dict[Kind, Callable[[Mapping[str, Any]], str]] = {
     Kind.AMPLITUDE: _amplitude,
     Kind.SILENT_CONTROL: _silent_control,
     Kind.REPEATED: _repeated,
+    Kind.AMPLITUDE_SOURCES: lambda f: (
+        f"{' and '.join(f['names'])} state different amplitudes in {stated(f['seconds'], 3)} s of it: the amplitude is unknown there until "
+        "a person chooses one of them, or 'unknown'."
+    ),
+    Kind.UNKNOWN_CLOCK: lambda f: (
+        f"The start is on a clock whose offset from UTC is unknown (recording {f['recording']}): it may be hours off, and nothing of a "
+        "watch or of another device is joined to it. State the offset if you know it."
+    ),
     Kind.LOGGED_POLICY: _logged_policy,
     Kind.SEVERAL_PROGRAMS: lambda f: (
         f"The amplitude of {' and of '.join(f['others'])} moved as well as that of {f['counted']}, which is taken for the controller's: "

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.beta import LARGEST_UV, channel_spectrum, step_trace, time_domain_traces
+from ml.formats.beta import LARGEST_UV, channel_spectrum, living, step_trace, time_domain_traces
 from ml.formats.labs.content import Channel, Content, measured_samples
 from ml.formats.labs.dose import amplitude_traces
 from ml.formats.labs.names import UV
@@ -121,10 +121,11 @@ def _stretches(channel: Channel, origin_s: float, report: FileReport) -> list[St
             channel.shown,
             "Check the unit of the channel.",
         )
-    good = measured_samples(x) & ~absurd
+    good = measured_samples(x) & living(x, channel.timing.rate_hz) & ~absurd
     lost = sum(int((~good[p.begin : p.end]).sum()) for p in channel.timing.pieces)
     if lost:
-        report.flagged.append(f"{channel.shown}: {lost} samples are zero in a row, no number or impossible: gaps. Were they recorded?")
+        said = "are zero in a row, stand still, are no number or impossible: gaps. Were they recorded?"
+        report.flagged.append(f"{channel.shown}: {lost} samples {said}")
     rate = channel.timing.rate_hz
     out: list[Stretch] = []
     for piece in channel.timing.pieces:

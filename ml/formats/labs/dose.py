@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.formats.beta import step_trace
+from ml.formats.disagreements import CONFLICTS, disagreements_of_rows
 from ml.formats.dose import LIMIT_TOLERANCE_MA, UPPER_PLAUSIBLE_MA
 from ml.formats.labs.content import Channel, Content
 from ml.formats.labs.marks import Mark
@@ -68,7 +69,8 @@ def amplitude_traces(
         differ = both & (np.abs(values - values_2) > LIMIT_TOLERANCE_MA)
         steady = differ & (covered > 1 - 1e-9) & (covered_2 > 1 - 1e-9)
         if steady.any():
-            quality["amplitude_conflicts"] = int(steady.sum())
+            said = disagreements_of_rows(steady, {name: values, other: values_2}, "amplitude_ma", 0.0, options.period_s)
+            quality.setdefault(CONFLICTS, []).extend(said)
             report.flagged.append(f"{name} and {other} differ about the amplitude in {int(differ.sum())} steps, which are unknown there")
         covered = np.where(differ, 0.0, np.where(np.isfinite(values), covered, covered_2))
         values = np.where(differ, np.nan, np.where(np.isfinite(values), values, values_2))

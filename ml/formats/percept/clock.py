@@ -11,7 +11,7 @@ from datetime import datetime, timedelta
 from typing import Any
 
 from ml.formats.facts.clocks import Moment, Offset, estimate, lead_in_words, unknown
-from ml.formats.percept.report_json import inside, moment
+from ml.formats.percept.report_json import has_zone, inside, moment
 from ml.formats.recording import FileReport
 
 OUTSIDE_S = 600.0
@@ -31,6 +31,9 @@ def implant_clock(report: dict[str, Any], packets: Iterable[datetime | None]) ->
     """
     begin, end = (moment(inside(report, "DeviceInformation", part, "DeviceDateTime")) for part in ("Initial", "Final"))
     stated = moment(report.get("SessionDate")), moment(report.get("SessionEndDate"))
+    if begin and (unzoned := [n for n in ("SessionDate", "SessionEndDate") if moment(report.get(n)) and not has_zone(report.get(n))]):
+        # a local time looks like a clock that is hours off
+        return unknown("implant", f"{' and '.join(unzoned)} {'has' if len(unzoned) == 1 else 'have'} no zone, and may be local time")
     found = estimate("implant", [(begin, stated[0]), (end, stated[1])])
     if not found.known:
         missing = [name for name, when in (("DeviceDateTime", begin or end), ("SessionDate", stated[0] or stated[1])) if when is None]

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Any
 
 from ml.formats.percept.enums import word
-from ml.formats.percept.report_json import entries, finite, inside, side_of
+from ml.formats.percept.report_json import entries, finite, inside, moment, side_of
 
 _SPELLINGS = {"GPI": "GPi", "GPE": "GPe"}
+LOGGED_WITHIN_S = 5.0
+"""The device's log and its packets are dated to the second; a change this near to a run counts as within it."""
+
 _ON = frozenset({"on", "enabled", "true"})
 
 
@@ -30,6 +34,24 @@ def cycling(report: dict[str, Any], group: str | None) -> dict[str, Any] | None:
                 stated.append(inside(one, "GroupSettings", "Cycling"))
     found = [c for c in map(_cycling, stated) if c is not None]
     return next((c for c in found if c["enabled"]), found[0] if found else None)
+
+
+def groups_used(report: dict[str, Any], group: str | None, began: datetime | None, length_s: float) -> list[str | None]:
+    """List the groups that were active in a run: that of its snapshot, and those of changes in the device's log.
+
+    Args:
+        report: as it was read.
+        group: of the run's snapshot. began: first packet of the run, on the implant's clock as the log is. length_s: of the run.
+    """
+    found = [group]
+    for event in entries(inside(report, "DiagnosticData", "EventLogs")):
+        when = moment(event.get("DateTime"))
+        if began is None or when is None or not -LOGGED_WITHIN_S <= (when - began).total_seconds() <= length_s + LOGGED_WITHIN_S:
+            continue
+        for key in ("OldGroupId", "NewGroupId"):
+            if named := (word(event.get(key)) or "").removeprefix("GROUP_"):
+                found.append(named)
+    return list(dict.fromkeys(found))
 
 
 def _cycling(value: Any) -> dict[str, Any] | None:

@@ -23,7 +23,7 @@ from ml.formats.options import DecodeOptions
 from ml.formats.percept import details
 from ml.formats.percept.annotations import gather
 from ml.formats.percept.clock import describe_clock, implant_clock, to_utc
-from ml.formats.percept.dose import cycling, describe_cycling, leads_of
+from ml.formats.percept.dose import cycling, describe_cycling, groups_used, leads_of
 from ml.formats.percept.enums import word
 from ml.formats.percept.history import history_recording
 from ml.formats.percept.report_json import SIDES, entries, inside, looks_like_report, read_report, side_of, utc_offset_h
@@ -143,7 +143,10 @@ def _run_recordings(
     leads = {side_of(word(lead.get("Hemisphere"))) for lead in entries(inside(report, "LeadConfiguration", "Final"))}
     targets = leads_of(report)
     group = details.snapshot(run.power.snapshot, "left")["group"] if run.power is not None else None
-    cycles = cycling(report, group)
+    groups = groups_used(report, group, run.first_packet, (end - begin) / 1000.0)
+    states = {g: state for g in groups if (state := cycling(report, g)) is not None}
+    group = next((g for g, state in states.items() if state["enabled"]), group)
+    cycles = states.get(group)
     unsteady = cycles is not None and cycles["enabled"] and run.power is not None
     out = []
     for side in (*SIDES, None):

@@ -164,6 +164,14 @@ def moment(value: Any) -> datetime | None:
     return when if 1990 <= when.year <= 2200 else None
 
 
+def has_zone(value: Any) -> bool:
+    """Decide whether a point in time states its offset from UTC."""
+    try:
+        return isinstance(value, str) and datetime.fromisoformat(value.strip()).tzinfo is not None
+    except ValueError:
+        return False
+
+
 def utc_offset_h(value: Any) -> float | None:
     """Parse the hours that the programmer's clock was ahead of UTC, from a text like `+01:00`; None for anything else."""
     found = _OFFSET.fullmatch(value.strip()) if isinstance(value, str) else None

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.beta import LARGEST_UV
+from ml.formats.beta import FLAT_S, LARGEST_UV, flat_runs, living
 from ml.formats.facts.counters import shift_by_turns, unwrap
 from ml.formats.facts.sentinels import readings
 from ml.formats.percept.enums import word
@@ -77,13 +77,15 @@ class TimeDomain:
         if self.void:
             beyond = f"or one beyond {LARGEST_UV / 1000:g} mV, which no electrode gives"
             out.append(f"{self.void} samples hold no number, {beyond}: gaps")
+        if flat := sum(end - begin for begin, end in flat_runs(self.values, self.rate_hz)):
+            out.append(f"{flat} samples stand still for {FLAT_S:g} s or longer, as no electrode does: gaps")
         return out
 
     def stretches(self, origin_ms: float) -> list[tuple[float, float, NDArray[np.float64]]]:
         """List gap-free pieces (time of the first sample in s after `origin_ms`, rate, samples in uV); NaN samples cut them too."""
         out = []
         for start_ms, first, end in self.pieces:
-            good = np.isfinite(self.values[first:end])
+            good = living(self.values[first:end], self.rate_hz)
             edges = np.flatnonzero(np.diff(np.concatenate(([False], good, [False])).astype(np.int8)))
             for begin, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
                 at_s = (start_ms - origin_ms) / 1000.0 + begin / self.rate_hz
@@ -293,7 +295,7 @@ def device_powers(value: Any) -> list[DevicePower]:
         if note:
             data.notes.append(note)
         if dropped := int(np.sum(~forward)):
-            data.notes.append(f"{dropped} power values that do not come later than those before them: left out")
+            data.void.append(f"{dropped} power values that do not come later than those before them: left out")
         if not channels:
             data.channels = [f"POWER_{side.upper()}" for side in SIDES if np.nanmax(data.power[side], initial=0.0) > 0]
         out.append(data)

@@ -50,7 +50,8 @@ def amplitude_steps(settings: Settings, adaptive: Adaptive | None, times: Packet
     states = settings.therapy.states
     base_t = np.array(settings.therapy.times_ms, dtype=np.float64)
     base_v = np.array([dose_of(state).amplitude_ma for state in states], dtype=np.float64).reshape(-1, 4)
-    programs = tuple(sorted({p for state in states for p in stimulating(state.programs)}))
+    disputed = (dose for c in settings.conflicts for dose in (c.read, *(logged for _, logged in c.logged)))
+    programs = tuple(sorted({p for state in states for p in stimulating(state.programs)} | {p for dose in disputed for p in dose.programs}))
     if not programs and any(state != Therapy() for state in states):
         programs = (0,)
     assumed = any(state.programs and all(p.enabled is None for p in state.programs) for state in states)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.beta import LARGEST_UV, beta_streams
+from ml.formats.beta import LARGEST_UV, beta_streams, flat_runs
 from ml.formats.rcs.packets.streams import TimeDomain
 from ml.formats.rcs.packets.time import PacketTimes
 from ml.formats.rcs.settings import Sensing, Settings
@@ -70,7 +70,7 @@ def _pieces(data: TimeDomain, times: PacketTimes, key: int, packets: NDArray[np.
         x = data.samples[key][int(begin[first]) : int(begin[end - 1] + count[end - 1])]
         skip = max(0, int(np.floor((latest_ms - start_ms) / step_ms + 0.01)) + 1) if latest_ms >= start_ms - 0.01 * step_ms else 0
         latest_ms = max(latest_ms, start_ms + (x.size - 1) * step_ms)
-        for here, there in _true_runs(x[skip:]):
+        for here, there in _true_runs(x[skip:], 1000.0 / step_ms):
             yield start_ms + (skip + here) * step_ms, 1000.0 / step_ms, x[skip + here : skip + there]
 
 
@@ -79,12 +79,23 @@ def impossible_samples(data: TimeDomain) -> int:
     return sum(int(np.sum(np.abs(x) > LARGEST_UV / UV_PER_MV)) for x in data.samples)
 
 
-def _true_runs(x: NDArray[np.float64]) -> Iterator[tuple[int, int]]:
+def flat_samples(data: TimeDomain) -> int:
+    """Count the samples of all channels in flat runs."""
+    rates = data.headers.rate_hz[np.isfinite(data.headers.rate_hz)]
+    rate = float(rates.max(initial=0.0))
+    return sum(end - begin for x in data.samples for begin, end in flat_runs(x, rate)) if rate > 0 else 0
+
+
+def _true_runs(x: NDArray[np.float64], rate_hz: float) -> Iterator[tuple[int, int]]:
     """Begin and end of every run of samples that an electrode can give."""
-    holes = np.flatnonzero(~(np.abs(x) <= LARGEST_UV / UV_PER_MV)).tolist()
-    for before, hole in zip([-1, *holes], [*holes, x.size], strict=True):
-        if hole - before > 1:
-            yield before + 1, hole
+    begin = 0
+    absurd = np.flatnonzero(~(np.abs(x) <= LARGEST_UV / UV_PER_MV)).tolist()
+    for here, there in sorted([*((hole, hole + 1) for hole in absurd), *flat_runs(x, rate_hz)]):
+        if here > begin:
+            yield begin, here
+        begin = max(begin, there)
+    if x.size > begin:
+        yield begin, x.size
 
 
 def _join(pieces: Iterator[Stretch]) -> Iterator[Stretch]:

@@ -11,11 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.beta import LARGEST_UV
+from ml.formats.beta import FLAT_S, LARGEST_UV
+from ml.formats.disagreements import CONFLICTS, disagreement
 from ml.formats.dose import Dose
 from ml.formats.options import DecodeOptions
 from ml.formats.rcs.amplitude import AmplitudeSteps, amplitude_steps
-from ml.formats.rcs.beta import Stretch, beta_traces, impossible_samples, time_domain_samples, time_domain_spectra, time_domain_stretches
+from ml.formats.rcs.beta import (
+    Stretch,
+    beta_traces,
+    flat_samples,
+    impossible_samples,
+    time_domain_samples,
+    time_domain_spectra,
+    time_domain_stretches,
+)
 from ml.formats.rcs.events import adaptive_events, note_events, stimulation_events
 from ml.formats.rcs.leads import described, hemisphere
 from ml.formats.rcs.packets.headers import PacketHeaders
@@ -25,6 +34,7 @@ from ml.formats.rcs.quality import STEMS, describe_clock, describe_quality
 from ml.formats.rcs.settings import GROUPS, Settings, Therapy, dose_of, get, integer, limits_of, number
 from ml.formats.rcs.traces import Grid, accel_traces, amplitude_traces, fft_results, power_traces
 from ml.formats.recording import FileReport, Hemisphere, RecordingLog, SpectrumLog, TraceLog, fingerprint
+from ml.formats.vouching import Disagreement
 
 MAX_ROWS = 100_000
 """Rows a recording may have (55 h of 2 s steps): clocks that span more are wrong."""
@@ -94,16 +104,15 @@ def build_recording(streams: Streams, report: ReportOf, options: DecodeOptions) 
         channels = time_domain_stretches(streams.time_domain, times["time_domain"], settings)
         if absurd := impossible_samples(streams.time_domain):
             report("RawDataTD").flagged.append(f"{absurd} samples beyond {LARGEST_UV / 1000:g} mV, which no electrode gives: gaps")
+        if flat := flat_samples(streams.time_domain):
+            report("RawDataTD").flagged.append(f"{flat} samples stand still for {FLAT_S:g} s or longer, as no electrode does: gaps")
     traces, spectra = _traces(streams, settings, times, steps, grid, channels, report) if main else ([], [])
     if not main:
         report("RawDataTD").flagged.append("a recording without data: no stream holds a packet that can be placed in time")
     quality = describe_quality(streams.data(), times, settings, streams.counts, report)
     if timeline.streams:
         quality["clock"] = describe_clock(timeline, start_ms, report)
-    quality["amplitude_conflicts"] = [
-        {"t_s": round((t - start_ms) / 1000.0, 3), "log_ma": _milliamps(log), "settings_ma": _milliamps(read)}
-        for t, log, read in settings.conflicts
-    ]
+    quality[CONFLICTS] = [_disagreement(c, grid) for c in settings.conflicts]
     quality["valid_fraction"] = {f"{t.stream} {t.channel}": round(float(t.valid.mean()), 4) for t in traces if t.valid.size}
     quality["spike_packets"] = {t.channel: t.details["spike_packets"] for t in traces if t.details.get("spike_packets")}
     device_clock = bool(main) and all(times[name].device_clock for name in main)
@@ -214,11 +223,29 @@ def _tell_dose(settings: Settings, grid: Grid, report: ReportOf) -> None:
         about.append("records are lost: the amplitude is unknown from the last one before the loss until a source states it again")
     for said in dict.fromkeys(why for state in settings.therapy.states if state != Therapy() for why in dose_of(state).why):
         about.append(said)
-    for t_ms, log, read in settings.conflicts[:MAX_CONFLICTS]:
-        at = (t_ms - grid.start_ms) / 1000.0
-        about.append(f"at {at:.1f} s StimLog says {_milliamps(log)} and DeviceSettings {_milliamps(read)}: the amplitude is unknown there")
+    for one in settings.conflicts[:MAX_CONFLICTS]:
+        both = [f"{_milliamps(one.logged[-1][1])} and DeviceSettings {_milliamps(one.read)}"] if one.logged else []
+        at = (one.at_ms - grid.start_ms) / 1000.0
+        about += [f"at {at:.1f} s StimLog says {each}: the amplitude is unknown there until a person chooses" for each in both]
     if (more := len(settings.conflicts) - MAX_CONFLICTS) > 0:
         about.append(f"StimLog and DeviceSettings differ at {more} further moments")
+
+
+def _disagreement(one: Disagreement, grid: Grid) -> dict[str, Any]:
+    """Describe two doses of one time, as `disagreement` does."""
+
+    def s(t_ms: float) -> float:
+        return min(max(0.0, (t_ms - grid.start_ms) / 1000.0), grid.end_s) if math.isfinite(t_ms) else grid.end_s
+
+    ends = [*(t for t, _ in one.logged), one.end_ms][1:]
+    logged = [(s(begin), s(end), dose) for (begin, dose), end in zip(one.logged, ends, strict=True)]
+    sources = {"StimLog": logged, "DeviceSettings": [(s(one.at_ms), s(one.end_ms), one.read)]}
+    programs = sorted({p for pieces in sources.values() for _, _, dose in pieces for p in dose.programs})
+    stated = {
+        name: {f"program {p}": [(a, b, dose.amplitude_ma[p]) for a, b, dose in pieces] for p in programs}
+        for name, pieces in sources.items()
+    }
+    return disagreement(s(one.begin_ms), s(one.end_ms), stated)
 
 
 def _milliamps(dose: Dose) -> str:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ml.formats.dose import Cycle, Dose, Program, delivered_dose
 from ml.formats.facts.sentinels import reading
 from ml.formats.rcs.packets.facts import FACTS
-from ml.formats.vouching import Vouching
+from ml.formats.vouching import Disagreement, Vouching
 
 RATE_HZ = {0: 250.0, 1: 500.0, 2: 1000.0}
 FFT_SIZE = {0: 64, 1: 256, 3: 1024}
@@ -33,6 +33,9 @@ CYCLE_UNIT_S: dict[int | None, float] = {2: 1.0}
 
 THERAPY_SECTIONS = frozenset({"GeneralData", "therapyStatusData"})
 """Sections that sensing and stimulation are read from, in addition to the therapy groups; a record without them changes neither."""
+
+SAME_SESSION_MS = 7 * 86_400_000.0
+"""No session lasts a week: a record further from the others has a wrong time."""
 
 T = TypeVar("T")
 
@@ -192,9 +195,11 @@ def therapy_of(state: dict[str, Any], stim: dict[str, Any] | None, lost: bool = 
     programs = []
     for p in range(4):
         enabled = integer(get(settings, "programs", p, "isEnabled"))
-        amplitude = number(get(log, f"program{p}", "AmplitudeInMilliamps"))
+        logged = get(log, f"program{p}")
+        amplitude = number(get(logged, "AmplitudeInMilliamps"))
         width = number(get(log, f"program{p}", "PulseWidthInMicroseconds"))
-        if amplitude is None and not lost:
+        # a log whose statement cannot be read outdates what the settings stated before it
+        if amplitude is None and not lost and not (isinstance(logged, dict) and "AmplitudeInMilliamps" in logged):
             amplitude = number(get(settings, "programs", p, "amplitudeInMilliamps"))
         if width is None:
             width = number(get(settings, "programs", p, "pulseWidthInMicroseconds"))
@@ -242,7 +247,7 @@ class Settings:
     """Everything the settings and the stimulation log say, over time.
 
     `lost`: whether records about stimulation are missing. `adaptive_lost`: the same of the adaptive log.
-    `conflicts`: where both say different things, as (PC ms, amplitudes of the log, those of the settings) in mA.
+    `conflicts`: where both say different things.
     """
 
     sensing: Timeline[Sensing]
@@ -252,7 +257,7 @@ class Settings:
     record_times_ms: list[float] = field(default_factory=list)
     lost: bool = False
     adaptive_lost: bool = False
-    conflicts: list[Conflict] = field(default_factory=list)
+    conflicts: list[Disagreement] = field(default_factory=list)
 
     def at_times(self, of_pc_ms: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Settings:
         """Move the settings' PC times onto a recording's timeline."""
@@ -263,12 +268,15 @@ class Settings:
 
         sensing = Timeline(moved(self.sensing.times_ms), self.sensing.states)
         therapy = Timeline(moved(self.therapy.times_ms), self.therapy.states)
-        conflicts = [(t, c[1], c[2]) for t, c in zip(moved([c[0] for c in self.conflicts]), self.conflicts, strict=True)]
+
+        def moved_one(c: Disagreement) -> Disagreement:
+            times = moved([c.at_ms, c.begin_ms, *(t for t, _ in c.logged)])
+            end_ms = moved([c.end_ms])[0] if math.isfinite(c.end_ms) else c.end_ms
+            logged = tuple(zip(times[2:], (dose for _, dose in c.logged), strict=True))
+            return replace(c, at_ms=times[0], begin_ms=times[1], end_ms=end_ms, logged=logged)
+
+        conflicts = [moved_one(c) for c in self.conflicts]
         return replace(self, sensing=sensing, therapy=therapy, record_times_ms=moved(self.record_times_ms), conflicts=conflicts)
-
-
-Conflict = tuple[float, Dose, Dose]
-"""PC time in ms, dose by the stimulation log, dose by the settings."""
 
 
 def follow(settings: Iterable[Any], stim: Iterable[Any]) -> Settings:
@@ -280,7 +288,7 @@ def follow(settings: Iterable[Any], stim: Iterable[Any]) -> Settings:
         settings: records of DeviceSettings.json in file order.
         stim: records of StimLog.json in file order; a `Lost` where some are missing.
     """
-    settings, stim = list(settings), list(stim)
+    settings, stim = _replace_undated(list(settings), list(stim))
     out = Settings(Timeline(), Timeline(), {}, False)
     times = [t for record in (*settings, *stim) if not isinstance(record, Lost) and (t := host_ms(record)) is not None]
     moves = _moves(settings, 0, min(times, default=0.0)) + _moves(stim, 1, min(times, default=0.0))
@@ -319,6 +327,23 @@ def follow(settings: Iterable[Any], stim: Iterable[Any]) -> Settings:
         for time_ms, state in course:
             out.therapy.add(time_ms, state)
     return out
+
+
+def _replace_undated(settings: list[Any], stim: list[Any]) -> tuple[list[Any], list[Any]]:
+    """Replace records without a time of their session by a `Lost`: what they changed was changed at an unknown moment.
+
+    A PC writes milliseconds. A time in another unit, or of a clock that was not set, is far from that of the other records.
+    """
+    known = sorted(t for record in settings or stim if not isinstance(record, Lost) and (t := host_ms(record)) is not None)
+    middle = known[len(known) // 2] if known else 0.0
+
+    def replace_one(record: Any) -> Any:
+        if isinstance(record, Lost) or not isinstance(record, dict) or record.keys() <= {"RecordInfo"}:
+            return record
+        time_ms = host_ms(record)
+        return record if time_ms is not None and abs(time_ms - middle) <= SAME_SESSION_MS else Lost()
+
+    return [replace_one(record) for record in settings], [replace_one(record) for record in stim]
 
 
 def dose_of(therapy: Therapy) -> Dose:

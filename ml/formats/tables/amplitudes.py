@@ -26,6 +26,9 @@ def checked_amplitude(role: str, columns: Columns, report: FileReport) -> NDArra
     if lost := int(np.sum(np.isnan(values))):
         report.flagged.append(f"{lost} rows without a number in {role}: kept as gaps")
     values = values / PER_UNIT[role][columns.units[role]]
+    if role == "amplitude_ma" and (hold := values == LARGEST[role]).any():
+        report.flagged.append(f"{int(hold.sum())} rows of {LARGEST[role]:g} mA, which is a stimulator's sign for no amplitude: unknown")
+        values = np.where(hold, np.nan, values)
     if (negative := np.flatnonzero(values < 0)).size:
         hint = "Amplitudes are 0 or more; leave the cell empty if unknown."
         raise columns.error(f"negative amplitude {values[negative[0]]:g}", role, hint, int(negative[0]))
@@ -47,13 +50,17 @@ def _absurd(role: str, value: float, columns: Columns, row: int) -> UndecodableF
     return columns.error(what, role, hint, row)
 
 
-def compare_amplitudes(milliamps: NDArray[np.float64], fraction: NDArray[np.float64], report: FileReport) -> None:
-    """Say which of two amplitude columns is used, and whether both can be true for one cDBS amplitude."""
+def compare_amplitudes(milliamps: NDArray[np.float64], fraction: NDArray[np.float64], report: FileReport) -> NDArray[np.bool_]:
+    """Say which of two amplitude columns is used, and find the rows, [n], in which both cannot be true for one cDBS amplitude."""
     report.ignored.append("amplitude_fraction: amplitude_ma is given too and is what is stored")
     both = np.isfinite(milliamps) & np.isfinite(fraction) & (fraction > LEAST_FRACTION)
+    differ = np.zeros(milliamps.size, dtype=bool)
     if not both.any():
-        return
+        return differ
     ratio = milliamps[both] / fraction[both]
     if ratio.max() > (1 + RATIO_SPREAD) * ratio.min():
+        differ[both] = np.abs(ratio - np.median(ratio)) > RATIO_SPREAD * np.median(ratio)
         runs = f"runs from {ratio.min():.3g} to {ratio.max():.3g} mA"
-        report.flagged.append(f"amplitude_ma and amplitude_fraction disagree: their ratio, the cDBS amplitude, {runs}")
+        unknown = f"{int(differ.sum())} rows are unknown until a person chooses"
+        report.flagged.append(f"amplitude_ma and amplitude_fraction disagree: their ratio, the cDBS amplitude, {runs}; {unknown}")
+    return differ

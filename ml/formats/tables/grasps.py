@@ -26,6 +26,9 @@ TELLING = frozenset({"open_fist_s", "open_fist_us", "open_fist"})
 LEAST_FRAMES = 20
 """So many intervals, nearly all under the shortest plausible one, are the frames of a hand tracker."""
 
+SLOWEST_S = 30.0
+"""No hand opens so rarely in a test: such times are in another unit."""
+
 COUNTERS = frozenset({"", "n", "i", "index", "number", "grasp", "count", "unnamed:_0"})
 EVENTS = frozenset({"event", "events", "state", "status", "phase", "gesture", "hand_state", "action"})
 """Names of a column that says what happened at a time."""
@@ -135,6 +138,9 @@ def _one_hand(
         every = 1000 * float(np.median(intervals))
         what = f"{t.size} times that follow each other every {every:.0f} ms: frames of a hand tracker, not open fists"
         raise UndecodableFile(what, "column of times", "Upload the times at which the hand was open, one row per open fist.")
+    if intervals.size and float(np.median(intervals)) > SLOWEST_S:
+        what = f"open fists follow each other every {float(np.median(intervals)):.6g} s, which no test has"
+        raise UndecodableFile(what, "column of times", "Give the times in seconds; if they are milliseconds, name the column t_s [ms].")
     implausible = (intervals < PLAUSIBLE_INTERVAL_S[0]) | (intervals > PLAUSIBLE_INTERVAL_S[1])
     whose = "" if hand is None else f"{hand} hand: "
     report.understood.append(f"{whose}{t.size} open fists")

@@ -8,10 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.formats.beta import LARGEST_UV, channel_spectrum, step_trace, time_domain_traces
+from ml.formats.beta import FLAT_S, LARGEST_UV, channel_spectrum, flat_runs, living, step_trace, time_domain_traces
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
 from ml.formats.tables.amplitudes import checked_amplitude, compare_amplitudes
+from ml.formats.tables.cells.fills import without_fills
 from ml.formats.tables.cells.numbers import known_unit
 from ml.formats.tables.columns import LFP_SCALE, TIME_SCALE, Columns, check_reach
 from ml.signals import BRIDGE_S, Stretch, row_means, step_means
@@ -42,6 +43,10 @@ COARSE_SPREAD = 1.25
 NO_CLOCK = 10.0
 """Times that stray this many steps from an even clock are uneven, or lack samples. They are not coarse."""
 
+RATE_ROWS = 128
+RATE_CHANGE = 0.02
+"""So many samples cannot differ by more from the mean rate, for rounded times move their ends by half a sample at most."""
+
 MIN_ROWS = 8
 LARGEST_RATE_HZ = 100_000.0
 MOST_SAMPLES = 64_000_000
@@ -59,11 +64,11 @@ def decode_lfp(columns: Columns, options: DecodeOptions, report: FileReport) -> 
     if unit not in LFP_SCALE:
         hint = "Write the unit into the header, lfp [uV], or state it with the upload."
         raise columns.error("the lfp column states no unit", "lfp", hint)
-    lfp = columns.values["lfp"] * LFP_SCALE[unit]
+    lfp = without_fills("lfp", columns.values["lfp"], columns.lines, report) * LFP_SCALE[unit]
     if (absurd := np.flatnonzero(np.abs(lfp) > LARGEST_UV)).size:
         what = f"{lfp[absurd[0]]:g} uV, more than any electrode in a brain gives"
         raise columns.error(what, "lfp", "Check the unit of the lfp column.", int(absurd[0]))
-    if lost := int(np.sum(np.isnan(lfp))):
+    if lost := int(np.sum(np.isnan(columns.values["lfp"]))):
         report.flagged.append(f"{lost} rows without a number in lfp: gaps")
     rate, cuts = _rate(t_s, columns, report)
     if options.beta_high_hz >= rate / 2:
@@ -74,6 +79,8 @@ def decode_lfp(columns: Columns, options: DecodeOptions, report: FileReport) -> 
     first = 1 if t_s[0] > -0.5 / rate else int(np.ceil(t_s[0] / period - 1e-9))
     t0_s, rows = (first - 1) * period, int(np.ceil(t_s[-1] / period - 1e-9)) - first + 1
     stretches = _stretches(t_s, lfp, rate, cuts)
+    if flat := sum(end - begin for begin, end in flat_runs(lfp, rate)):
+        report.flagged.append(f"{flat} rows of lfp stand still for {FLAT_S:g} s or longer, as no electrode does: gaps")
     details = {"column": columns.label("lfp"), "unit_from": "header" if columns.units["lfp"] else "options"}
     traces = time_domain_traces(stretches, "lfp", rows, options, details, t0_s)
     traces += _amplitude(columns, t_s, rate, rows, t0_s, options, report)
@@ -143,6 +150,7 @@ def _rate(t_s: NDArray[np.float64], columns: Columns, report: FileReport) -> tup
         i = int(np.flatnonzero(off)[0]) + 1
         what = f"times are not evenly spaced: {steps[i - 1]:g} s here, {usual:g} s on average"
         raise columns.error(what, "t_s", "Write the times with enough decimals, one row per sample.", i)
+    _refuse_two_rates(t_s, usual, inside, columns)
     cuts = np.flatnonzero(~inside) + 1
     missing = int(np.rint(steps[~inside] * rate - 1).sum())
     if cuts.size:
@@ -152,6 +160,19 @@ def _rate(t_s: NDArray[np.float64], columns: Columns, report: FileReport) -> tup
     if even is None and jitter > 0.1 * usual:
         report.flagged.append(f"the times jitter by up to {1000 * jitter:.3g} ms around an even clock of {rate:g} Hz")
     return rate, cuts
+
+
+def _refuse_two_rates(t_s: NDArray[np.float64], usual: float, inside: NDArray[np.bool_], columns: Columns) -> None:
+    """Raise UndecodableFile where a stretch of `RATE_ROWS` samples without a gap has another rate than the whole."""
+    cut = np.concatenate(([0], np.cumsum(~inside)))
+    first = np.arange(0, t_s.size - RATE_ROWS, RATE_ROWS)
+    first = first[cut[first] == cut[first + RATE_ROWS]]
+    every = (t_s[first + RATE_ROWS] - t_s[first]) / RATE_ROWS
+    other = np.flatnonzero(np.abs(every - usual) > RATE_CHANGE * usual)
+    if other.size:
+        i = int(other[0])
+        what = f"the sampling rate changes: {1 / every[i]:.4g} Hz here, {1 / usual:.4g} Hz on average"
+        raise columns.error(what, "t_s", "Upload each part with one rate as a table of its own.", int(first[i]))
 
 
 def _coarse_clock(t_s: NDArray[np.float64], usual: float, columns: Columns) -> tuple[float, NDArray[np.bool_]] | None:
@@ -186,7 +207,7 @@ def _coarse_clock(t_s: NDArray[np.float64], usual: float, columns: Columns) -> t
 
 def _stretches(t_s: NDArray[np.float64], lfp: NDArray[np.float64], rate: float, cuts: NDArray[np.int64]) -> list[Stretch]:
     """List gap-free pieces; rows without a number are gaps too."""
-    good = np.isfinite(lfp)
+    good = living(lfp, rate)
     edges = np.concatenate(([0], cuts, np.flatnonzero(np.diff(good.astype(np.int8))) + 1, [lfp.size]))
     edges = np.unique(edges)
     pairs = zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)

@@ -5,14 +5,18 @@ The row `t_s` covers (t_s - period, t_s]; rows with t_s <= 0 are the window befo
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ml.formats.disagreements import CONFLICTS, disagreements_of_rows
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import DecodedFile, FileReport, RecordingLog, TraceLog, UndecodableFile, fingerprint
 from ml.formats.tables.amplitudes import checked_amplitude, compare_amplitudes
+from ml.formats.tables.cells.fills import without_fills
 from ml.formats.tables.cells.numbers import shown, unit_name
 from ml.formats.tables.columns import (
     TIME_SCALE,
@@ -56,11 +60,19 @@ def decode_columns(columns: Columns, options: DecodeOptions, name: str) -> Decod
     row, t_first = _grid(t_s, columns, options)
     n = int(row[-1]) + 1
     given = {role: _check_column(role, columns, report) for role in columns.values if role != "t_s"}
+    conflicts: list[dict[str, Any]] = []
     if "amplitude_ma" in given and "amplitude_fraction" in given:
-        compare_amplitudes(given["amplitude_ma"], given.pop("amplitude_fraction"), report)
+        differ = np.zeros(n, dtype=bool)
+        differ[row] = compare_amplitudes(given["amplitude_ma"], given.pop("amplitude_fraction"), report)
+        stated = np.full(n, np.nan)
+        stated[row] = given["amplitude_ma"]
+        begin = t_first - options.period_s
+        conflicts = disagreements_of_rows(differ, {"amplitude_ma": stated}, "amplitude_ma", begin, options.period_s)
+        given["amplitude_ma"] = np.where(differ[row], np.nan, given["amplitude_ma"])
     traces = tuple(_trace(role, values, columns, row, n, t_first, options) for role, values in given.items())
     _describe(report, row, n, t_first, options)
-    return DecodedFile((_recording(traces, t_first, n, options),), (report,))
+    recording = _recording(traces, t_first, n, options)
+    return DecodedFile((replace(recording, quality={**recording.quality, CONFLICTS: conflicts}) if conflicts else recording,), (report,))
 
 
 def _times(columns: Columns, options: DecodeOptions) -> NDArray[np.float64]:
@@ -115,7 +127,7 @@ def _check_column(role: str, columns: Columns, report: FileReport) -> NDArray[np
     values = columns.values[role]
     if lost := int(np.sum(np.isnan(values))):
         report.flagged.append(f"{lost} rows without a number in {role}: kept as gaps")
-    return _checked_beta(values, columns.lines, report)
+    return _checked_beta(without_fills(role, values, columns.lines, report), columns.lines, report)
 
 
 def _checked_beta(values: NDArray[np.float64], lines: NDArray[np.int64], report: FileReport) -> NDArray[np.float64]:

@@ -158,3 +158,33 @@ def test_a_table_has_no_clock_to_correct(send: Any, client: TestClient) -> None:
     refused = client.put(f"/api/v1/sessions/{number}/clock", json={"ahead_s": 5, "uncertainty_s": 1, "reason": "said"})
     assert refused.status_code == 422
     assert "no clock to correct" in refused.text
+
+
+def test_the_pages_mark_an_unknown_clock_and_correct_it(send: Any, client: TestClient) -> None:
+    number = send(("r.json", report(None)), visit=1, controller="cdbs").json()["sessions"][0]["id"]
+    page = client.get(f"/sessions/{number}").text
+    assert "clock unknown: the start may be hours off" in page
+    assert "Correct the clock" in page
+    typed = {"ahead_s": "2254", "uncertainty_s": "30"}
+    refused = client.post(f"/sessions/{number}/clock", data=typed)
+    assert refused.status_code == 422
+    assert 'value="2254"' in refused.text  # what was typed stays
+    done = client.post(f"/sessions/{number}/clock", data=typed | {"clock_reason": "notes of the visit"}, follow_redirects=False)
+    assert done.status_code == 303
+    page = client.get(f"/sessions/{number}").text
+    assert "clock unknown" not in page
+    assert "37 min 34 s ahead of UTC within 30 s" in page
+    assert start(client, number) == DAY - timedelta(seconds=AHEAD_S)
+
+
+def test_a_proposals_clock_is_corrected_by_its_form(send: Any, client: TestClient) -> None:
+    answer = send(("r.json", report(None))).json()
+    number, version = answer["sessions"][0]["id"], answer["proposals"][0]["version"]
+    assert answer["proposals"][0]["clock_unknown"] is True
+    assert "clock unknown: the start may be hours off" in client.get(f"/proposals/{number}").text
+    form = {f"version-{number}": str(version), f"ahead_s-{number}": "-60", f"uncertainty_s-{number}": "5", "do": f"clock:{number}"}
+    assert client.post("/participants/P1/proposals", data=form).status_code == 422
+    done = client.post("/participants/P1/proposals", data=form | {f"clock_reason-{number}": "notes"}, follow_redirects=False)
+    assert done.status_code == 303
+    assert client.get(f"/api/v1/proposals/{number}").json()["clock_unknown"] is False
+    assert start(client, number) == DAY + timedelta(seconds=60)

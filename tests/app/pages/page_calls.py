@@ -99,6 +99,8 @@ def _of_visits(world: World) -> dict[str, Call]:
         | {"data": DOSE | {"mg": "50", "taken_at": "2026-03-02T08:00:00Z"}},
         "/doses/{dose_id}/removal": of_api(world, "post", "/doses/{dose_id}/removal") | {"data": {"reason": "not taken"}},
         "/sessions/{session_id}/qoc": {"data": {"rating": "5", "reason": "misread"}},
+        "/sessions/{session_id}/clock": of_api(world, "put", "/sessions/{session_id}/clock")
+        | {"data": {"ahead_s": "60", "uncertainty_s": "5", "clock_reason": "compared on the day"}},
         "/sessions/{session_id}/correction": {"data": {"hemisphere": "left", "reason": "protocol sheet"}},
         "/sessions/{session_id}/conditions": {
             "data": {"revision": str(revision), "lower_bound": "0.2", "conditions_reason": "protocol sheet"}

@@ -31,6 +31,7 @@ FORMS = {
     "/doses/{dose_id}/removal": can.WRITE_STUDY,
     "/sessions/{session_id}/qoc": can.WRITE_QOC,
     "/sessions/{session_id}/correction": can.WRITE_STUDY,
+    "/sessions/{session_id}/clock": can.WRITE_STUDY,
     "/sessions/{session_id}/conditions": can.WRITE_STUDY,
     "/sessions/{session_id}/derived": can.WRITE_QOC,
     "/sessions/{session_id}/exclusion": can.WRITE_STUDY,

@@ -107,7 +107,7 @@ def test_power_that_does_not_come_later_is_left_out():
     rows = [{"TicksInMs": t, "Left": {"LFP": 1, "mA": 1}} for t in (500, 1000, 1000, 800, 1500)]
     (data,) = device_powers([{"LfpData": rows, "Channel": "ZERO_TWO_LEFT"}])
     assert data.ticks_ms.tolist() == [500, 1000, 1500]
-    assert "2 power values" in data.notes[0]
+    assert "2 power values" in data.void[0]
 
 
 @given(
