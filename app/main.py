@@ -21,6 +21,7 @@ from starlette.concurrency import run_in_threadpool
 from app import __version__
 from app.accounts.deps import METRICS, CurrentCaller, judge, reader_of_figures
 from app.analysis.standing import outlook, standing_sentences
+from app.planning.plans.suggested import suggested_visit
 from app.planning.slots.pages import facts as slots_of_visit
 from app.platform import logs
 from app.platform.database import Db, check_connection
@@ -167,6 +168,7 @@ def _built() -> FastAPI:
     app.mount("/static", _Static(directory=STATIC))
     app.state.description = DESCRIPTION
     templates.provide(templates.Part.OUTLOOK, outlook)
+    templates.provide(templates.Part.SUGGESTED_VISIT, suggested_visit)
     templates.provide(templates.Part.STANDINGS, standing_sentences)
     templates.provide(templates.Part.TESTED_STANDINGS, partial(standing_sentences, every=False))
     templates.provide(templates.Part.SLOTS_OF_VISIT, slots_of_visit)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
@@ -37,7 +37,7 @@ from app.platform.kept import kept
 from app.platform.web.charts import Chart
 from app.platform.web.numbers import when
 from app.platform.web.schemas import PagingQuery, Text
-from app.platform.web.templates import render
+from app.platform.web.templates import Part, make_part, render
 from app.settings import get_settings
 from app.study import repository as study
 from app.study.access import may, withdrawn_codes
@@ -166,14 +166,15 @@ def participant_page(request: Request, participant: CurrentParticipant, db: Db, 
 
 @dataclass(frozen=True)
 class _Answer:
-    """What to test next, in the ranking's own words; whether they are of data that have changed since."""
+    """Words of the ranking on what to test next, whether the data have changed since, and the visit that one button drafts."""
 
     words: Markup
     stale: bool
+    suggested: Any
 
 
 def _answer(db: Session, participant: Participant, caller: Caller) -> _Answer | None:
-    """None before the first ranking, and for blinded assessors, to whom rankings are closed."""
+    """Return None before the first ranking, and for blinded assessors, to whom rankings are closed."""
     if caller.is_blinded:
         return None
     try:
@@ -181,7 +182,8 @@ def _answer(db: Session, participant: Participant, caller: Caller) -> _Answer | 
     except NotFound:
         return None
     words = what_next(found, may_run=may(caller, can.RUN_JOBS, participant))
-    return _Answer(words, bool(stale_reasons(db, participant, found.evaluation, found.sessions)))
+    suggested = make_part(Part.SUGGESTED_VISIT, db, participant, caller, found)
+    return _Answer(words, bool(stale_reasons(db, participant, found.evaluation, found.sessions)), suggested)
 
 
 def _story(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsVersion]) -> Chart | None:

@@ -66,7 +66,7 @@ def test_the_first_screen_says_what_to_test_what_it_costs_and_what_not_to_touch(
     first, _, rest = words.partition("Not advised:")
     assert first.count("energy −") == 3, "rl-03 does what rl-02 does"
     assert first.count("grasp ") >= 3
-    assert first.count("likely no worse than cDBS by more than the margins; never run so far") == 3, "in the same words for each"
+    assert first.count("chance that grasp, rating and tremor all stay within the margins; never run") == 3, "in the same words for each"
     assert "nearly off 26 % of the time" in rest
     assert "nearly off 42 % of the time" in rest
     assert "No worse” is by this participant's margins" in rest

@@ -16,7 +16,7 @@ from app.platform.web.charts import counted
 from app.platform.web.templates import render_part
 from app.study.margins import margins_of
 from ml.ope import NEARLY_OFF, Flag
-from ml.outcomes import ANY, OUTCOMES, Outcome
+from ml.outcomes import ALL, ANY, OUTCOMES, Outcome
 from ml.qoc import Margins
 
 # The words of a ranking's verdicts: what each is called, and its reasons in a line, in full and for a first look.
@@ -70,7 +70,7 @@ def likely(within: float) -> str:
     Args:
         within: that probability.
     """
-    return f"{chance(within)} likely no worse than cDBS by more than the margins"
+    return f"{chance(within)} chance that {ALL} all stay within the margins"
 
 
 def further_sessions(reasons: Sequence[Flag]) -> str:

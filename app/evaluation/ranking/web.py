@@ -35,7 +35,6 @@ from app.study.access import may
 from app.study.deps import CurrentParticipant, ResultsViewed
 from app.tables.jobs import JobStatus
 from app.tables.participants import Participant
-from ml.designs import EARLY_RANDOM_SESSIONS
 from ml.ope import registry as estimators
 from ml.outcomes import FIELDS
 
@@ -171,6 +170,8 @@ def ranking_page(
         ranking=found,
         standings=make_part(Part.TESTED_STANDINGS, db, participant, caller) if found else {},
         answer=judged.answer if judged else None,
+        suggested=make_part(Part.SUGGESTED_VISIT, db, participant, caller, judged) if judged else None,
+        next=what_next(judged, may_run=may_run) if judged else "",
         body=_body(judged, found, shown, may_plan, may_run, unfolded=bool(method)) if judged and found else "",
         missing=missing,
         live=live,
@@ -197,11 +198,9 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             "evaluation/_ranking.html",
             base=f"/participants/{participant.code}",
             code=participant.code,
-            random_sessions=EARLY_RANDOM_SESSIONS,
             ranking=found,
             answer=answered,
             picture=judged.picture(settings.bound),
-            next=what_next(judged, may_run=may_run),
             held=held_out.of_evaluation(judged.evaluation),
             pooling=[wording.shape_pooling(o, told) for o, told in dose_shapes.pooling(judged.evaluation).items()],
             plainly=verdict_wording.plainly,

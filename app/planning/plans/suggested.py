@@ -5,15 +5,26 @@ The clinician decides."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from sqlalchemy.orm import Session
 
+from app.accounts import permissions as can
+from app.accounts.permissions import Caller
 from app.evaluation.ranking.answer import answer
-from app.evaluation.ranking.assessment import Assessment
+from app.evaluation.ranking.assessment import Assessment, cdbs_amplitude_now
 from app.evaluation.ranking.judged import Judged
 from app.evaluation.repository import PolicyHead
-from app.planning.protocol.schedule import cdbs_sessions
+from app.planning.plans import repository
+from app.planning.plans.designs import offered
+from app.planning.plans.visits import today
+from app.planning.protocol.schedule import Rules, cdbs_sessions, most_policies, total_minutes
+from app.platform.web.charts import counted
+from app.study.access import may
+from app.tables.participants import Participant
+from app.tables.visits import Visit
+from ml.designs import EARLY_RANDOM_SESSIONS
 from ml.ope import FEWEST_DRAWS, Suggestion, portfolio
 from ml.ope.posterior.further_sessions import Hold, Place, worth_exploring, worth_holding
 
@@ -81,3 +92,61 @@ def _portfolio(found: Assessment, slots: int) -> tuple[Suggested, ...]:
         if len(chosen) == number:
             return tuple(Suggested(policies[s.name], s) for s in chosen)
     return ()
+
+
+# The visit that the ranking suggests, filled in: one button drafts it.
+
+
+@dataclass(frozen=True)
+class SuggestedVisit:
+    """A visit as the protocol fills it.
+
+    Attributes:
+        sessions: how many, those of cDBS among them. minutes: from the first one's start to the last one's end.
+        alone: minutes of a visit that tests one policy: its cDBS session, the washout and the test.
+        policies: what is tested. sessions_near: sessions near an amplitude, in words. visit: for which; None where one is to be chosen.
+        fields: names and values of the form for a draft.
+    """
+
+    sessions: int
+    minutes: float
+    alone: float
+    policies: tuple[PolicyHead, ...]
+    sessions_near: tuple[str, ...]
+    visit: Visit | None
+    fields: tuple[tuple[str, str], ...]
+
+
+def suggested_visit(db: Session, participant: Participant, caller: Caller, ranking: Judged) -> SuggestedVisit | None:
+    """Fill the next visit without a plan: policies worth a test, else sessions near an amplitude, else random ones.
+
+    None where the caller drafts no plans, the participant has withdrawn, or every visit to come has its plan.
+    """
+    if participant.status == "withdrawn" or not may(caller, can.DRAFT_PLAN, participant):
+        return None
+    visits = repository.open_visits(db, participant.id, today())
+    planned = {plan.visit_id for plan, _ in repository.plans(db, participant.id, 500, 0)[0] if plan.status != "superseded"}
+    free = [visit for visit in visits if visit.id not in planned]
+    if visits and not free:
+        return None
+    rules, settings = Rules(), participant.current_settings
+    slots = most_policies(rules)
+    place = Place(settings.bound, round(60 * rules.session_minutes / settings.period_s), settings.period_s)
+    policies = tuple(s.policy for s in suggested(ranking, slots))
+    holds = held_in(ranking, slots, place) if ranking.answer.cheapest and not policies else ()
+    rules = replace(rules, random_sessions=0 if policies or holds else EARLY_RANDOM_SESSIONS, held_sessions=sum(h.hold.here for h in holds))
+    cdbs_ma = cdbs_amplitude_now(participant)
+    near = [(str(h.hold.here), offered(h.hold.fraction, settings.bound, cdbs_ma)) for h in holds]
+    name, unit = ("amplitude_fraction", "of cDBS") if cdbs_ma is None else ("amplitude_ma", "mA")
+    fields = [("evaluation_id", str(ranking.evaluation.id)), ("random_sessions", str(rules.random_sessions))]
+    fields += [("policy_ids", str(p.id)) for p in policies]
+    fields += [f for here, ma in near for f in (("held_unit", name), ("held_amplitude", ma), ("held_sessions", here))]
+    return SuggestedVisit(
+        sessions=len(policies) + cdbs_sessions(len(policies)) + rules.exploring,
+        minutes=total_minutes(len(policies), rules),
+        alone=total_minutes(1, Rules()),
+        policies=policies,
+        sessions_near=tuple(f"{counted(int(here), 'session')} near {level} {unit}" for here, level in near),
+        visit=free[0] if free else None,
+        fields=(*fields, *([("visit_id", str(free[0].id))] if free else [])),
+    )

@@ -126,6 +126,7 @@ class Part(StrEnum):
     SLOTS_OF_VISIT = "planned sessions against recorded ones, on the page of a visit"
     STANDINGS = "a sentence on every policy, by its number, on pages that show policies"
     TESTED_STANDINGS = "the same of policies with sessions or harms alone, on pages that list many"
+    SUGGESTED_VISIT = "the visit that one button drafts, on pages that say what to test next"
     OUTLOOK = "sentences on what further visits would settle, on the page of a draft"
 
 

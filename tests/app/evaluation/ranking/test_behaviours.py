@@ -38,7 +38,7 @@ def rows(client: TestClient) -> dict[str, list[str]]:
     assert body is not None
     found = {}
     for row in re.findall(r"<tr.*?</tr>", body[0], re.S)[1:]:
-        first, _, same = row.partition("does the same:")
+        first, _, same = row.partition("nearly identical:")
         names = [re.findall(r">(p\d)</a>", part) for part in (first, same.partition("</td>")[0])]
         found[names[0][0]] = names[1]
     return found
@@ -57,7 +57,7 @@ def test_two_policies_that_nothing_binds_share_a_row_where_they_ask_for_the_same
     judge({a: judged(50.0), b: judged(60.0), c: judged(40.0)}, coverage=apart(policies, 0.05))
     assert rows(client) == {"p1": ["p0"], "p2": []}, "the better one stands for both"
     words = above_fold(client.get(PAGE).text)
-    assert "p1 external does the same: p0 test" in words
+    assert "p1 external nearly identical: p0 test" in words
     assert words.count("p0 : energy") == 0, "what to test names each behaviour once"
     judge({a: judged(50.0), b: judged(60.0), c: judged(40.0)}, coverage=apart(policies, 0.051))
     assert rows(client) == {"p1": [], "p0": [], "p2": []}
@@ -88,9 +88,9 @@ def test_one_that_was_tested_stands_for_those_that_were_not(
     upload("rl", level=0.4, policy=a)
     judge({a: judged(50.0), b: judged(60.0), c: judged(70.0)}, coverage=apart(policies, 0.01))
     assert rows(client) == {"p2": [], "p0": ["p1"]}
-    assert re.search(r"p0 external does the same: p1 test .*? 1 session ", above_fold(client.get(PAGE).text))
+    assert re.search(r"p0 external nearly identical: p1 test .*? 1 session ", above_fold(client.get(PAGE).text))
     upload("rl", level=0.6, policy=b)
-    assert "p1 external does the same: p0 (tested)" in above_fold(client.get(PAGE).text), "the best of those that were tested"
+    assert "p1 external nearly identical: p0 (tested)" in above_fold(client.get(PAGE).text), "the best of those that were tested"
 
 
 def test_each_keeps_its_own_numbers_where_it_is_planned_or_looked_at(client: TestClient, policies: list[int], judge: Judge) -> None:

@@ -82,7 +82,7 @@ def test_the_page_follows_values_and_the_first_proposal_is_a_test_all_the_same(
     assert [re.findall(r">(p\d)</a>", r)[0] for r in rows] == ["p1", "p0", "p2"]
     assert ['type="checkbox"' in r for r in rows] == [False, True, False]
     words = first_screen(client)
-    assert words.index("Worth a test") < words.index("p0 :") < words.index("p1 :"), "what is likely worse is no proposal"
+    assert words.index("Suggested tests") < words.index("p0 :") < words.index("p1 :"), "what is likely worse is no proposal"
     assert "p1 :" in words.split("Not advised:")[1]
 
 
@@ -131,7 +131,7 @@ def test_without_ordering_skill_there_are_no_ranks_and_verdicts_stay(client: Tes
     assert "; by name, as the recordings cannot order them): p0 :" in words
     assert "the recordings so far cannot tell policies apart" in words
     assert "Not advised: p2 : unsafe, nearly off 42 % of the time" in words
-    assert "#" not in words.split("Each behaviour against cDBS")[1].split("Policy")[0]
+    assert "#" not in words.split("Candidates compared with cDBS")[1].split("Policy")[0]
 
 
 def test_the_first_screen_says_what_to_test_why_and_at_what_risk_without_a_word_of_methods(
@@ -142,12 +142,12 @@ def test_the_first_screen_says_what_to_test_why_and_at_what_risk_without_a_word_
     judge({a: judged(50.0, outcome_draws=likely), b: judged(60.0, **NEARLY_OFF), c: judged(70.0, supported=False)})
     words = first_screen(client)
     assert (
-        "minutes each (expected against cDBS): p0 : energy \N{MINUS SIGN}29 %, grasp \N{MINUS SIGN}0.2 Hz, rating unchanged, tremor +4 "
+        "Suggested tests (expected change from cDBS): p0 : energy \N{MINUS SIGN}29 %, grasp \N{MINUS SIGN}0.2 Hz, rating unchanged, "
+        "tremor +4 "
         "percentage points; "
-        "85 % likely no worse than cDBS by more than the margins; never run so far." in words
+        "85 % chance that grasp, rating and tremor all stay within the margins; never run so far." in words
     )
-    assert re.search(r"Worth a test, \d+ minutes each \(", words)
-    assert re.search(r"Worth a test with care, \d+ minutes, one of them at a visit \(expected against cDBS\): p2 , not below 1.5 mA", words)
+    assert "Suggested tests with care, one of them at a visit (expected change from cDBS): p2 , not below 1.5 mA" in words
     assert "Not advised: p1 : unsafe, nearly off 42 % of the time" in words
     assert methods_named(words) == []
 
@@ -156,7 +156,7 @@ def test_the_participants_page_begins_with_the_words_of_the_ranking(client: Test
     a, b, c = policies
     judge({a: judged(50.0), b: judged(60.0, **NEARLY_OFF), c: judged(70.0, supported=False)})
     ranking, words = first_screen(client), above_fold(client.get("/participants/P1").text)
-    answered = ranking[ranking.index("Worth a test") : ranking.index(" A proposal by stated rules")]
+    answered = ranking[ranking.index("Suggested tests") : ranking.index(" A proposal by stated rules")]
     assert words.index(answered) < words.index("Needs attention"), "the answer comes first"
     assert "out of date" not in words
     assert methods_named(words) == []
@@ -176,7 +176,7 @@ def test_a_plan_says_of_its_policies_what_the_ranking_says(client: TestClient, p
     assert methods_named(words) == []
     pages = PdfReader(io.BytesIO(client.get(f"/api/v1/visits/{visit}/plan.pdf").content)).pages
     sheet = " ".join(" ".join(page.extract_text() for page in pages).split())
-    assert "Verdict test; 85 % likely no worse than cDBS by more than the margins" in sheet
+    assert "Verdict test; 85 % chance that grasp, rating and tremor all stay within the margins" in sheet
     assert re.search(r"Against cDBS energy .29 %, grasp .0.2 Hz, rating unchanged, tremor \+4 percentage points", sheet)
 
 

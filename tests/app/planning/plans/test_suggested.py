@@ -143,3 +143,33 @@ def test_policies_that_do_the_same_stand_under_their_teacher_and_can_still_be_ti
     assert client.post(f"/api/v1/visits/{visit}/plan", json={"policy_ids": [b]}).status_code == 201
     again = client.get(f"/visits/{visit}/plan", headers={"accept": "text/html"}).text
     assert '<details class="counted" open><summary><small>and 1 that does the same' in again, "what the draft holds is not hidden"
+
+
+def test_one_button_drafts_the_suggested_visit_and_names_its_minutes(client: TestClient, policies: list[int], judge: Judge) -> None:
+    a, b, _ = policies
+    judge({a: _with(10.0, drawn(10.0, 4.0, 1)), b: _with(8.0, drawn(8.0, 4.0, -1))})
+    visit = client.post("/api/v1/participants/P1/visits", json={"number": 2, "date": "2046-04-06"}).json()["id"]
+    for path in ("/participants/P1", "/participants/P1/ranking"):
+        page = client.get(path, headers={"accept": "text/html"}).text
+        (form,) = re.findall(r'<form method="post" action="([^"]+)"[^>]*id="suggested-visit"(.*?)</form>', page, re.S)
+        words = " ".join(re.sub(r"<[^>]+>", " ", form[1]).split())
+        assert "Suggested visit 2, 2046-04-06: 40 minutes, 3 sessions (p0, p1, and cDBS in between), washouts included." in words, path
+        assert "One policy alone takes 25 minutes" in words
+    fields: dict[str, list[str]] = {}
+    for name, value in re.findall(r'name="(\w+)" value="([^"]*)"', form[1]):
+        fields.setdefault(name, []).append(value)
+    drafted = client.post(form[0], data=fields, follow_redirects=False)
+    assert drafted.headers["location"] == f"/visits/{visit}/plan?done=drafted", drafted.text
+    plan = client.get(f"/api/v1/visits/{visit}/plan").json()
+    assert sorted(s["policy_id"] for s in plan["sessions"] if s["policy_id"]) == [a, b]
+    assert len(plan["sessions"]) == 3
+    assert "suggested-visit" not in client.get("/participants/P1/ranking", headers={"accept": "text/html"}).text, "it has its plan"
+
+
+def test_the_suggested_visit_is_offered_to_those_alone_who_draft(
+    client: TestClient, client_as: Callable[[str], TestClient], policies: list[int], judge: Judge
+) -> None:
+    judge({policies[0]: judged(50.0)})
+    for role, shown in (("coordinator", False), ("monitor", False), ("engineer", True), ("clinician", True)):
+        page = client_as(role).get("/participants/P1/ranking", headers={"accept": "text/html"}).text
+        assert ("Draft the suggested visit" in page) == shown, role
