@@ -24,9 +24,9 @@ from app.platform import logs
 from app.platform.audit.commands import app as audit_app
 from app.platform.bucket import bucket
 from app.platform.database import database_place, keep_asking, supervise_database, transaction
-from app.platform.start import Watchdog, in_one_line, require_data_folder, require_free
 from app.platform.terminal import ACTOR, AsJson, Code, say, show
 from app.platform.upkeep.commands import app as upkeep_app
+from app.platform.upkeep.start import Watchdog, in_one_line, require_data_folder, require_free
 from app.settings import Settings, get_settings
 from app.simulation import commands as simulation
 from app.study import commands as closing
@@ -102,7 +102,7 @@ def serve(
     from app.ingest.uploads.interrupted import keep_resuming
     from app.main import create_app
     from app.platform.audit.chain import keep_sealing
-    from app.platform.migrate import migrate as bring_up_to_date
+    from app.platform.upkeep.migrate import migrate as bring_up_to_date
 
     logs.configure()
     if (tls_certificate is None) != (tls_key is None):
@@ -144,7 +144,7 @@ def serve(
 def worker(slots: Annotated[int | None, typer.Option(min=1, help="Compute steps side by side; BETALOOP_WORKER_SLOTS.")] = None) -> None:
     """Run background jobs until stopped; an interrupted job continues where it was."""
     from app.platform.jobs.worker import run_worker
-    from app.platform.migrate import migrate as bring_up_to_date
+    from app.platform.upkeep.migrate import migrate as bring_up_to_date
 
     logs.configure()
     require_data_folder()

@@ -27,7 +27,7 @@ from app.platform import logs
 from app.platform.database import Db, check_connection
 from app.platform.errors import DatabaseAway
 from app.platform.files import prune_copies_beside, remove_abandoned
-from app.platform.migrate import newest_revision, revision
+from app.platform.upkeep.migrate import newest_revision, revision
 from app.platform.web import middleware as web
 from app.platform.web import templates
 from app.platform.web.compression import CompressedFiles

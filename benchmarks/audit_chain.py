@@ -46,9 +46,9 @@ def main() -> None:
         os.environ["BETALOOP_DATA_DIR"] = folder
         os.environ.pop("BETALOOP_DATABASE_URL", None)
         from app.platform.audit.chain import verify
-        from app.platform.audit.rows import past_the_trail
+        from app.platform.audit.guards import past_the_trail
         from app.platform.database import owner_url
-        from app.platform.migrate import migrate
+        from app.platform.upkeep.migrate import migrate
 
         migrate()
         found: dict[tuple[bool, bool], list[float]] = {}

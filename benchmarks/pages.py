@@ -44,7 +44,7 @@ from app.main import create_app
 from app.pipeline.service import start_job
 from app.platform.database import get_engine, transaction
 from app.platform.jobs.service import cancel
-from app.platform.migrate import migrate
+from app.platform.upkeep.migrate import migrate
 from app.settings import get_settings
 from app.study.repository import participant_by_code
 from app.tables.jobs import Job

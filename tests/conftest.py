@@ -30,7 +30,7 @@ from app.accounts.passwords import FewAtOnce
 from app.platform import service_role
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.jobs import engine as jobs_engine
-from app.platform.web.body_limit import sent
+from app.platform.web.request_bodies import sent
 from app.settings import get_settings
 from app.tables.accounts import Role
 

@@ -26,7 +26,7 @@ DAMAGED = "tests/app/ingest/uploads/test_damaged_files.py"
 LOCKS, LOCK_SIGNED = "tests/app/study/visits/test_visit_locks.py", "tests/app/study/visits/test_lock_signatures.py"
 PLANS, KEY = "tests/app/planning/plans/test_sign_off.py", "tests/app/planning/plans/test_sealed_key.py"
 RELEASES, MARGINS = "tests/app/planning/releases/test_releases.py", "tests/app/study/test_margin_signatures.py"
-SIGNATURES = "tests/app/platform/signatures/test_signatures.py"
+SIGNATURES = "tests/app/platform/audit/test_signatures.py"
 QUARANTINE, QUERIES = "tests/app/ingest/quarantine/test_quarantine.py", "tests/app/study/data_queries/test_data_queries.py"
 SCOPE, HEADERS = "tests/app/overview/test_audit_scope.py", "tests/app/platform/web/test_headers.py"
 MALFORMED, HASHES = "tests/app/platform/test_malformed_bodies.py", "tests/app/accounts/test_few_hashes_at_once.py"
@@ -56,7 +56,7 @@ PROMISES = [
          f"{CHAIN}::test_a_seal_that_was_deleted_from_the_database_still_stands_in_its_file"),
     ),
     *_of(
-        "platform/json_members",
+        "platform/web/request_bodies",
         ("malformed bodies are answered as described", "except (ValueError, RecursionError):", "except RecursionError:",
          f"{MALFORMED}::test_every_malformed_body_is_answered_as_described"),
         ("a document with a doubled member is refused", "if doubled is not None:", "if False:",
@@ -87,7 +87,7 @@ PROMISES = [
         at_start=True,
     ),
     *_of(
-        "platform/signatures/service",
+        "platform/audit/signatures",
         ("a signature stands for its content alone", "signature.sha256 == content_hash(content) == content_hash(signature.content)",
          "signature.sha256 == content_hash(signature.content)", f"{SIGNATURES}::test_a_signature_stands_for_its_content_alone"),
         ("a signature whose own record was changed does not stand",
@@ -346,7 +346,7 @@ PROMISES = [
          f"{HEADERS}::test_every_answer_has_them"),
     ),
     *_of(
-        "platform/web/body_limit",
+        "platform/web/request_bodies",
         ("strangers send nothing large", ", await self.judge(request)])", "])",
          f"{LIMITS}::test_a_gibibyte_of_nobody_is_refused_before_it_is_received"),
         ("nothing that the interface is sent is read of strangers", 'is_json(scope) or scope["path"].startswith(INTERFACE)', "False",

@@ -16,8 +16,8 @@ from app.accounts import service
 from app.accounts.permissions import Caller, is_open
 from app.platform.database import Db, new_session, set_actor
 from app.platform.errors import EntriesOfAnother, Forbidden, TooMany, Unauthorized
-from app.platform.sources import Allowance, from_this_machine, in_words, network_address
 from app.platform.web.forms import written_by
+from app.platform.web.sources import Allowance, from_this_machine, in_words, network_address
 from app.settings import get_settings
 from app.tables.accounts import Scope
 

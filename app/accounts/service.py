@@ -19,7 +19,7 @@ from app.accounts.repository import LONGEST_ADDRESS, normal_address
 from app.platform.audit import record, record_once
 from app.platform.database import now, set_actor, transaction
 from app.platform.errors import Conflict, Forbidden, Invalid, NotFound, TooMany, Unauthorized, about
-from app.platform.sources import in_words
+from app.platform.web.sources import in_words
 from app.settings import get_settings
 from app.tables.accounts import ApiToken, Membership, Role, Scope, SignIn, SignInAttempt, Study, User
 

@@ -14,10 +14,10 @@ from app.accounts.permissions import CONFIRMED_FOR, Caller
 from app.accounts.service import confirm_password, open_session
 from app.accounts.sign_on_provider import Identity, Refused
 from app.platform.audit import record
+from app.platform.audit.signatures import Signer
+from app.platform.audit.signatures import record as record_signature
 from app.platform.database import now, set_actor
 from app.platform.errors import Forbidden, about
-from app.platform.signatures.service import Signer
-from app.platform.signatures.service import record as record_signature
 from app.tables.accounts import SignIn, SignOnLink, User
 from app.tables.audit import Signature
 
@@ -127,7 +127,7 @@ def _refused(db: Session, whose: str, detail: str, hint: str = "Ask an administr
     return Refused(detail, hint)
 
 
-# Signing: the signer shows again who they are, and the signed content is stored (`app.platform.signatures`).
+# Signing: the signer shows again who they are, and the signed content is stored (`app.platform.audit.signatures`).
 #
 # They give the password again (with the code of a second factor), or the hospital's sign-on asked them again. That was at most five
 # minutes ago, in this browser session, for this one signature.

@@ -10,8 +10,8 @@ from app.accounts.deps import CurrentCaller
 from app.analysis import biomarker, primary_words
 from app.analysis.biomarker import Biomarker, Pairing
 from app.platform.database import Db
-from app.platform.web.charts import Cell, Chart, Link, apart_where_equal, axis, counted, figure
-from app.platform.web.numbers import number
+from app.platform.numbers import counted, number
+from app.platform.web.charts import Cell, Chart, Link, apart_where_equal, axis, figure
 from app.platform.web.schemas import Model, problems
 from app.platform.web.templates import render
 from app.study.deps import CurrentParticipant

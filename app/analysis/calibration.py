@@ -28,7 +28,7 @@ from app.evaluation.estimates.rows import estimate_of
 from app.evaluation.ranking.assessment import QUANTITIES, Actual, actual
 from app.evaluation.ranking.results import DrivenSession, driven_sessions
 from app.planning.plans import repository as plans
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 from app.study import access, blinding
 from app.study import repository as study_repository
 from app.study.settings import mdp_settings

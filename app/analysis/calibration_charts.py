@@ -7,8 +7,8 @@ from typing import Any
 
 from app.analysis.calibration_accuracy import AccuracyOut, CalibrationOut, MethodMetricOut, PredictionOut, TestedPolicyOut
 from app.evaluation.ranking.charts import style
-from app.platform.web.charts import MUTED, Chart, axis, counted, figure
-from app.platform.web.numbers import hover
+from app.platform.numbers import counted, hover
+from app.platform.web.charts import MUTED, Chart, axis, figure
 from ml.ope import shown as method_of
 from ml.outcomes import OUTCOMES
 

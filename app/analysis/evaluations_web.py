@@ -15,9 +15,9 @@ from app.analysis import evaluations
 from app.analysis.evaluations import LEAST_POLICIES, WANTED_SEEDS, BySeed, SeedRow
 from app.analysis.figures import SYNTHETIC, Box, Panel, boxes_svg, csv_of
 from app.platform.database import Db
-from app.platform.web.charts import TEXT, Cell, Chart, axis, counted, figure, side_by_side
+from app.platform.numbers import counted, hover
+from app.platform.web.charts import TEXT, Cell, Chart, axis, figure, side_by_side
 from app.platform.web.csv_files import download
-from app.platform.web.numbers import hover
 from app.platform.web.schemas import Model, problems
 from app.platform.web.templates import render
 from app.study.access import may

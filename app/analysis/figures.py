@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 
+from app.platform.numbers import stated
 from app.platform.web.charts import side_by_side
 from app.platform.web.csv_files import safe_cell
-from app.platform.web.numbers import stated
 
 COLOURS = {"cdbs": "#0067a8", "rl": "#c24e00", "distilled": "#9b3f86", "no_dbs": "#5d6770", "random": "#00795a", "other": "#7a6200"}
 PANEL_W, PANEL_H, LEFT, TOP, BOTTOM, GAP, EMPTY_W = 250, 190, 52, 44, 52, 18, 1000

@@ -14,8 +14,7 @@ from app.analysis import primary, primary_words
 from app.analysis.evidence import Evidence, evidence
 from app.analysis.facts import METRICS, BetaKind, Facts, comparable_beta, with_comparable_beta
 from app.platform.kept import kept
-from app.platform.web.charts import counted
-from app.platform.web.numbers import p_text
+from app.platform.numbers import counted, p_text
 from app.study.blinding import CONTROLLER_NAMES
 from app.study.sessions.stimulation import MEAN_FRACTION, fits
 from app.tables.participants import Participant

@@ -13,9 +13,9 @@ from app.analysis.facts import HIGHER_IS_BETTER, METRICS
 from app.analysis.figures import COLOURS, SYNTHETIC, Box, Panel, boxes_svg, csv_of
 from app.analysis.metrics import ALPHA, Comparison, FiveMetrics, Group, MetricResult, PolicyResult
 from app.platform.kept import kept
-from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, counted, figure, marker, side_by_side
+from app.platform.numbers import counted, hover, p_text
+from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, colour, figure, marker, side_by_side
 from app.platform.web.csv_files import download
-from app.platform.web.numbers import hover, p_text
 from app.tables.sessions import LEARNED, Controller
 from ml.outcomes import BY_KEY
 

@@ -24,7 +24,8 @@ from app.analysis.primary_schemas import AverageOut, VerdictOut, average_out, ve
 from app.platform.database import Db
 from app.platform.errors import NotFound
 from app.platform.kept import kept
-from app.platform.web.charts import TEXT, Cell, Chart, axis, counted, figure
+from app.platform.numbers import counted
+from app.platform.web.charts import TEXT, Cell, Chart, axis, figure
 from app.platform.web.charts import figure as empty
 from app.platform.web.csv_files import download
 from app.platform.web.schemas import Model, PagingQuery, problems

@@ -14,8 +14,8 @@ from app.analysis.primary_results import Comparison, Tested
 from app.analysis.primary_schemas import PrimaryOut, primary_csv, primary_out, unit_of
 from app.platform.database import Db
 from app.platform.errors import NotFound
-from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, counted, figure, horizontal, marker, written
-from app.platform.web.numbers import hover, number
+from app.platform.numbers import counted, hover, number
+from app.platform.web.charts import MUTED, TEXT, Cell, Chart, axis, figure, horizontal, marker, written
 from app.platform.web.schemas import problems
 from app.platform.web.templates import Part, make_part, render
 from app.study.deps import CurrentParticipant

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 from app.analysis.facts import Excluded, LeftOut, Missing
 from app.analysis.primary_results import Basis, Comparison, Disagreement, Tested
 from app.analysis.primary_verdict import LockedMargins, NoVerdict, VerdictResult
-from app.platform.web.charts import counted
-from app.platform.web.numbers import p_text
+from app.platform.numbers import counted, p_text
 from app.study.blinding import CONTROLLER_NAMES
 from ml.outcomes import ALL, BY_KEY, OUTCOMES, Outcome, enumerated
 from ml.statistics.noninferiority import ENERGY, LEAST_VISITS, FailureRule, Inconclusive, Inferior, NonInferiorAndSaving, Verdict

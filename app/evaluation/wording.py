@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from app.evaluation.schemas import EstimateSummary, FlagOut, ReasonOut
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 from ml.ope import Estimate, Flag, shown
 from ml.outcomes import ALL, ANY, OUTCOMES
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from app.ingest.proposals.evidence import Evidence, Reason, Source, stored_courses
 from app.platform.errors import BetaloopError, DatabaseAway, GivenUp, StorageFull
-from app.platform.web.numbers import stated
+from app.platform.numbers import stated
 from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern
 from app.tables.recordings import Recording
 from app.tables.uploads import ColumnMapping

@@ -11,8 +11,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.learning.trajectories import read_buffer
-from app.platform.web.charts import ACCENT, CONTROLLERS, WARN, Chart, axis, counted, figure
-from app.platform.web.numbers import stated
+from app.platform.numbers import counted, stated
+from app.platform.web.charts import ACCENT, CONTROLLERS, WARN, Chart, axis, figure
 from app.study import blinding
 from app.study import repository as study_repository
 from app.tables.learning import BufferSnapshot

@@ -19,7 +19,8 @@ from app.learning.policies import read_limited
 from app.learning.schemas import ALGORITHM_NAMES, PolicyChange, PolicyLabel, PolicyName, PolicyOut
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
-from app.platform.web.charts import ACCENT, Chart, axis, counted, figure
+from app.platform.numbers import counted
+from app.platform.web.charts import ACCENT, Chart, axis, figure
 from app.platform.web.forms import field_notes, parse
 from app.platform.web.schemas import Page, PagingQuery, problems
 from app.platform.web.templates import render

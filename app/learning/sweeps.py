@@ -14,7 +14,8 @@ from app.learning.policies import free_name
 from app.learning.training_configs import CLONE, policy_file, training_file
 from app.platform import files
 from app.platform.jobs.service import code_version
-from app.platform.web.charts import Chart, axis, counted, figure
+from app.platform.numbers import counted
+from app.platform.web.charts import Chart, axis, figure
 from app.study import repository as study_repository
 from app.tables.learning import BufferSnapshot, Policy, Sweep
 from ml.ope import surest

@@ -12,8 +12,8 @@ from markupsafe import Markup
 
 from app.learning.schemas import ALGORITHM_NAMES
 from app.learning.sweeps import Candidate, held_near
-from app.platform.web.charts import Cell, counted
-from app.platform.web.numbers import stated
+from app.platform.numbers import counted, stated
+from app.platform.web.charts import Cell
 from app.platform.web.svg import Plane, apart, drawing
 
 W, H, TOP, BOTTOM, LEFT, RIGHT = 1120.0, 400.0, 66.0, 26.0, 96.0, 118.0

@@ -34,8 +34,8 @@ from app.platform.database import Db
 from app.platform.errors import NotFound
 from app.platform.jobs import registry
 from app.platform.kept import kept
+from app.platform.numbers import when
 from app.platform.web.charts import Chart
-from app.platform.web.numbers import when
 from app.platform.web.schemas import PagingQuery, Text
 from app.platform.web.templates import Part, make_part, render
 from app.settings import get_settings

@@ -17,8 +17,8 @@ from app.overview.samples import MEDIA_TYPES, SampleFormat, session_samples
 from app.overview.signals import Signals, SignalWindow, signals_of
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
+from app.platform.numbers import hover, number
 from app.platform.web.charts import ACCENT, Cell, axis, figure, written
-from app.platform.web.numbers import hover, number
 from app.platform.web.png import colour_scale, picture
 from app.platform.web.schemas import Model, problems
 from app.platform.web.svg import Plane, drawing

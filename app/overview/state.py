@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.overview import repository
 from app.planning.slots import repository as slots
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 from app.tables.jobs import Job
 from app.tables.participants import Participant
 

@@ -10,8 +10,8 @@ from typing import Any
 
 from app.analysis.evidence import Evidence
 from app.analysis.facts import Facts
-from app.platform.web.charts import ACCENT, GRID, MUTED, SYMBOLS, TEXT, WARN, Cell, Chart, Link, colour, counted, figure, marker
-from app.platform.web.numbers import hover
+from app.platform.numbers import counted, hover
+from app.platform.web.charts import ACCENT, GRID, MUTED, SYMBOLS, TEXT, WARN, Cell, Chart, Link, colour, figure, marker
 from app.study.blinding import CONTROLLER_NAMES
 from app.tables.participants import SettingsVersion
 from app.tables.visits import Visit

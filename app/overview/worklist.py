@@ -13,7 +13,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.overview import repository
 from app.overview.repository import VisitCounts
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 from app.tables.data_queries import QueryState
 from app.tables.participants import Participant
 from app.tables.visits import Visit

@@ -6,7 +6,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-from app.platform.web.charts import MUTED, Chart, axis, counted, figure
+from app.platform.numbers import counted
+from app.platform.web.charts import MUTED, Chart, axis, figure
 from app.tables.jobs import Job, JobEvent
 
 PALETTE = ("token:rl", "token:distilled", "token:random", "token:cdbs", "token:no_dbs", "token:other", "token:accent", "token:warn")

@@ -24,7 +24,7 @@ from app.platform.jobs import registry
 from app.platform.jobs import repository as jobs
 from app.platform.jobs import service as job_service
 from app.platform.jobs.titles import failure, numbered
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.schemas import PagingQuery
 from app.platform.web.templates import render

@@ -14,8 +14,7 @@ from app.planning.slots.matching import Deviation
 from app.planning.visit_day.record import ASKED, ASKED_BY_KIND, AskedOutcome, Contradiction, Entry, moment
 from app.planning.visit_day.schemas import SlotOut
 from app.planning.visit_day.screening import Found
-from app.platform.web.charts import counted
-from app.platform.web.numbers import stated
+from app.platform.numbers import counted, stated
 from app.study.blinding import CONTROLLER_NAMES
 from app.tables.adverse_events import AdverseEvent
 from app.tables.plans import Plan, PlanItem

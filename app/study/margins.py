@@ -12,11 +12,10 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts import sign_on
 from app.accounts.permissions import Caller
+from app.platform.audit import signatures
+from app.platform.audit.signatures import SignatureOut, SignatureState, Signing, state_of
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
-from app.platform.signatures import repository as signatures
-from app.platform.signatures.schemas import SignatureOut, Signing
-from app.platform.signatures.service import SignatureState, state_of
 from app.platform.web.schemas import Int, Model, Number, Text
 from app.study import access
 from app.study.outcomes.fields import StatedMargins

@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, StringConstraints, field_validator
 from pydantic_core import PydanticCustomError
 
-from app.platform.signatures.schemas import SignatureOut, Signing
-from app.platform.signatures.service import SignatureState
+from app.platform.audit.signatures import SignatureOut, SignatureState, Signing
 from app.platform.web.schemas import Bool, Day, Int, Model, Number, Text
 from app.study.outcomes.fields import SURE, DerivedField, EnteredOutcomes, OutcomeField, StoredOutcomes
 from app.study.settings_types import CDBS_MA, SettingsOut

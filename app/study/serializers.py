@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.platform.signatures.schemas import SignatureOut
+from app.platform.audit.signatures import SignatureOut
 from app.study import blinding
 from app.study.doses import hours_since_dose
 from app.study.outcomes import service as outcomes

@@ -14,7 +14,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
-from app.platform.web.numbers import number
+from app.platform.numbers import number
 from app.study import blinding, repository
 from app.study.access import require
 from app.study.outcomes import values as values_rules

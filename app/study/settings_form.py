@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Any, Generic, TypeVar
 
 from app.platform.errors import Conflict
-from app.platform.web.numbers import typed
+from app.platform.numbers import typed
 from ml.formats import SOURCE_NAMES
 from ml.outcomes import END_WEIGHTS
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
-from app.platform.web.numbers import stated
+from app.platform.numbers import stated
 from app.study import cdbs_amplitude, repository
 from app.tables.participants import SettingsVersion
 from app.tables.recordings import Recording, Trace

@@ -16,10 +16,10 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts import sign_on
 from app.accounts.permissions import SYSTEM, Caller
+from app.platform.audit import signatures
+from app.platform.audit.signatures import SignatureState, content_hash, state_of
 from app.platform.database import now, set_reason
 from app.platform.errors import BetaloopError, Conflict, Invalid
-from app.platform.signatures import repository as signatures
-from app.platform.signatures.service import SignatureState, content_hash, state_of
 from app.platform.web.forms import field_notes
 from app.platform.web.templates import render
 from app.study import repository

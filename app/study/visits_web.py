@@ -15,8 +15,8 @@ from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Invalid
+from app.platform.numbers import typed
 from app.platform.web.forms import FormValues, confirmed, field_notes, parse
-from app.platform.web.numbers import typed
 from app.platform.web.templates import Part, make_part, render
 from app.settings import get_settings
 from app.study import access, cdbs_amplitude, repository

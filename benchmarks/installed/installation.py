@@ -39,7 +39,7 @@ import json, sys
 from app.accounts import service
 from app.tables.accounts import Role
 from app.platform.database import transaction
-from app.platform.migrate import migrate
+from app.platform.upkeep.migrate import migrate
 migrate()
 people, password = json.loads(sys.argv[1])
 with transaction("measurement") as db:

@@ -51,7 +51,7 @@ FAULTS = [
          f"{DOCTOR}::test_the_exit_code_is_1_and_the_lines_say_what_is_wrong"),
     ),
     *_of(
-        "platform/database",
+        "platform/database/__init__",
         ("an answer stands whose database goes away", "        if passing(error) is None:\n            raise\n        log.warning",
          "        raise\n        log.warning", f"{HEALING}::test_an_answer_stands_whose_database_goes_away_after_it_was_made"),
     ),

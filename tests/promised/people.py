@@ -154,12 +154,12 @@ PEOPLE: list[Promise] = [
          "tests/app/platform/embedded/test_first_start.py::test_a_damaged_secret_is_refused_and_never_used"),
     ),
     *of(
-        "platform/database",
+        "platform/database/__init__",
         ("logs hold no values", "hide_parameters=True", "hide_parameters=False",
          f"{SIGN_IN}::test_a_server_error_has_every_header_and_logs_no_values"),
     ),
     *of(
-        "platform/database",
+        "platform/database/__init__",
         ("a database that was killed comes back", "            if server.heal():\n", "            if False:\n",
          f"{HEALING}::test_a_service_whose_database_was_killed_heals_by_itself"),
         at_start=True,
@@ -170,7 +170,7 @@ PEOPLE: list[Promise] = [
          f"{HEADERS}::test_a_wrong_method_is_told_every_right_one"),
     ),
     *of(
-        "platform/web/body_limit",
+        "platform/web/request_bodies",
         ("a large document is not read", "        if (self._stated or 0) > self._limit:\n", "        if False:\n",
          f"{BODIES}::test_a_large_document_is_refused_before_it_is_read"),
         ("files are counted for who sends them", "        if wait_s := sent.take(source, size):\n", "        if wait_s := 0:\n",

@@ -79,7 +79,7 @@ RECORDS = [
          f"{REFUSALS}::test_a_wrong_password_at_a_signature_is_in_the_trail"),
     ),
     *_of(
-        "platform/signatures/service",
+        "platform/audit/signatures",
         ("signatures are bound to the trail", " and _as_recorded(signature)", "",
          f"{MARGINS}::test_a_signature_that_was_rewritten_with_its_values_does_not_stand"),
     ),

@@ -58,7 +58,7 @@ WIDE: list[Promise] = [
          f"{ROUTES}::test_every_route_against_every_scope"),
     ),
     *of(
-        "platform/database",
+        "platform/database/__init__",
         ("who wrote stands in the trail", '    db.info["actor"] = {"label": label,', '    db.info["actor"] = {"label": "system",',
          "tests/app/study/test_study_api.py::test_every_write_leaves_an_audit_row_that_cannot_be_changed"),
     ),

@@ -11,7 +11,7 @@ from app.evaluation.estimates import dose_shapes
 from app.learning.trajectories import read_buffer
 from app.platform import files
 from app.platform.jobs import StepReport, write_atomically
-from app.platform.web.numbers import number
+from app.platform.numbers import number
 from ml import progress
 from ml.faults import said_of
 from ml.loading import load_libraries

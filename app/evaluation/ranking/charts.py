@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from app.evaluation.schemas import RankedPolicy, RankingOut
-from app.platform.web.charts import Chart, axis, counted, figure
+from app.platform.numbers import counted
+from app.platform.web.charts import Chart, axis, figure
 from ml.ope import shown
 
 

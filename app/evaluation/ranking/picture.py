@@ -10,8 +10,8 @@ from markupsafe import Markup
 
 from app.evaluation.ranking.answer import QUANTITIES, Row, map_of
 from app.evaluation.ranking.assessment import Assessed, Assessment
+from app.platform.numbers import number
 from app.platform.web.charts import Cell, written
-from app.platform.web.numbers import number
 from app.platform.web.svg import Plane, apart, drawing
 from ml.designs import Bound
 from ml.ope import DOSES, BehaviourMap, Estimate, interval, outcome_draws

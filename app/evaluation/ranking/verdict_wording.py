@@ -12,7 +12,7 @@ from app.evaluation.ranking.judged import Judged
 from app.evaluation.ranking.results import RandomSessions
 from app.evaluation.schemas import Standing, TestedBefore
 from app.evaluation.wording import OUTCOME_NAMES, amplitude, chance, count_stops, number, percent, sentence, signed
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 from app.platform.web.templates import render_part
 from app.study.margins import margins_of
 from ml.ope import NEARLY_OFF, Flag

@@ -16,8 +16,8 @@ from app.ingest.proposals.parts import placement_of
 from app.ingest.proposals.service import renew
 from app.ingest.sessions import Placement, StatedSession, add_session
 from app.ingest.uploads import outcomes as outcomes_intake
+from app.platform import numbers
 from app.platform.database import now
-from app.platform.web import numbers
 from app.study import repository as study
 from app.study.sessions import conditions
 from app.study.sessions import usable_steps as usable_steps_rules

@@ -9,7 +9,8 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from app.platform.web.charts import counted, written
+from app.platform.numbers import counted
+from app.platform.web.charts import written
 from app.platform.web.svg import Plane, drawing
 from app.study.sessions.usable_steps import SessionData
 

@@ -1,6 +1,6 @@
 """Uploads are refused by role before their body is read: a form is parsed before any dependency is asked, and may have gigabytes.
 
-What is read then is encrypted on its way (`app.platform.web.encrypted_form`). Meanwhile the process that forks readers starts.
+What is read then is encrypted on its way (`app.platform.web.forms`). Meanwhile the process that forks readers starts.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from app.accounts import permissions as can
 from app.accounts.deps import get_caller
 from app.platform.database import new_session
 from app.platform.jobs.children import limited
-from app.platform.web.encrypted_form import EncryptedForm
+from app.platform.web.forms import EncryptedForm
 
 _bearer = HTTPBearer(auto_error=False)
 

@@ -22,9 +22,9 @@ from app.planning.plans.key import common_limits
 from app.planning.plans.limits import device_limits
 from app.planning.plans.view import read_plan
 from app.planning.releases import service as releases
+from app.platform import numbers
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Conflict, Invalid
-from app.platform.web import numbers
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.settings import get_settings

@@ -31,8 +31,8 @@ from app.planning.plans.view import PlanLine, PlanView, shown, standings_of
 from app.planning.plans.view import read_plan as plan_of
 from app.planning.protocol.session_order import Order
 from app.platform.audit import record
+from app.platform.audit.signatures import SignatureOut
 from app.platform.database import Db, now
-from app.platform.signatures.schemas import SignatureOut
 from app.platform.web.schemas import problems
 from app.study.deps import CurrentVisit, VisitViewed
 from app.tables.plans import Plan

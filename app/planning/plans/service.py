@@ -26,9 +26,9 @@ from app.planning.plans.view import PlanView, medication_due, read_plan, refuse_
 from app.planning.protocol.schedule import Candidate, Rules, require_controls, schedule
 from app.planning.protocol.session_order import Order
 from app.planning.releases import service as releases
+from app.platform.audit.signatures import SignatureState
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
-from app.platform.signatures.service import SignatureState
 from app.study import access
 from app.study.sessions.usable_steps import CONTROLLER_OF_KIND
 from app.tables.evaluations import Evaluation

@@ -9,9 +9,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts import sign_on
 from app.accounts.permissions import Caller
+from app.platform.audit import signatures
+from app.platform.audit.signatures import SignatureState
 from app.platform.errors import Conflict, Forbidden
-from app.platform.signatures import repository, service
-from app.platform.signatures.service import SignatureState
 from app.tables.audit import Signature
 from app.tables.learning import Policy
 from app.tables.plans import Plan, PlanItem
@@ -46,8 +46,8 @@ def signature_of(db: Session, visit: Visit, plan: Plan, policies: Mapping[int, P
     """Whether a plan's signature stands, and the newest one under it, standing or broken."""
     if plan.approved_at is None:
         return SignatureState.NONE, None
-    newest = next(iter(repository.signatures_of(db, KIND, plan.id)), None)
-    return service.state_of(newest, signed_content(visit, plan, policies)), newest
+    newest = next(iter(signatures.signatures_of(db, KIND, plan.id)), None)
+    return signatures.state_of(newest, signed_content(visit, plan, policies)), newest
 
 
 def signed_content(visit: Visit, plan: Plan, policies: Mapping[int, Policy]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from app.planning.plans import repository
 from app.planning.plans.designs import offered
 from app.planning.plans.visits import today
 from app.planning.protocol.schedule import Rules, cdbs_sessions, most_policies, total_minutes
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 from app.study.access import may
 from app.tables.participants import Participant
 from app.tables.visits import Visit

@@ -26,8 +26,8 @@ from app.planning.plans.sign_off import signature_of
 from app.planning.plans.visits import today
 from app.planning.protocol.medication import due_before
 from app.planning.wording import ANSWER_EVENT, happened
+from app.platform.audit.signatures import SignatureState
 from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
-from app.platform.signatures.service import SignatureState
 from app.platform.web.templates import Part, make_part
 from app.study import access
 from app.study.adverse_events import Events

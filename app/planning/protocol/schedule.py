@@ -14,7 +14,7 @@ import numpy as np
 
 from app.planning.protocol.session_order import Order, rounds
 from app.platform.errors import Invalid
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 from app.tables.sessions import Controller
 
 SESSION_MINUTES = (5.0, 20.0)

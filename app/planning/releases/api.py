@@ -11,9 +11,8 @@ from app.accounts.deps import CurrentCaller
 from app.learning.deps import CurrentPolicy
 from app.planning.bundles.service import Limits
 from app.planning.releases import service
+from app.platform.audit.signatures import SignatureOut, SignatureState, Signing
 from app.platform.database import Db
-from app.platform.signatures.schemas import SignatureOut, Signing
-from app.platform.signatures.service import SignatureState
 from app.platform.web.schemas import Model, Number, problems
 from app.tables.learning import Policy
 from app.tables.participants import Hemisphere, Participant

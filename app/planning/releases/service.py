@@ -13,9 +13,9 @@ from app.accounts import sign_on
 from app.accounts.permissions import Caller
 from app.learning.policies import onnx_of
 from app.planning.bundles import service as bundles
+from app.platform.audit import signatures
+from app.platform.audit.signatures import SignatureState, state_of
 from app.platform.errors import Conflict, Forbidden
-from app.platform.signatures import repository as signatures
-from app.platform.signatures.service import SignatureState, state_of
 from app.settings import get_settings
 from app.study import access
 from app.study import repository as study_repository

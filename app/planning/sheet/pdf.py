@@ -17,7 +17,7 @@ from app.planning.plans.view import PlanView, shown
 from app.planning.sheet.cards import WIDTH, draw_cards
 from app.planning.sheet.content import HASH
 from app.planning.sheet.ink import INK, LINE, MUTED, clock, latin, shade
-from app.platform.signatures.service import SignatureState
+from app.platform.audit.signatures import SignatureState
 from app.study.cdbs_amplitude import held_settings
 from app.study.characteristics import MEDICATION, characteristics_words, fields_of
 from app.study.doses import doses_words

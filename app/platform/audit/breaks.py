@@ -1,9 +1,21 @@
-"""Breaks of the trail, of what writes it, and of the rows that it covers; and the sentences about them."""
+"""Breaks of the trail, of what writes it, and of the rows that it covers; and the sentences about them.
+
+A clock that went fast leaves rows with future times. The first row after it was set right is reported for ever, since nothing in the trail
+changes. `betaloop audit accept` records who accepted such a time, when and why; no other kind of break can be accepted.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime
 from enum import StrEnum
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.platform.audit.trail import record
+from app.platform.database import set_reason
+from app.tables.audit import AuditEvent
 
 MOST_BREAKS = 100
 """After so many the rest is not looked for: the trail is broken, and one wants to know where it begins."""
@@ -70,3 +82,33 @@ def sentence(b: Break) -> str:
         BreakKind.ROW_REMOVED: f"{where} is gone, and the trail tells of no deletion: its row {b.event_id} is the last that tells of it",
         BreakKind.ROW_ADDED: f"{where} was put in past the trail, which does not tell of it",
     }[b.kind]
+
+
+# Accepted false times of the trail: `betaloop audit accept` writes a row of the trail, and `verify` separates them from breaks.
+#
+# A clock that went fast leaves rows with future times. The first row after it was set right is named for ever, since nothing in the trail
+# is changed. What was accepted stays listed, with who, when and why; no other kind of break can be accepted.
+
+ACCEPT, ENTITY = "accept", "audit_event"
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """A finding that was looked into, by whom, when and why."""
+
+    found: Break
+    by: str
+    at: datetime
+    reason: str
+
+
+def accept(db: Session, event_id: int, reason: str) -> None:
+    """Record in the trail that a person has looked into the time of one of its rows. The caller commits."""
+    set_reason(db, reason)
+    record(db, ACCEPT, ENTITY, event_id)
+
+
+def acceptances(db: Session) -> dict[int, AuditEvent]:
+    """Find the newest row that accepts each row's time, by the number of the row; none that came before what it accepts."""
+    rows = db.scalars(select(AuditEvent).where(AuditEvent.entity == ENTITY, AuditEvent.action == ACCEPT).order_by(AuditEvent.id))
+    return {int(e.entity_id): e for e in rows if e.entity_id.isdecimal() and e.id > int(e.entity_id)}

@@ -24,12 +24,10 @@ from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from app.platform.audit.accepted import Accepted, acceptances
-from app.platform.audit.breaks import MOST_BREAKS, Break, BreakKind
-from app.platform.audit.guards import what_writes
-from app.platform.audit.rows import past_the_trail
+from app.platform.audit.breaks import MOST_BREAKS, Accepted, Break, BreakKind, acceptances
+from app.platform.audit.guards import past_the_trail, what_writes
+from app.platform.audit.signatures import changed_records
 from app.platform.database import transaction
-from app.platform.signatures.service import changed_records
 from app.settings import get_settings, private_folder
 from app.tables.audit import GENESIS, AuditLink, AuditSeal
 

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from app.platform.audit.accepted import accept
-from app.platform.audit.breaks import BreakKind, sentence
+from app.platform.audit.breaks import BreakKind, accept, sentence
 from app.platform.audit.chain import Verified, seal, verify
 from app.platform.database import new_session, transaction
 from app.platform.terminal import ACTOR, AsJson, Why, bad_call, print_line, show

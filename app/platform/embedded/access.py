@@ -16,7 +16,7 @@ import psycopg
 from psycopg import sql
 from psycopg.conninfo import make_conninfo
 
-from app.platform.embedded.cluster import ADMIN
+from app.platform.embedded.programs import ADMIN
 
 OWNER, SERVICE, DATABASE = "betaloop", "betaloop_service", "betaloop"
 PORT = 5432

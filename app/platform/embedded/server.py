@@ -27,8 +27,7 @@ from psycopg.conninfo import make_conninfo
 
 from app.platform.embedded import place
 from app.platform.embedded.access import DATABASE, OWNER, PORT, SERVICE, Access, Passwords
-from app.platform.embedded.cluster import make_cluster, shared_memory
-from app.platform.embedded.programs import Programs, runnable
+from app.platform.embedded.programs import Programs, make_cluster, runnable, shared_memory
 from app.platform.embedded.system_user import system_user
 from app.settings import get_settings, stored_secret
 

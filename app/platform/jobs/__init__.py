@@ -65,8 +65,7 @@ queries; `stream.job_events` serves server-sent events; `watch.watch(job_id)` fe
 from __future__ import annotations
 
 from app.platform.jobs.children.report import StepReport, write_atomically
-from app.platform.jobs.context import JobContext
-from app.platform.jobs.errors import JobError, StepFailed
+from app.platform.jobs.context import JobContext, JobError, StepFailed
 from app.platform.jobs.registry import JobKind, Priority, register
 
 __all__ = ["JobContext", "JobError", "JobKind", "Priority", "StepFailed", "StepReport", "register", "write_atomically"]

@@ -23,8 +23,7 @@ from app.platform.bucket import StoreAway
 from app.platform.database import now, set_actor, transaction
 from app.platform.jobs import repository
 from app.platform.jobs.children.supervisor import ChildMessages
-from app.platform.jobs.context import StepOutcome
-from app.platform.jobs.errors import JobCancelled
+from app.platform.jobs.context import JobCancelled, StepOutcome
 from app.tables.jobs import Job, JobStatus, JobStep
 
 log = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 from sqlalchemy.orm import Session
 
-from app.platform.jobs.errors import UnknownKind
+from app.platform.jobs.context import UnknownKind
 
 if TYPE_CHECKING:
     from app.platform.jobs.children.report import StepReport

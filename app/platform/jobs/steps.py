@@ -19,10 +19,9 @@ from app.platform.errors import BetaloopError
 from app.platform.jobs import registry, repository, service
 from app.platform.jobs.children.child import ChildLimits
 from app.platform.jobs.children.forked import ForkedProcesses
-from app.platform.jobs.children.slots import Slots
+from app.platform.jobs.children.limited import Slots
 from app.platform.jobs.children.supervisor import ChildProcesses, ComputeCall, take_over
-from app.platform.jobs.context import JobContext, StepOutcome
-from app.platform.jobs.errors import JobCancelled, WorkerStopping
+from app.platform.jobs.context import JobCancelled, JobContext, StepOutcome, WorkerStopping
 from app.platform.jobs.ledger import WAITS_FOR_FILES, Ledger, longer_pauses, pause, persist
 from app.settings import get_settings, private_folder
 from app.tables.jobs import Job, JobStatus

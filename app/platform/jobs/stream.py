@@ -15,7 +15,7 @@ from app.platform.database import new_session, now
 from app.platform.jobs import repository
 from app.platform.jobs.service import describe_event
 from app.platform.jobs.titles import plain_words, reason, state_in_words
-from app.platform.web.numbers import time_left
+from app.platform.numbers import time_left
 from app.tables.jobs import Job, JobEvent, JobStatus
 
 POLL_S = 0.5

@@ -32,7 +32,7 @@ from app.platform.bucket import bucket
 from app.platform.database import get_engine, now, owner_url, transaction
 from app.platform.embedded.programs import wheel_programs
 from app.platform.errors import BetaloopError
-from app.platform.migrate import migrate
+from app.platform.upkeep.migrate import migrate
 from app.platform.upkeep.sealing import CHUNK, KEY_BYTES, SealedReader, SealedWriter
 from app.settings import get_settings, private_folder
 

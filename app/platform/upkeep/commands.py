@@ -9,11 +9,11 @@ import typer
 
 from app.platform.database import database_place, transaction
 from app.platform.jobs.service import take_back
-from app.platform.migrate import migrate as bring_up_to_date
+from app.platform.numbers import counted
 from app.platform.terminal import AsJson, print_line, show
 from app.platform.upkeep import backup as backups
 from app.platform.upkeep.doctor import examine
-from app.platform.web.charts import counted
+from app.platform.upkeep.migrate import migrate as bring_up_to_date
 from app.settings import get_settings
 
 app = typer.Typer(no_args_is_help=True)

@@ -17,9 +17,9 @@ from app.platform.bucket import StoreAway, bucket
 from app.platform.database import new_session, now
 from app.platform.jobs import repository as jobs
 from app.platform.jobs.service import NEWER_WORKER, STALE_S
-from app.platform.migrate import newest_revision, revision
+from app.platform.numbers import counted
 from app.platform.service_role import excess
-from app.platform.web.charts import counted
+from app.platform.upkeep.migrate import newest_revision, revision
 from app.settings import get_settings
 from app.tables import METADATA
 from app.tables.uploads import StoredFile

@@ -166,16 +166,6 @@ def written(text: str) -> str:
     return _SQUARED.sub("\u00b5V\u00b2", _MICRO.sub("\u00b5\\1", text)) if "u" in text else text
 
 
-def counted(number: float, one: str, many: str = "") -> str:
-    """Write a number with its noun.
-
-    Args:
-        number: how many, to six digits. one: the noun of one. many: of several; `one` with an s where it is empty.
-    """
-    shown = f"{number:g}" if isinstance(number, float) else str(number)
-    return f"{shown} {one if shown == '1' else many or one + 's'}"
-
-
 def plain(value: Any) -> Any:
     """Copy a value for JSON: arrays become lists, numpy numbers Python's, what is not finite null; `_DIGITS` significant digits."""
     # numbers and lists of them first: they are nearly all that a figure holds

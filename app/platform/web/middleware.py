@@ -25,11 +25,10 @@ from starlette.routing import compile_path
 
 from app.platform.database import new_session
 from app.platform.errors import BetaloopError, Conflict, DatabaseAway, EntriesOfAnother, Forbidden, StorageFull, Unauthorized, passing
-from app.platform.json_members import UniqueMembers
-from app.platform.migrate import newest_revision, revision
-from app.platform.web.body_limit import BodyLimit, Judge
+from app.platform.upkeep.migrate import newest_revision, revision
 from app.platform.web.compression import Compression
 from app.platform.web.error_pages import ADDRESS_ALONE, advised, input_in_words, kept_entries, send_again_to, writer_of
+from app.platform.web.request_bodies import BodyLimit, Judge, UniqueMembers
 from app.platform.web.templates import render
 from app.settings import get_settings
 

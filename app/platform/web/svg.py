@@ -13,7 +13,7 @@ from html import escape
 
 from markupsafe import Markup
 
-from app.platform.web.numbers import stated
+from app.platform.numbers import stated
 
 LABEL = 12.0
 """Height of a line of text."""

@@ -16,8 +16,8 @@ from markupsafe import Markup
 
 from app.platform.database import now
 from app.platform.jobs.titles import state_in_words
-from app.platform.web.charts import counted, written
-from app.platform.web.numbers import fixed, minutes, number, p_text, place, rate, size, stated, time_left, typed, when, whole
+from app.platform.numbers import counted, fixed, minutes, number, p_text, place, rate, size, stated, time_left, typed, when, whole
+from app.platform.web.charts import written
 from app.settings import get_settings
 from ml.outcomes import ALL, ANY, OUTCOMES, Outcome
 

@@ -24,8 +24,8 @@ from rich.console import Console
 
 from app.platform.database import now
 from app.platform.errors import BetaloopError, Conflict
-from app.platform.migrate import migrate
-from app.platform.start import require_data_folder, require_free
+from app.platform.upkeep.migrate import migrate
+from app.platform.upkeep.start import require_data_folder, require_free
 from app.settings import get_settings, private_folder
 from app.simulation.demo.accounts import add_accounts
 from app.simulation.demo.keeper import ENDED_BY_ITSELF, ENDING, become_keeper, stop

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from app.platform.errors import BetaloopError
-from app.platform.web.numbers import time_left
+from app.platform.numbers import time_left
 
 Step = tuple[str, Callable[[], None]]
 """One thing to do, with the name under which it is written down."""

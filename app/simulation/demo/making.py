@@ -25,7 +25,7 @@ from app.learning.training_configs import POLICY, distillation_config, generatio
 from app.platform import files
 from app.platform.errors import Invalid
 from app.platform.jobs import StepReport
-from app.platform.web.numbers import number
+from app.platform.numbers import number
 from app.settings import get_settings
 from app.simulation.demo.data import DAY_WITH_POLICIES, Generation, LearnedPolicy, RecordedSession, Story, write
 from app.simulation.demo.study import trajectories

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from app.platform.web.charts import ACCENT, BAD, MUTED, TEXT, WARN, Cell, Chart, axis, counted, figure, horizontal
+from app.platform.numbers import counted
+from app.platform.web.charts import ACCENT, BAD, MUTED, TEXT, WARN, Cell, Chart, axis, figure, horizontal
 from app.study.outcomes.values import GraspOutcome, TremorOutcome
 from ml.qoc import PLAUSIBLE_INTERVAL_S, TREMOR_CLASSES
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import Field, create_model, model_validator
 
-from app.platform.web.numbers import stated
+from app.platform.numbers import stated
 from app.platform.web.schemas import Int, Model, Number
 from ml.outcomes import BY_FIELD, OUTCOMES, Outcome
 

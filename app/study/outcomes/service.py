@@ -18,8 +18,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.platform.database import now, set_reason
 from app.platform.errors import Invalid
-from app.platform.web.charts import counted
-from app.platform.web.numbers import stated
+from app.platform.numbers import counted, stated
 from app.study import repository
 from app.study.adverse_events import stops_of_session
 from app.study.outcomes import tremor

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 from app.tables.outcomes import TremorSeries
 from ml.qoc import SAME_TIME_S, TREMOR_CLASSES
 

@@ -13,7 +13,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
-from app.platform.web.numbers import stated
+from app.platform.numbers import stated
 from app.study import repository
 from app.study.outcomes import fields, tremor
 from app.study.outcomes.fields import FAR, USUAL, Question, question

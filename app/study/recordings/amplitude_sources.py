@@ -17,7 +17,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
-from app.platform.web.numbers import stated
+from app.platform.numbers import stated
 from app.platform.web.schemas import Model, Text
 from app.study import blinding
 from app.study.access import require

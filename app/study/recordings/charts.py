@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.platform.numbers import hover
 from app.platform.web.charts import Cell, Chart, axis, figure
-from app.platform.web.numbers import hover
 from app.study.recordings.facts import clock_fit
 from app.study.traces import unpack
 from app.tables.recordings import Recording, Trace

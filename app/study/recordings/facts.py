@@ -12,7 +12,7 @@ from pydantic import Field
 from sqlalchemy import select
 from sqlalchemy.orm import Session, joinedload
 
-from app.platform.web.numbers import stated
+from app.platform.numbers import stated
 from app.platform.web.schemas import Model
 from app.tables.recordings import Recording
 from app.tables.sessions import StudySession

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from app.platform.numbers import hover, stated
 from app.platform.web.charts import Cell, Chart, axis, figure
-from app.platform.web.numbers import hover, stated
 from app.study.recordings.history import History, Spectrum, Trend
 
 SIDES = {"left": "token:cdbs", "right": "token:rl"}

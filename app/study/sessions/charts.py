@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.platform.web.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, counted, figure, horizontal
-from app.platform.web.numbers import hover, number, stated
+from app.platform.numbers import counted, hover, number, stated
+from app.platform.web.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, figure, horizontal
 from app.study.recordings.charts import TIME
 from app.study.sessions.usable_steps import SessionData
 from app.study.traces import amplitude_program, session_offset_s

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from app.platform.web.numbers import stated
+from app.platform.numbers import stated
 from app.study.sessions.contradictions import Contradiction, Kind
 from app.study.sessions.designs import Drawn
 from app.tables.sessions import Activity, Controller

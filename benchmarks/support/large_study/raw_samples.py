@@ -18,7 +18,7 @@ from app.accounts import service as accounts
 from app.accounts.permissions import SYSTEM
 from app.main import create_app
 from app.platform.database import transaction
-from app.platform.migrate import migrate
+from app.platform.upkeep.migrate import migrate
 from app.settings import get_settings
 from app.study.participation import ParticipantIn, enrol
 from app.tables.accounts import Role

@@ -18,7 +18,7 @@ from app.accounts.deps import COOKIE, caller_now
 from app.accounts.permissions import PERMISSIONS, READ_ARMS, SCOPES, Caller, Grant
 from app.platform.database import now
 from app.platform.errors import Forbidden, Invalid, TooMany
-from app.platform.web.numbers import when
+from app.platform.numbers import when
 from app.tables.accounts import Role, Scope, User
 from tests.conftest import PASSWORD
 

@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from rich.console import Console
 
 from app.platform.database import now, transaction
-from app.platform.web.numbers import minutes_left, time_left
+from app.platform.numbers import minutes_left, time_left
 from app.simulation.demo import command, loader
 from app.tables.jobs import Job, JobStatus
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from fastapi.testclient import TestClient
 
-from app.platform.json_members import doubled_member
+from app.platform.web.request_bodies import doubled_member
 
 JSON = {"Content-Type": "application/json"}
 

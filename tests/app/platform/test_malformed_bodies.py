@@ -9,7 +9,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-import app.platform.json_members as json_members
+from app.platform.web import request_bodies as json_members
 from tests.app.every_route import World
 
 JSON, FILES, FORM = "application/json", "multipart/form-data", "application/x-www-form-urlencoded"

@@ -16,7 +16,7 @@ from sqlalchemy import Connection, text
 from sqlalchemy.orm import Session
 
 from app.platform.audit import AUDITED
-from app.platform.migrate import migrate
+from app.platform.upkeep.migrate import migrate
 from app.tables import METADATA
 
 ROOT = Path(__file__).resolve().parents[3]

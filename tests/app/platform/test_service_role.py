@@ -13,8 +13,8 @@ from app.platform import service_role
 from app.platform.audit import AUDITED
 from app.platform.audit.chain import verify
 from app.platform.database import new_session, owner_url
-from app.platform.migrate import migrate
 from app.platform.upkeep.doctor import examine
+from app.platform.upkeep.migrate import migrate
 from app.settings import get_settings
 
 FORGED = "insert into audit_event (actor, action, entity, entity_id) values ('ada@clinic.example', 'update', 'qoc', '1')"

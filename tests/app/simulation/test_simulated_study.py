@@ -18,9 +18,9 @@ from sqlalchemy import func, select
 from app.accounts.permissions import SYSTEM
 from app.analysis.pooled import trial_time
 from app.evaluation.ranking.results import driven_sessions, results_by_policy
+from app.platform.audit.signatures import signatures_of
 from app.platform.database import new_session
 from app.platform.errors import Conflict
-from app.platform.signatures.repository import signatures_of
 from app.settings import get_settings
 from app.simulation.design import STATE_FILE, design
 from app.simulation.run import ACCOUNT, SIGNER, simulate

@@ -8,9 +8,8 @@ from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
 from app.platform.audit.chain import verify
+from app.platform.audit.signatures import content_hash, covers, newest_of_each
 from app.platform.database import new_session
-from app.platform.signatures.repository import newest_of_each
-from app.platform.signatures.service import content_hash, covers
 from app.tables.audit import Signature
 from tests.conftest import PASSWORD
 

@@ -28,7 +28,7 @@ from typing import Any, Literal
 
 from app.platform.errors import FULL, BetaloopError
 from app.platform.jobs.children.report import StepReport, pipe_sender, write_atomically
-from app.platform.jobs.errors import JobError
+from app.platform.jobs.context import JobError
 from app.platform.jobs.registry import load_compute
 
 REPORT_FD = "BETALOOP_REPORT_FD"

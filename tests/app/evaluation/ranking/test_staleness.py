@@ -13,7 +13,7 @@ from app.accounts.permissions import SYSTEM
 from app.evaluation import repository, wording
 from app.evaluation.ranking.staleness import stale_reasons
 from app.learning.gate import decide
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 from app.study.repository import participant_by_code, sessions_of_participant
 from app.tables.learning import GateChoice
 from app.tables.participants import Hemisphere

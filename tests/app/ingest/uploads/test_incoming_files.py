@@ -17,7 +17,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from app.platform import files, raw_bytes
-from app.platform.web import encrypted_form
+from app.platform.web import forms
 from app.settings import get_settings
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -169,7 +169,7 @@ def test_any_place_of_raw_bytes_is_read_and_written_as_in_a_plain_file(fresh_dat
 
 FORM = """
 import asyncio, sys
-from app.platform.web.encrypted_form import EncryptedForm
+from app.platform.web.forms import EncryptedForm
 
 head = b'--b\\r\\nContent-Disposition: form-data; name="file"; filename="t.csv"\\r\\nContent-Type: text/csv\\r\\n\\r\\n'
 chunks = iter([head, *([b"NAME-OF-THE-PATIENT," * 3000] * 50)])
@@ -199,7 +199,7 @@ def test_the_routes_of_uploads_read_their_forms_encrypted(
     client: TestClient, participant_code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[object] = []
-    monkeypatch.setattr(encrypted_form, "raw_stream", lambda: made.append(raw := raw_bytes.raw_stream()) or raw)
+    monkeypatch.setattr(forms, "raw_stream", lambda: made.append(raw := raw_bytes.raw_stream()) or raw)
     for path in ("/api/v1/uploads", f"/participants/{participant_code}/upload"):
         table = b"t_s,beta,amplitude_fraction\n" + b"".join(b"%d,1,1\n" % (2 * k) for k in range(20 + len(made)))
         fields = {"participant": participant_code, "visit": "1", "controller": "cdbs"}
@@ -209,7 +209,7 @@ def test_the_routes_of_uploads_read_their_forms_encrypted(
 
 def test_a_disk_that_fills_while_a_form_comes_is_named(client: TestClient, participant_code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     full = lambda: raw_bytes._stream(open("/dev/full", "r+b", buffering=0), bytes(32))  # noqa: E731, SIM115 - its reader closes it
-    monkeypatch.setattr(encrypted_form, "raw_stream", full)
+    monkeypatch.setattr(forms, "raw_stream", full)
     for path in ("/api/v1/uploads", f"/participants/{participant_code}/upload"):
         fields = {"participant": participant_code, "visit": "1", "controller": "cdbs"}
         answer = client.post(path, data=fields, files={"file": ("t.csv", b"1" * (1 << 20))}, headers={"accept": "text/html"})

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from app import cli
 from app.platform.audit.breaks import BreakKind
 from app.platform.audit.chain import verify
+from app.platform.audit.signatures import content_hash
 from app.platform.database import new_session
-from app.platform.signatures.service import content_hash
 from app.tables.audit import AuditEvent
 from tests.app.every_route import World
 from tests.conftest import PASSWORD

@@ -15,8 +15,8 @@ from app.platform import files
 from app.platform.database import get_engine
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.embedded.system_user import system_user
-from app.platform.migrate import migrate
 from app.platform.service_role import excess
+from app.platform.upkeep.migrate import migrate
 from app.settings import get_settings
 from tests.system_users import require_root
 

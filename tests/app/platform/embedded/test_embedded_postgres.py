@@ -13,8 +13,7 @@ import psutil
 import psycopg
 import pytest
 
-from app.platform.embedded.cluster import make_cluster
-from app.platform.embedded.programs import Programs
+from app.platform.embedded.programs import Programs, make_cluster
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.embedded.system_user import SystemUser
 from app.settings import get_settings

@@ -19,7 +19,7 @@ from sqlalchemy.orm import Session
 from app.platform import files
 from app.platform.jobs import JobContext, JobError, JobKind, StepReport, register, write_atomically
 from app.platform.jobs.worker import Pace, run_worker
-from app.platform.start import Watchdog
+from app.platform.upkeep.start import Watchdog
 from app.platform.web.schemas import Text
 
 PREPARED: list[int] = []

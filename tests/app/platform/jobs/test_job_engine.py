@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.database import get_engine, new_session, transaction
 from app.platform.jobs import engine, registry
-from app.platform.jobs.errors import WorkerStopping
+from app.platform.jobs.context import WorkerStopping
 
 
 @pytest.fixture

@@ -17,9 +17,9 @@ from app.platform import files
 from app.platform.database import new_session, transaction
 from app.platform.errors import NotFound
 from app.platform.jobs import JobContext, StepFailed, StepReport, registry, repository, stream, write_atomically
-from app.platform.jobs.children.slots import Slots
+from app.platform.jobs.children.limited import Slots
 from app.platform.jobs.children.supervisor import ChildMessages
-from app.platform.jobs.errors import JobCancelled
+from app.platform.jobs.context import JobCancelled
 from app.platform.jobs.ledger import Ledger
 from app.platform.jobs.steps import JobRunner
 from app.platform.jobs.stream import job_events

@@ -14,7 +14,7 @@ from app.platform.database import new_session, transaction
 from app.platform.errors import Conflict, Invalid
 from app.platform.jobs import repository, service
 from app.platform.jobs.children.forked import MODULE as FORKING
-from app.platform.jobs.errors import UnknownKind
+from app.platform.jobs.context import UnknownKind
 
 
 def test_a_job_runs_in_children_stores_once_tells_its_story_and_names_its_submitter(jobs):

@@ -23,10 +23,10 @@ from app.platform.database import transaction
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.embedded.system_user import system_user
 from app.platform.files import path_of
-from app.platform.migrate import newest_revision
 from app.platform.upkeep import backup as backups
 from app.platform.upkeep.backup import BackupError
 from app.platform.upkeep.doctor import examine
+from app.platform.upkeep.migrate import newest_revision
 from app.platform.upkeep.sealing import SealedReader
 from app.settings import get_settings
 

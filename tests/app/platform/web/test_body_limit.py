@@ -10,7 +10,7 @@ import pytest
 from fastapi.testclient import TestClient
 from structlog.testing import capture_logs
 
-from app.platform.web.body_limit import PLAIN_LIMIT
+from app.platform.web.request_bodies import PLAIN_LIMIT
 
 
 @pytest.mark.parametrize("content_type", ["application/json", "application/x-www-form-urlencoded", ""])

@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from app.platform.errors import Invalid
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 from app.platform.web.forms import parse
 from app.study.participation import ParticipantIn
 from app.study.schemas import QocIn

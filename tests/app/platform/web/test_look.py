@@ -7,8 +7,8 @@ from pathlib import Path
 
 from app.analysis.biomarker_web import SCALE
 from app.analysis.figures import COLOURS
+from app.platform.numbers import fixed, hover, number, place, rate, stated, typed, whole
 from app.platform.web.charts import figure, written
-from app.platform.web.numbers import fixed, hover, number, place, rate, stated, typed, whole
 
 ROOT = Path(__file__).parents[4]
 STATIC = ROOT / "static"
@@ -16,7 +16,7 @@ OWN_FORMAT = re.compile(r"(?<!\{)%[-+0]*\d*(?:\.\d+)?[gfeGE]\b|\|\s*round\b")
 """A number that a template formats by itself: `"%.3g"|format(x)`, `x|round`."""
 
 OWN_DIGITS = re.compile(r":[-+,z]*\.\d+[geE]\}")
-OWN_PLACES = ("app/platform/web/numbers.py", "app/tablet/", "app/analysis/calibration_web.py")
+OWN_PLACES = ("app/platform/numbers.py", "app/tablet/", "app/analysis/calibration_web.py")
 """Where a format of digits stands: the one place of the pages, what the tablet writes to its wire and terminal, and a file of data."""
 ROUNDED = 'float(f"'
 """How a line begins to round numbers that stay numbers."""
@@ -44,7 +44,7 @@ def test_numbers_are_formatted_in_one_place() -> None:
             if ROUNDED not in line and (hit := OWN_DIGITS.findall(line))
         }
     assert OWN_DIGITS.findall('f"{a:.3g} {b:,.2e}"') == [":.3g}", ":,.2e}"]
-    assert found == {}, "use number, fixed, stated, whole, typed, place or hover of app.platform.web.numbers"
+    assert found == {}, "use number, fixed, stated, whole, typed, place or hover of app.platform.numbers"
     assert OWN_FORMAT.findall('{{ "%g"|format(x) }} {{ "%.3g mA"|format(x) }} {{ x|round|int }} {% for %} {{ "%d"|format(3) }} 4 %') == [
         "%g", "%.3g", "|round",
     ]  # fmt: skip

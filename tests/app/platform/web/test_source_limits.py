@@ -13,7 +13,7 @@ import pytest
 import uvicorn
 from fastapi.testclient import TestClient
 
-from app.platform.sources import MOST_SOURCES, Allowance, in_words
+from app.platform.web.sources import MOST_SOURCES, Allowance, in_words
 from app.settings import get_settings
 from tests.app.every_route import TABLE
 from tests.conftest import PASSWORD

@@ -12,7 +12,7 @@ from sqlalchemy import create_engine
 from sqlalchemy.exc import OperationalError, ProgrammingError
 
 from app.platform.errors import Conflict
-from app.platform.start import in_one_line, require_data_folder, require_free
+from app.platform.upkeep.start import in_one_line, require_data_folder, require_free
 from app.settings import Settings, get_settings
 from tests.ports import free_port
 

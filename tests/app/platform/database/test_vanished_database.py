@@ -17,7 +17,7 @@ from sqlalchemy import create_engine, make_url, text
 from sqlalchemy.exc import OperationalError
 
 from app.platform import database
-from app.platform.connection import connection_url
+from app.platform.database.connection import connection_url
 from app.platform.jobs.ledger import persist
 from app.settings import get_settings
 from tests.network import FORWARD

@@ -7,7 +7,7 @@ from sqlalchemy import make_url
 from sqlalchemy.exc import OperationalError
 
 from app.platform import database
-from app.platform.connection import NOTICED, connection_url
+from app.platform.database.connection import NOTICED, connection_url
 from app.platform.errors import DatabaseAway, passing
 from app.platform.jobs.ledger import _worth_repeating
 from app.settings import Settings

@@ -20,7 +20,7 @@ from app.platform.database import database_url, get_engine, owner_url
 from app.platform.files import close_to_others
 from app.platform.jobs import engine as jobs_engine
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 _LOCK = 0x62657461  # any number that only this project uses
 
 

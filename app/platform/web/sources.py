@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from fastapi import Request
 
-from app.platform.web.charts import counted
+from app.platform.numbers import counted
 
 MOST_SOURCES = 10_000
 """Sources that are remembered; beyond them those that have asked for the least are forgotten."""

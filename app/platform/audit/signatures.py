@@ -1,19 +1,66 @@
-"""Rules of signatures: what is hashed, and whether a signature is still valid. The caller commits."""
+"""Electronic signatures: who signed what, when, with which meaning. `app.accounts.sign_on.sign` asks for the password and makes one."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
+from pydantic import Field
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.platform.signatures import repository
+from app.platform.web.schemas import Model, Text
 from app.tables.audit import Signature
+
+# Every query of signatures.
+
+
+def signatures_of(db: Session, kind: str, subject_id: int) -> Sequence[Signature]:
+    """List every signature under one thing, newest first."""
+    mine = (Signature.subject_kind == kind) & (Signature.subject_id == subject_id)
+    return db.scalars(select(Signature).where(mine).order_by(Signature.id.desc())).all()
+
+
+def newest_of_each(db: Session, kind: str, subject_ids: Collection[int]) -> dict[int, Signature]:
+    """Find the newest signature under each of several things of a kind; unsigned ones are omitted."""
+    if not subject_ids:
+        return {}
+    mine = (Signature.subject_kind == kind) & Signature.subject_id.in_(subject_ids)
+    return {row.subject_id: row for row in db.scalars(select(Signature).where(mine).order_by(Signature.id))}
+
+
+def contents(db: Session) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    """Yield number, hash and content of every signature."""
+    rows = db.execute(select(Signature.id, Signature.sha256, Signature.content).order_by(Signature.id).execution_options(yield_per=100))
+    for row in rows:
+        yield row[0], row[1], row[2]
+
+
+# API types of signatures, of whatever is signed.
+
+
+class Signing(Model):
+    """Credentials of a signer, who proves their identity again."""
+
+    password: Text = Field(max_length=1000, description="The signer's own, asked for again.")
+    code: Text = Field("", max_length=40, description="Of the signer's second factor, or a recovery code; empty where there is none.")
+
+
+class SignatureOut(Model):
+    """Signature: its signer, time and meaning."""
+
+    signer: str
+    signed_at: datetime
+    meaning: str
+    sha256: str = Field(description="Of the canonical JSON of all that was signed.")
+
+
+# Rules of signatures: what is hashed, and whether a signature is still valid. The caller commits.
 
 _EXACT = 2**53
 _RECORDED = ("id", "subject_kind", "subject_id", "meaning", "sha256", "signed_by", "signer")
@@ -73,7 +120,7 @@ def covers(signature: Signature, content: Mapping[str, Any]) -> bool:
 
 def changed_records(db: Session) -> list[int]:
     """List the numbers of the signatures whose content is not what was signed. The audit trail covers their other columns."""
-    return [number for number, sha256, content in repository.contents(db) if content_hash(content) != sha256]
+    return [number for number, sha256, content in contents(db) if content_hash(content) != sha256]
 
 
 def _as_recorded(signature: Signature) -> bool:

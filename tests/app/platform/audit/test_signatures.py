@@ -12,9 +12,8 @@ from sqlalchemy.orm import Session
 from app.accounts import service as accounts
 from app.accounts.permissions import SYSTEM, Caller
 from app.accounts.sign_on import sign
+from app.platform.audit.signatures import content_hash, covers, signatures_of
 from app.platform.errors import Forbidden, TooMany
-from app.platform.signatures.repository import signatures_of
-from app.platform.signatures.service import content_hash, covers
 from app.tables.accounts import Role, SignInAttempt
 from app.tables.audit import AuditEvent, Signature
 

@@ -18,7 +18,7 @@ from sqlalchemy.exc import DBAPIError, ProgrammingError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import DeclarativeBase, ORMExecuteState, Session, SessionTransaction
 
-from app.platform.connection import NOTICED, connection_url
+from app.platform.database.connection import NOTICED, connection_url
 from app.platform.embedded import place
 from app.platform.embedded.server import EmbeddedPostgres
 from app.platform.errors import passing

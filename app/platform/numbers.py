@@ -117,3 +117,13 @@ def when(value: datetime | date | None) -> str:
     if value is None:
         return "—"
     return value.strftime("%Y-%m-%d %H:%M UTC") if isinstance(value, datetime) else value.isoformat()
+
+
+def counted(number: float, one: str, many: str = "") -> str:
+    """Write a number with its noun.
+
+    Args:
+        number: how many, to six digits. one: the noun of one. many: of several; `one` with an s where it is empty.
+    """
+    shown = f"{number:g}" if isinstance(number, float) else str(number)
+    return f"{shown} {one if shown == '1' else many or one + 's'}"
