@@ -2,7 +2,7 @@
 
     python benchmarks/recordings.py [--files 500] [--quick]
 
-The files are those of `tests/ml/formats/peers`: written by another library or by the specification, with known samples, bursts, gaps and
+The files are those of `tests/ml/formats/peers`, written by another library or by the specification, with known samples, bursts, gaps and
 steps. Nothing may be wrong, at least 95 % of what a perfect reader could use must be usable. A large file is then read by the format's
 reader and by the library alone, each in a process of its own. CPU is in seconds; memory is the peak above that of the imports.
 """
@@ -45,11 +45,19 @@ def work():
 work()
 """
 READERS = {
+    "bids": (
+        "from ml.formats.archive import ZipFiles\nfrom ml.formats.bids.read import find_runs, read_run\nfrom ml.formats.options import "
+        "ArchiveLimits\ndef reader(path, report):\n    with ZipFiles(path, ArchiveLimits()) as files:\n"
+        "        return read_run(files, find_runs(files)[0][0], report)",
+        "import edfio, io, zipfile",
+        "z = zipfile.ZipFile(path)\nraw = z.read(next(n for n in z.namelist() if '.edf' in n))\n"
+        "x = [s.data for s in edfio.read_edf(io.BytesIO(raw)).signals]",
+    ),
     "edf": ("from ml.formats.edf.read import read_edf as reader", "import edfio", "x = [s.data for s in edfio.read_edf(path).signals]"),
     "nwb": (
         "from ml.formats.nwb.read import read_nwb as reader\nimport h5py",
         "import pynwb",
-        "x = [s.data[:] for s in pynwb.NWBHDF5IO(str(path), 'r').read().acquisition.values()]",
+        "x = [s.get_data_in_units() for s in pynwb.NWBHDF5IO(str(path), 'r').read().acquisition.values()]",
     ),
     "xdf": ("from ml.formats.xdf.read import read_xdf as reader\nimport pyxdf", "import pyxdf", "x = pyxdf.load_xdf(str(path))"),
 }

@@ -119,6 +119,14 @@ DEVICES = (
         magic=(b"\x89HDF\r\n\x1a\n",),
     ),
     DeviceFormat(
+        kind="bids",
+        device="BIDS",
+        file="BIDS folder",
+        upload="a zipped BIDS folder (iEEG) of one participant",
+        package="ml.formats.bids",
+        sources={},
+    ),
+    DeviceFormat(
         kind="brainvision",
         device="BrainVision",
         file="BrainVision recording",

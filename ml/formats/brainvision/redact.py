@@ -7,8 +7,8 @@ import shutil
 import zipfile
 from pathlib import Path
 
-from ml.formats.archive import ZipFiles, told
-from ml.formats.brainvision.files import Head, Marker, find_parts, read_head, read_markers, read_text
+from ml.formats.archive import Files, ZipFiles, told
+from ml.formats.brainvision.files import Head, Marker, Parts, find_parts, read_head, read_markers, read_text
 from ml.formats.labs.marks import clean_text
 from ml.formats.labs.names import clean_label, clean_unit
 from ml.formats.options import ArchiveLimits
@@ -35,25 +35,31 @@ def redact_brainvision(source: Source, target: Path, key: bytes, limits: Archive
             raise UndecodableFile("no BrainVision recording in here", "archive", "Zip its three files and upload that.")
         texts = []
         for part in parts:
-            head = read_head(read_text(files, part.header))
-            markers = read_markers(read_text(files, part.markers)) if part.markers else None
-            texts.append((_header(head, markers is not None, done), None if markers is None else _markers(markers, done)))
+            texts.append(clean_texts(files, part, done))
         used = {name for p in parts for name in (p.header, p.samples, p.markers)}
         others = [n for n in files.names() if n not in used]
         done.ignored += told(files.left_out) + ([f"{len(others)} other files of the archive"] if others else [])
         with zipfile.ZipFile(target, "w") as archive:
             for number, (part, (header, text)) in enumerate(zip(parts, texts, strict=True), start=1):
                 base = f"recording-{number}"
-                archive.writestr(_info(f"{base}.vhdr"), header.format(base=base))
+                archive.writestr(archive_entry(f"{base}.vhdr"), header.format(base=base))
                 if text is not None:
-                    archive.writestr(_info(f"{base}.vmrk"), text.format(base=base))
-                with files.open(part.samples) as stream, archive.open(_info(f"{base}.eeg"), "w", force_zip64=True) as sink:
+                    archive.writestr(archive_entry(f"{base}.vmrk"), text.format(base=base))
+                with files.open(part.samples) as stream, archive.open(archive_entry(f"{base}.eeg"), "w", force_zip64=True) as sink:
                     shutil.copyfileobj(stream, sink, 1 << 20)
     done.removed.append("names and paths of files, comments, impedances and settings of the amplifier")
     return done
 
 
-def _info(name: str) -> zipfile.ZipInfo:
+def clean_texts(files: Files, part: Parts, account: Redaction) -> tuple[str, str | None]:
+    """Write header and markers of a recording from what may stay; `{base}` is in the place of its name."""
+    head = read_head(read_text(files, part.header))
+    markers = read_markers(read_text(files, part.markers)) if part.markers else None
+    return _header(head, markers is not None, account), None if markers is None else _markers(markers, account)
+
+
+def archive_entry(name: str) -> zipfile.ZipInfo:
+    """Make the entry of a file without a date, so that the same bytes give the same archive."""
     info = zipfile.ZipInfo(name, EPOCH)
     info.create_system, info.external_attr = 3, 0o100600 << 16
     return info

@@ -144,7 +144,13 @@ def _reader(parts: list[tuple[Any, Series]], i: int) -> Callable[[], Floats]:
     """Make the function that gives the samples of a channel in its unit."""
 
     def read() -> Floats:
-        values = [data[:, i] * series.scale[i] + series.offset for data, series in parts]
+        values = []
+        for data, series in parts:
+            x = data[:, i].astype(np.float64)
+            x *= series.scale[i]
+            if series.offset:
+                x += series.offset
+            values.append(x)
         return values[0] if len(values) == 1 else np.concatenate(values)
 
     return read

@@ -14,7 +14,7 @@ from pynwb.ecephys import ElectricalSeries
 
 from app.platform import files
 from tests.ml.formats.brainvision.test_brainvision import three
-from tests.ml.formats.peers import nwb
+from tests.ml.formats.peers import bids, nwb
 from tests.ml.formats.peers.xdf import Stream, write
 
 
@@ -112,7 +112,13 @@ def nwb_file(path: Path) -> bytes:
     return path.read_bytes()
 
 
-FILES = {"edf": edf_file, "nwb": nwb_file, "xdf": xdf_file}
+def bids_file(path: Path) -> bytes:
+    """Write the same as a zipped BIDS folder with an EDF+."""
+    events = [(t, "n/a", "n/a", text) for t, text in MARKS]
+    return bids.pack(path, bids.folder({"edf": edf_file(path)}, SIDES, events, 250.0, f"sub-{NAME}_task-rest")).read_bytes()
+
+
+FILES = {"bids": bids_file, "edf": edf_file, "nwb": nwb_file, "xdf": xdf_file}
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

@@ -13,7 +13,7 @@ import numpy as np
 import pybv
 from pynwb.ecephys import ElectricalSeries
 
-from tests.ml.formats.peers import nwb, xdf
+from tests.ml.formats.peers import bids, nwb, xdf
 from tests.ml.formats.peers.truth import Truth, make_truth
 
 
@@ -55,7 +55,7 @@ def write_xdf(path: Path, rng: np.random.Generator) -> Written:
     return Written(truth, {n: n.replace(" 0", " +0").replace(" 1-", " +1-") for n in truth.channels})
 
 
-def write_edf(path: Path, rng: np.random.Generator) -> Written:
+def write_edf(path: Path, rng: np.random.Generator, marked: bool = True) -> Written:
     """Write EDF+ by edfio or pyedflib, or BDF+ by pyedflib; for an EDF+D the records that were lost are taken out of the bytes.
 
     edfio writes no gaps, so the file is written whole and keeps the time-keeping annotations of the records that stay.
@@ -71,7 +71,7 @@ def write_edf(path: Path, rng: np.random.Generator) -> Written:
     for name, x in truth.channels.items():
         whole[name][at] = np.round(np.clip(x, -40, 40) / (100 / 65535)) * (100 / 65535)
         truth.channels[name][:] = np.clip(x, -40, 40)
-    marks = [(t, str(rng.choice(WORDS)).format(a=a)) for t, a in truth.steps]
+    marks = [(t, str(rng.choice(WORDS)).format(a=a)) for t, a in truth.steps if marked]
     bdf = not lossy and bool(rng.integers(2))
     if bdf:
         _by_pyedflib(path, whole, marks, rate, scale, unit)
@@ -117,13 +117,13 @@ def _take_records_out(path: Path, numbers: set[int]) -> None:
     path.write_bytes(head + b"".join(kept))
 
 
-def write_brainvision(path: Path, rng: np.random.Generator) -> Written:
+def write_brainvision(path: Path, rng: np.random.Generator, marked: bool = True) -> Written:
     """Write the three files by pybv, zipped; segments after a loss begin with a dated New Segment marker, as the recorder writes it."""
     rate = float(rng.choice([250.0, 500.0]))
     truth = make_truth(rng, rate_hz=rate, gaps=int(rng.integers(0, 5)), steps=int(rng.integers(0, 5)))
     form, lsb = [("binary_float32", 1e-5), ("binary_int16", 0.01)][int(rng.integers(2))]
     start = datetime(2026, 3, 2, 9, 30)
-    inside = [(t, a) for t, a in truth.steps if np.min(np.abs(truth.t_s - t)) < 1 / rate]
+    inside = [(t, a) for t, a in truth.steps if marked and np.min(np.abs(truth.t_s - t)) < 1 / rate]
     events: list[dict[str, object]] = [
         {"onset": int(np.searchsorted(truth.t_s, t)), "duration": 1, "type": "Comment", "description": str(rng.choice(WORDS)).format(a=a)}
         for t, a in inside
@@ -146,13 +146,13 @@ def write_brainvision(path: Path, rng: np.random.Generator) -> Written:
     return Written(truth, names, 2 * lsb, pause=True, steps=inside)
 
 
-def write_nwb(path: Path, rng: np.random.Generator) -> Written:
+def write_nwb(path: Path, rng: np.random.Generator, marked: bool = True) -> Written:
     """Write NWB by pynwb: integers with scales or volts; timestamps, a series per stretch, NaN or invalid times; three ways of doses."""
     truth = make_truth(rng, rate_hz=float(rng.choice([250.0, 500.0, 1000.0])), gaps=int(rng.integers(0, 5)), steps=int(rng.integers(0, 5)))
     file, begin_s = nwb.new_file(), float(rng.choice([0.0, 12.3456]))
     place = str(rng.choice(["left STN", "Left subthalamic nucleus", "unknown"]))
     lsb = nwb.add_signal(file, truth, rng, nwb.add_electrodes(file, list(truth.channels), place), begin_s)
-    pause = nwb.add_dose(file, truth, rng, WORDS, begin_s)
+    pause = not marked or nwb.add_dose(file, truth, rng, WORDS, begin_s)
     if rng.integers(2):
         # what another sensor recorded meanwhile shows that the recording went on, and so did its marks
         nwb.add_others(file, truth)
@@ -162,7 +162,20 @@ def write_nwb(path: Path, rng: np.random.Generator) -> Written:
     return Written(truth, {n: target + n.replace(" 0", " +0").replace(" 1-", " +1-") for n in truth.channels}, lsb, pause=pause)
 
 
+def write_bids(path: Path, rng: np.random.Generator) -> Written:
+    """Write a zipped BIDS folder, by the specification, around a data file of another writer; doses are in events.tsv alone."""
+    kind = str(rng.choice(["edf", "brainvision", "nwb"]))
+    with tempfile.TemporaryDirectory() as name:
+        data = Path(name, "data")
+        one = {"edf": write_edf, "brainvision": write_brainvision, "nwb": write_nwb}[kind](data, rng, False)
+        lasting = bool(rng.integers(2))
+        how = str(rng.choice(["text", "column", "unit"]))
+        bids.write(path, data, kind, one.truth, [str(rng.choice(WORDS)).format(a=a) for _, a in one.truth.steps], how, lasting)
+    return Written(one.truth, one.names, one.lsb_uv, pause=one.pause and not lasting)
+
+
 WRITERS: dict[str, Callable[[Path, np.random.Generator], Written]] = {
+    "bids": write_bids,
     "brainvision": write_brainvision,
     "edf": write_edf,
     "nwb": write_nwb,
@@ -201,5 +214,12 @@ def large_nwb(path: Path, megabytes: int) -> None:
     nwb.write(path, file)
 
 
-LARGE = {"edf": large_edf, "nwb": large_nwb, "xdf": large_xdf}
+def large_bids(path: Path, megabytes: int) -> None:
+    """Write a zipped BIDS folder around a large EDF+."""
+    with tempfile.TemporaryDirectory() as name:
+        large_edf(Path(name, "data"), megabytes)
+        bids.pack(path, bids.folder({"edf": Path(name, "data").read_bytes()}, [f"LFP L {k}-{k + 2}" for k in range(8)], [], 1000.0))
+
+
+LARGE = {"bids": large_bids, "edf": large_edf, "nwb": large_nwb, "xdf": large_xdf}
 """Large files by kind, for what reading takes."""
