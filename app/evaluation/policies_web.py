@@ -94,6 +94,8 @@ def _page(
         same=_same(policy, answered) if answered else [],
         plainly=verdict_wording.plainly,
         effect=verdict_wording.effect,
+        dose_words=verdict_wording.dose_words,
+        cdbs_ma=answered.cdbs_ma if answered else None,
         test_results=verdict_wording.test_results,
         standing_names=verdict_wording.STANDING_NAMES,
         may_write=may(caller, can.WRITE_POLICIES, participant),

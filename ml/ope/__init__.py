@@ -17,6 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ml.ope.adaptation import Adaptation, Gain, adaptation_of, gain_by_following
     from ml.ope.compare.aggregate import combine
     from ml.ope.compare.gain import gain_over
     from ml.ope.compare.metrics import Accuracy, accuracy
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "estimate": ("LEVEL", "Estimate", "Estimator"),
     "flags": ("Flag", "distinct", "not_counted_tests"),
+    "adaptation": ("Adaptation", "Gain", "adaptation_of", "gain_by_following"),
     "registry": ("AGGREGATE", "POSTERIOR", "Method", "Size", "build", "estimators", "method_keys", "methods", "quick_estimators", "shown"),
     "compare.metrics": ("Accuracy", "accuracy"),
     "compare.gain": ("gain_over",),
@@ -75,12 +77,13 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 # fmt: off
 __all__ = [
-    "AGGREGATE", "DOSES", "FEWEST_DRAWS", "FEWEST_VISITS", "HAZARDS", "LEVEL", "NEARLY_OFF", "POSTERIOR", "QUANTITIES",
-    "SAME_AMPLITUDE", "SETTLED_BY_SESSIONS", "Accuracy", "BehaviourMap", "Estimate", "Estimator", "FittedPosterior", "Flag", "Levels",
+    "AGGREGATE", "DOSES", "FEWEST_DRAWS", "FEWEST_VISITS", "HAZARDS", "LEVEL", "NEARLY_OFF", "POSTERIOR", "QUANTITIES", "SAME_AMPLITUDE",
+    "SETTLED_BY_SESSIONS", "Accuracy", "Adaptation", "BehaviourMap", "Estimate", "Estimator", "FittedPosterior", "Flag", "Gain", "Levels",
     "Method", "Posterior", "PosteriorGain", "Size", "Suggestion", "TestSession", "TestedDifference", "Tests", "Verdict", "accuracy",
-    "behaviour_map", "build", "chance_within", "combine", "default_method", "diagnose", "differences_to_cdbs", "distinct", "estimators",
-    "gain_over", "gains_over_cdbs", "held_out_skill", "interval", "method_keys", "methods", "not_counted_tests", "outcome_draws",
-    "portfolio", "quick_estimators", "rank_policies", "shown", "spread_of_random", "surest", "verdict", "with_held_out_error",
+    "adaptation_of", "behaviour_map", "build", "chance_within", "combine", "default_method", "diagnose", "differences_to_cdbs", "distinct",
+    "estimators", "gain_by_following", "gain_over", "gains_over_cdbs", "held_out_skill", "interval", "method_keys", "methods",
+    "not_counted_tests", "outcome_draws", "portfolio", "quick_estimators", "rank_policies", "shown", "spread_of_random", "surest",
+    "verdict", "with_held_out_error",
 ]
 # fmt: on
 

@@ -12,7 +12,18 @@ from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.evaluation.ranking.decisions import Decided
 from app.study.margins import margins_of
 from app.tables.evaluations import Evaluation
-from ml.ope import SAME_AMPLITUDE, BehaviourMap, Estimate, chance_within, interval, outcome_draws
+from ml.ope import (
+    SAME_AMPLITUDE,
+    Adaptation,
+    BehaviourMap,
+    Estimate,
+    Gain,
+    adaptation_of,
+    chance_within,
+    gain_by_following,
+    interval,
+    outcome_draws,
+)
 from ml.outcomes import FIELDS
 
 ORDER = ("test", "test_with_care", "undecided", "cannot_tell", "likely_worse", "not_advised", "unsafe", "same_as_cdbs")
@@ -69,6 +80,8 @@ class Row:
         twins: rows of the policies that do the same, each with its own numbers and without twins. decided: the verdict.
         differences: to cDBS, by quantity; a quantity is absent where it is not predicted.
         limit_ma: for a test with care, the lowest amplitude, mA (fraction in `limit` where the cDBS amplitude is not known).
+        adapts: how far it adapts its amplitude to beta. adds: what that is estimated to add to its energy all the time. Each is None where
+            it is not known.
     """
 
     one: Assessed
@@ -77,6 +90,8 @@ class Row:
     differences: dict[str, Difference]
     limit: float | None
     limit_ma: float | None
+    adapts: Adaptation | None = None
+    adds: Gain | None = None
 
     @property
     def within(self) -> float | None:
@@ -177,7 +192,8 @@ class Answer:
 
 def answer(found: Assessment) -> Answer:
     """What to say of an assessment's candidates."""
-    rows = [_row(found, one, tuple(_row(found, twin) for twin in twins)) for one, *twins in behaviours(found)]
+    known = map_of(found.evaluation)
+    rows = [_row(found, known, one, tuple(_row(found, known, twin) for twin in twins)) for one, *twins in behaviours(found)]
     if not found.ordered:
         rows.sort(key=lambda r: ORDER.index(r.decided.standing))
     off = [r for r in rows if _nearly_off(r.one.posterior) > OFF_SHARE]
@@ -261,13 +277,16 @@ def _behaviour(estimate: Estimate | None) -> dict[str, float]:
     return (estimate.details.get("behaviour") or {}) if estimate is not None else {}
 
 
-def _row(found: Assessment, one: Assessed, twins: tuple[Row, ...] = ()) -> Row:
+def _row(found: Assessment, beta_map: BehaviourMap | None, one: Assessed, twins: tuple[Row, ...] = ()) -> Row:
     if one.decided is None:
         raise ValueError(f"policy {one.policy.id} is a reference and has no verdict")
     limit = one.decided.limit
     cdbs = found.cdbs.posterior if found.cdbs else None
     ma = None if limit is None or found.cdbs_ma is None else limit * found.cdbs_ma
-    return Row(one, twins, one.decided, differences(one.posterior, cdbs), limit, ma)
+    adapts = adaptation_of(beta_map, str(one.policy.id)) if beta_map is not None else None
+    constants = [(a.policy.amplitude, a.posterior) for a in found.references if a.policy.amplitude is not None and a.posterior is not None]
+    adds = gain_by_following(one.posterior, constants) if one.posterior is not None else None
+    return Row(one, twins, one.decided, differences(one.posterior, cdbs), limit, ma, adapts, adds)
 
 
 def _fixed(found: Assessment) -> Fixed | None:

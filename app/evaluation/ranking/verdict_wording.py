@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from markupsafe import Markup
 
 from app.evaluation import wording
-from app.evaluation.ranking.answer import OFF_SHARE, Difference
+from app.evaluation.ranking.answer import OFF_SHARE, Difference, Row
 from app.evaluation.ranking.judged import Judged
 from app.evaluation.ranking.results import RandomSessions
 from app.evaluation.schemas import Standing, TestedBefore
@@ -124,6 +124,27 @@ def effect(differences: Mapping[str, Difference], within: float | None = None) -
     return (", ".join(told) or "what it would change is not estimated") + ("" if within is None else f"; {likely(within)}")
 
 
+def dose_words(row: Row, cdbs_ma: float | None) -> str:
+    """Say how far a policy adapts its amplitude to beta, and what that is estimated to add; empty where neither is known.
+
+    Args:
+        row: of the policy. cdbs_ma: the cDBS amplitude, mA; None where it is not known.
+    """
+
+    def dose(fraction: float) -> str:
+        return amplitude(fraction, None if cdbs_ma is None else fraction * cdbs_ma)
+
+    found, adapts, adds = [], row.adapts, row.adds
+    if adapts is not None:
+        how = "same as" if adapts.fixed else "follows beta around"
+        found.append(f"{how} {dose(adapts.mean)}{' all the time' if adapts.fixed else ''}: {dose(adapts.low)} to {dose(adapts.high)}")
+    if adds is not None:
+        points = f"{signed(adds.value)} points of the return ({signed(adds.low)} to {signed(adds.high)})"
+        open_yet = "" if adds.low > 0 or adds.high < 0 else ", so that it may be nothing"
+        found.append(f"following beta adds {points} to {dose(adds.amplitude)} all the time{open_yet}")
+    return "; ".join(found)
+
+
 def test_results(results: TestedBefore | None) -> str:
     """Return what a policy's own sessions showed: how many, how many were stopped, and the differences to the same day's cDBS."""
     if results is None:
@@ -213,6 +234,7 @@ def what_next(judged: Judged, *, may_run: bool) -> Markup:
             margins=margins_of(judged.participant.margins_in_force),
             plainly=plainly,
             effect=effect,
+            dose_words=dose_words,
             test_results=test_results,
             random_effects=random_effects,
             usual=usual,

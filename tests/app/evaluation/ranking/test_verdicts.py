@@ -5,19 +5,25 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 from pypdf import PdfReader
+from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from app.evaluation.ranking.decisions import Circumstances, decide
 from app.learning.policies import constant_onnx
+from app.tables.learning import Policy
 from app.tables.participants import MarginsVersion
 from ml.designs import Bound
 from ml.ope.flags import Flag
 from ml.ope.posterior.further_sessions import Place
+from ml.ope.support.behaviour_map import COLUMNS, BehaviourMap, Curve
+from tests.app.evaluation.ranking.test_picture import stored_map
 from tests.app.evaluations import judged
 from tests.app.words import above_fold, flat, methods_named
 from tests.conftest import PASSWORD
@@ -91,6 +97,29 @@ def test_a_value_that_few_sessions_came_near_is_a_place(client: TestClient, poli
     few = Flag.of("few_near_sessions", 0.0, 2.0, "sessions", refuses=True).to_json()
     judge({a: judged(50.0), b: judged(60.0, supported=False) | {"flags": [few]}, c: judged(70.0, supported=False)})
     assert [p["policy_id"] for p in ranked(client)["policies"]] == [b, a, c], "amplitudes that were hardly tried come after what was"
+
+
+def test_each_policy_says_how_far_it_follows_beta_and_what_that_adds(
+    client: TestClient, policies: list[int], judge: Judge, db: Session
+) -> None:
+    a, b, _ = policies
+    middle = tuple(0.5 + 0.02 * k for k in range(COLUMNS))
+    curves = {str(a): Curve(middle, middle, middle), str(b): Curve((0.8,) * COLUMNS, (0.78,) * COLUMNS, (0.82,) * COLUMNS)}
+    coverage = stored_map(a)
+    coverage["map"] = replace(BehaviourMap.from_json(coverage["map"]), policies=curves).to_json()  # type: ignore[arg-type]
+    judge({a: judged(50.0), b: judged(49.0)}, coverage=coverage)
+    words = first_screen(client)
+    assert "never run so far. Dose: follows beta around 2.19 mA: 1.56 mA to 2.82 mA." in words, (
+        "what it adds is not known without constants"
+    )
+    held = {float(p.config["amplitude"]): p.id for p in db.scalars(select(Policy).where(Policy.algorithm == "constant"))}
+    levels = sorted(level for level in held if level < 1.0)
+    posterior = {held[level]: judged(45.0) for level in levels}
+    judge({a: judged(50.0), b: judged(45.5)} | posterior, cdbs(value=45.0).to_json(), coverage=coverage, candidates=[a, b])
+    adds = f"following beta adds +5.0 points of the return (+5.0 to +5.0) to {3 * 0.6**0.5:.2f} mA all the time"
+    assert f"follows beta around 2.19 mA: 1.56 mA to 2.82 mA; {adds}" in first_screen(client), "its energy is 0.6 of that of cDBS"
+    page = flat(client.get(f"/participants/P1/policies/{b}").text)
+    assert "same as 2.4 mA all the time: 2.34 mA to 2.46 mA; following beta adds +0.5 points" in page
 
 
 def test_a_change_of_margins_changes_the_verdict_at_once(client: TestClient, policies: list[int], judge: Judge) -> None:
