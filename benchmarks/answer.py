@@ -33,7 +33,7 @@ from support.results import emit, run_benchmark
 from ml.ope.compare.gain import gain_over
 from ml.ope.compare.metrics import spearman
 from ml.ope.posterior.estimator import build
-from ml.ope.posterior.verdict import Levels, share_within, verdict
+from ml.ope.posterior.verdict import Levels, calibrate, share_within, verdict
 from ml.outcomes import PREDICTED
 from ml.policies.policy import ConstantPolicy
 from ml.population.virtual import WORLDS_PER_PART, Truth, world
@@ -178,6 +178,15 @@ def aims(worlds: Sequence[World]) -> dict[str, tuple[float, float]]:
     }
 
 
+def reliability(worlds: Sequence[World], edges: Sequence[float] = (0.1, 0.25, 0.5, 0.65, 0.8, 0.9)) -> list[tuple[int, float, float]]:
+    """Compare calibrated probabilities with truth: candidates between two edges, the mean that was stated, the share truly within."""
+    known = [r for rows in worlds for r in candidates(rows) if r["share"] is not None]
+    stated, true = np.array([calibrate(r["share"]) for r in known]), np.array([r["safe"] for r in known], dtype=np.float64)
+    column = np.searchsorted(edges, stated, "right")
+    parts = [column == k for k in range(len(edges) + 1) if (column == k).any()]
+    return [(int(p.sum()), round(float(stated[p].mean()), 2), round(float(true[p].mean()), 2)) for p in parts]
+
+
 AIMS = {
     "loss of the pick": "<= 0.12",
     "pick within 5 % of the best safe": ">= 0.60",
@@ -234,6 +243,9 @@ def main() -> None:
     emit(f"{len(worlds)} worlds of part {chosen.part}, population {chosen.population}\n{'':<42}{'':>8}{'error':>8}  aim\n")
     for name, (value, error) in figures.items():
         emit(f"{name:<42}{value:>8.2f}{error:>8.2f}  {AIMS.get(name, '')}\n")
+    emit("of candidates called so likely no worse, so many were\n")
+    for number, stated, true in reliability(worlds):
+        emit(f"{number:>6} candidates{100 * stated:>6.0f} %{100 * true:>6.0f} %\n")
     if chosen.calibrate:
         known = [r for rows in worlds for r in candidates(rows) if r["share"] is not None]
         emit(f"CALIBRATION = {monotone([r['share'] for r in known], [r['safe'] for r in known])}\n")

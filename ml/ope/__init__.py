@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         FEWEST_DRAWS,
         HAZARDS,
         NEARLY_OFF,
+        RELIABILITY,
         SAME_AMPLITUDE,
         SETTLED_BY_SESSIONS,
         Levels,
@@ -69,7 +70,7 @@ _HOMES = {
     "posterior.support": ("FEWEST_VISITS",),
     "posterior.tested": ("TestSession", "differences_to_cdbs", "spread_of_random"),
     "posterior.verdict": (
-        *("FEWEST_DRAWS", "HAZARDS", "NEARLY_OFF", "SAME_AMPLITUDE", "SETTLED_BY_SESSIONS", "Levels", "Verdict"),
+        *("FEWEST_DRAWS", "HAZARDS", "NEARLY_OFF", "RELIABILITY", "SAME_AMPLITUDE", "SETTLED_BY_SESSIONS", "Levels", "Verdict"),
         *("chance_within", "interval", "outcome_draws", "verdict"),
     ),
 }
@@ -77,13 +78,13 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 # fmt: off
 __all__ = [
-    "AGGREGATE", "DOSES", "FEWEST_DRAWS", "FEWEST_VISITS", "HAZARDS", "LEVEL", "NEARLY_OFF", "POSTERIOR", "QUANTITIES", "SAME_AMPLITUDE",
-    "SETTLED_BY_SESSIONS", "Accuracy", "Adaptation", "BehaviourMap", "Estimate", "Estimator", "FittedPosterior", "Flag", "Gain", "Levels",
-    "Method", "Posterior", "PosteriorGain", "Size", "Suggestion", "TestSession", "TestedDifference", "Tests", "Verdict", "accuracy",
-    "adaptation_of", "behaviour_map", "build", "chance_within", "combine", "default_method", "diagnose", "differences_to_cdbs", "distinct",
-    "estimators", "gain_by_following", "gain_over", "gains_over_cdbs", "held_out_skill", "interval", "method_keys", "methods",
-    "not_counted_tests", "outcome_draws", "portfolio", "quick_estimators", "rank_policies", "shown", "spread_of_random", "surest",
-    "verdict", "with_held_out_error",
+    "AGGREGATE", "DOSES", "FEWEST_DRAWS", "FEWEST_VISITS", "HAZARDS", "LEVEL", "NEARLY_OFF", "POSTERIOR", "QUANTITIES", "RELIABILITY",
+    "SAME_AMPLITUDE", "SETTLED_BY_SESSIONS", "Accuracy", "Adaptation", "BehaviourMap", "Estimate", "Estimator", "FittedPosterior", "Flag",
+    "Gain", "Levels", "Method", "Posterior", "PosteriorGain", "Size", "Suggestion", "TestSession", "TestedDifference", "Tests", "Verdict",
+    "accuracy", "adaptation_of", "behaviour_map", "build", "chance_within", "combine", "default_method", "diagnose",
+    "differences_to_cdbs", "distinct", "estimators", "gain_by_following", "gain_over", "gains_over_cdbs", "held_out_skill", "interval",
+    "method_keys", "methods", "not_counted_tests", "outcome_draws", "portfolio", "quick_estimators", "rank_policies", "shown",
+    "spread_of_random", "surest", "verdict", "with_held_out_error",
 ]
 # fmt: on
 

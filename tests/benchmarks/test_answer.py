@@ -67,6 +67,13 @@ def test_a_ratio_has_the_error_of_a_mean_where_all_worlds_weigh_the_same(answer:
     assert math.isnan(answer.ratio([0.0], [0.0])[0])
 
 
+def test_probabilities_are_compared_with_truth_between_edges(answer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(answer, "calibrate", lambda share: share / 2)
+    shares = [(0.2, False), (0.3, True), (0.9, True), (None, True)]
+    rows = [row(str(k), "undecided", 0.0, 0.0, share=share, safe=safe) for k, (share, safe) in enumerate(shares)]
+    assert answer.reliability([[*rows, CDBS]], (0.25, 0.75)) == [(2, 0.12, 0.5), (1, 0.45, 1.0)]
+
+
 def test_the_map_pools_what_falls_and_keeps_what_rises(answer: Any) -> None:
     share = [0.1, 0.1, 0.4, 0.4, 0.6, 0.6, 0.9, 0.9]
     true = [False, False, True, True, False, True, True, True]

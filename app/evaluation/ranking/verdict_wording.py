@@ -15,7 +15,7 @@ from app.evaluation.wording import OUTCOME_NAMES, amplitude, chance, count_stops
 from app.platform.numbers import counted
 from app.platform.web.templates import render_part
 from app.study.margins import margins_of
-from ml.ope import NEARLY_OFF, Flag
+from ml.ope import NEARLY_OFF, RELIABILITY, Flag
 from ml.outcomes import ALL, ANY, OUTCOMES, Outcome
 from ml.qoc import Margins
 
@@ -122,6 +122,13 @@ def effect(differences: Mapping[str, Difference], within: float | None = None) -
         if quantity in differences
     ]
     return (", ".join(told) or "what it would change is not estimated") + ("" if within is None else f"; {likely(within)}")
+
+
+def reliability() -> str:
+    """Compare stated chances with how often they were true of virtual patients."""
+    first, *others = ((percent(stated), percent(true)) for _, stated, true in RELIABILITY)
+    listed = "; ".join(f"of {stated}, {true}" for stated, true in others)
+    return f"of policies called {first[0]} likely no worse, {first[1]} were; {listed}"
 
 
 def dose_words(row: Row, cdbs_ma: float | None) -> str:

@@ -207,6 +207,7 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             signed=wording.signed,
             test_results=verdict_wording.test_results,
             dose_words=verdict_wording.dose_words,
+            reliability=verdict_wording.reliability(),
             chance=wording.chance,
             weights=assessment.weights,
             correlation=assessment.held_out_correlation,

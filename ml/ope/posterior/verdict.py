@@ -60,6 +60,18 @@ CALIBRATION: tuple[tuple[float, float], ...] = (
 """Share of draws in which all outcomes are within their margins, and the share of candidates of which that was true. Linear between.
 Measured on the 720 candidates of part A of the second population (`python benchmarks/answer.py --calibrate`)."""
 
+RELIABILITY: tuple[tuple[int, float, float], ...] = (
+    (131, 0.03, 0.08),
+    (79, 0.16, 0.27),
+    (73, 0.38, 0.63),
+    (40, 0.58, 0.70),
+    (47, 0.74, 0.89),
+    (80, 0.86, 0.85),
+    (270, 0.96, 0.99),
+)
+"""Of part B, on which nothing was chosen: candidates, calibrated probability that was stated on average, share of which it was true
+(`python benchmarks/answer.py --part B`)."""
+
 
 @dataclass(frozen=True)
 class Levels:

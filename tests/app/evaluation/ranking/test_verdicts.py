@@ -21,6 +21,7 @@ from app.tables.learning import Policy
 from app.tables.participants import MarginsVersion
 from ml.designs import Bound
 from ml.ope.flags import Flag
+from ml.ope.posterior import verdict
 from ml.ope.posterior.further_sessions import Place
 from ml.ope.support.behaviour_map import COLUMNS, BehaviourMap, Curve
 from tests.app.evaluation.ranking.test_picture import stored_map
@@ -161,6 +162,15 @@ def test_without_ordering_skill_there_are_no_ranks_and_verdicts_stay(client: Tes
     assert "the recordings so far cannot tell policies apart" in words
     assert "Not advised: p2 : unsafe, nearly off 42 % of the time" in words
     assert "#" not in words.split("Candidates compared with cDBS")[1].split("Policy")[0]
+
+
+def test_the_page_says_how_often_its_chances_were_true(client: TestClient, policies: list[int], judge: Judge) -> None:
+    judge({policies[0]: judged(50.0)})
+    words = flat(client.get(PAGE).text)
+    said = re.search(r"of policies called (\d+) % likely no worse, (\d+) % were((?:; of \d+ %, \d+ %)+)\.", words)
+    assert said is not None
+    assert words.count("on 60 virtual patients") == 1
+    assert [*map(int, re.findall(r"\d+", said[0]))] == [round(100 * share) for _, *pair in verdict.RELIABILITY for share in pair]
 
 
 def test_the_first_screen_says_what_to_test_why_and_at_what_risk_without_a_word_of_methods(
