@@ -1,4 +1,4 @@
-"""What speaks against a plan, as typed records; their sentences are made in `app.planning.wording`."""
+"""What speaks against a plan, as typed records; their sentences are made in `app.planning.plans.wording`."""
 
 from __future__ import annotations
 

@@ -89,6 +89,11 @@ def minutes(seconds: float | None) -> str:
     return f"{whole // 60} min" + (f" {whole % 60} s" if whole % 60 else "") if whole >= 60 else f"{whole} s"
 
 
+def elapsed_time(seconds: float) -> str:
+    """Format a time since the start of a session, in s, as minutes and seconds: 3:05."""
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+
+
 def minutes_left(seconds: float) -> str:
     """Format a remaining time for people, no finer than it can be known."""
     if seconds < 60:

@@ -2,7 +2,7 @@
 
 Blinding hangs on this place: who may not know an arm is refused here or told that it is hidden, and nowhere else is the column read. It
 holds for two things: a person's role (blinded assessor), and a visit under a blinded plan whose key is sealed, of which nobody knows more
-than letters (`app.planning.plans.key`).
+than letters (`app.planning.plans.sign_off`).
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ class Plan(Base):
 
 
 SEALED = and_(Plan.blinded, Plan.approved_at.is_not(None), Plan.key_opened_at.is_(None))
-"""Condition on `Plan`: as `app.planning.plans.key.sealed`, of replaced plans too."""
+"""Condition on `Plan`: as `app.planning.plans.sign_off.sealed`, of replaced plans too."""
 
 
 class PlanItem(Base):

@@ -15,11 +15,11 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning.deps import CurrentOwnPolicy
-from app.planning import wording
 from app.planning.bundles import ports, repository, slots
 from app.planning.bundles import service as bundles
-from app.planning.plans.key import common_limits
+from app.planning.plans import wording
 from app.planning.plans.limits import device_limits
+from app.planning.plans.sign_off import common_limits
 from app.planning.plans.view import read_plan
 from app.planning.releases import service as releases
 from app.platform import numbers

@@ -22,9 +22,9 @@ from app.learning import foreign
 from app.learning import repository as learning
 from app.learning.policies import onnx_of, probe_windows
 from app.learning.trajectories import read_buffer
-from app.planning import wording
 from app.planning.bundles import repository
 from app.planning.grounds import events_against, unanswered
+from app.planning.plans import wording
 from app.planning.plans.limits import DeviceLimits, device_limits
 from app.platform import files
 from app.platform.database import set_reason

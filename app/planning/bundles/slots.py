@@ -12,14 +12,14 @@ from app import __version__
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import repository as learning
-from app.planning import wording
 from app.planning.bundles import ports, repository, service
 from app.planning.grounds import events_against, unanswered
+from app.planning.plans import wording
 from app.planning.plans.designs import Planned, seed_of
-from app.planning.plans.key import common_limits
 from app.planning.plans.limits import device_limits
+from app.planning.plans.repository import today
+from app.planning.plans.sign_off import common_limits
 from app.planning.plans.view import PlanLine, PlanView, read_plan, refuse_running, shown
-from app.planning.plans.visits import today
 from app.planning.sheet.content import BUNDLE, card_of
 from app.platform import files
 from app.platform.errors import Conflict, Invalid, NotFound

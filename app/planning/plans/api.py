@@ -9,10 +9,9 @@ from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
 from app.evaluation.wording import estimate_out
-from app.planning import wording
 from app.planning.bundles.ports import lines_of
 from app.planning.bundles.repository import releases_of_slots
-from app.planning.plans import key, service, visits
+from app.planning.plans import repository, service, sign_off, wording
 from app.planning.plans.schemas import (
     Approval,
     KeyOpening,
@@ -101,16 +100,16 @@ def open_key(visit: CurrentVisit, opening: KeyOpening, db: Db, caller: CurrentCa
     found = plan_of(db, visit, caller)
     waits = found.plan.key_opened_at is not None and found.plan.key_opened_reason is None
     if waits:
-        key.give_reason(db, visit, found.plan, caller, opening.reason)
+        sign_off.give_reason(db, visit, found.plan, caller, opening.reason)
     else:
-        key.open_key(db, visit, found.plan, caller, opening.reason, emergency=opening.emergency)
+        sign_off.open_key(db, visit, found.plan, caller, opening.reason, emergency=opening.emergency)
     return plan_out(plan_of(db, visit, caller))
 
 
 @router.post("/visits/{visit_id}/removal", status_code=204, responses=problems(409))
 def remove_visit(visit: CurrentVisit, removal: Removal, db: Db, caller: CurrentCaller) -> None:
     """Remove a visit in which nothing was done, with its drafts."""
-    visits.remove_visit(db, visit, removal.reason, caller)
+    repository.remove_visit(db, visit, removal.reason, caller)
 
 
 def plan_out(view: PlanView) -> PlanOut:
@@ -155,7 +154,7 @@ def plan_out(view: PlanView) -> PlanOut:
 
 def _key_out(plan: Plan) -> KeyOut:
     return KeyOut(
-        sealed=key.sealed(plan),
+        sealed=sign_off.sealed(plan),
         opened_at=plan.key_opened_at,
         opened_by=plan.key_opened_by,
         reason=plan.key_opened_reason,

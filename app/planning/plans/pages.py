@@ -16,12 +16,11 @@ from app.accounts.permissions import Caller
 from app.evaluation import wording as evaluation_wording
 from app.evaluation.ranking import verdict_wording
 from app.evaluation.wording import method_name, sentence
-from app.planning import draft_form, wording
-from app.planning.plans import key, repository, service
+from app.planning.plans import draft_form, repository, service, sign_off, wording
+from app.planning.plans.repository import remove_visit, today, visit_for_draft
 from app.planning.plans.schemas import Id, Move
 from app.planning.plans.sign_off import MEANING
 from app.planning.plans.view import PlanView, read_plan, shown, standings_of
-from app.planning.plans.visits import remove_visit, today, visit_for_draft
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, NotFound
 from app.platform.web.forms import FormValues, field_notes, parse, renamed
@@ -128,9 +127,9 @@ def open_key(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCalle
     try:
         found = read_plan(db, visit, caller).plan
         if found.key_opened_at is not None:
-            key.give_reason(db, visit, found, caller, reason)
+            sign_off.give_reason(db, visit, found, caller, reason)
         else:
-            key.open_key(db, visit, found, caller, reason, emergency="emergency" in values)
+            sign_off.open_key(db, visit, found, caller, reason, emergency="emergency" in values)
     except BetaloopError as error:
         db.rollback()
         return HTMLResponse(_page(request, db, visit, caller, error), error.status)

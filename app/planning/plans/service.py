@@ -17,11 +17,10 @@ from app.learning import repository as learning
 from app.planning.grounds import grounds
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of, is_held, near_sessions, planned_sessions, seed_of
-from app.planning.plans.key import label_sessions, sealed
 from app.planning.plans.limits import StatedLimits, lowest_draw, planned_cdbs_ma, require_limits, set_limits
 from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
 from app.planning.plans.schemas import HeldIn, Move, PlanIn, PlanOptions
-from app.planning.plans.sign_off import sign_plan
+from app.planning.plans.sign_off import label_sessions, sealed, sign_plan
 from app.planning.plans.view import PlanView, medication_due, read_plan, refuse_after_events, refuse_withdrawn, view_of
 from app.planning.protocol.schedule import Candidate, Rules, require_controls, schedule
 from app.planning.protocol.session_order import Order

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
 from sqlalchemy.orm import Session
 
+from app.accounts import permissions as can
 from app.accounts import sign_on
 from app.accounts.permissions import Caller
 from app.platform.audit import signatures
 from app.platform.audit.signatures import SignatureState
-from app.platform.errors import Conflict, Forbidden
+from app.platform.database import now, set_reason
+from app.platform.errors import Conflict, Forbidden, Invalid
+from app.study import access
 from app.tables.audit import Signature
 from app.tables.learning import Policy
 from app.tables.plans import Plan, PlanItem
@@ -89,3 +94,85 @@ def _session(item: PlanItem, policy: Policy | None) -> dict[str, Any]:
         "design": item.design,
         "note": item.note,
     }
+
+
+# Blinded plans: sessions run under letters, and which letter is which controller is the sealed key. The caller commits.
+
+
+@dataclass(frozen=True)
+class CommonLimits:
+    """Limits that hold for every session of a plan alike, mA and mA/s: they tell no controller from another."""
+
+    min_ma: float
+    max_ma: float
+    ramp_ma_per_s: float
+
+
+def label_sessions(items: Sequence[PlanItem], seed: int) -> None:
+    """Give every session a letter of its own, drawn: a letter that came twice would tell policies from cDBS."""
+    order = np.random.default_rng([seed, len(items)]).permutation(len(items))
+    for item, place in zip(items, order, strict=True):
+        item.label = _letters(int(place))
+
+
+def sealed(plan: Plan) -> bool:
+    """Whether nobody is shown which session is which: from the signature on, until the key is opened."""
+    return plan.blinded and plan.approved_at is not None and plan.key_opened_at is None
+
+
+def common_limits(items: Sequence[PlanItem]) -> CommonLimits | None:
+    """The least and the greatest amplitude and the fastest change of any session; None where a limit is open."""
+    lows, highs, ramps = ([getattr(i, name) for i in items] for name in ("min_ma", "max_ma", "ramp_ma_per_s"))
+    if not items or any(v is None for v in (*lows, *highs, *ramps)):
+        return None
+    return CommonLimits(min(lows), max(highs), max(ramps))
+
+
+def open_key(db: Session, visit: Visit, plan: Plan, caller: Caller, reason: str, *, emergency: bool = False) -> None:
+    """Open the key of a blinded plan.
+
+    Args:
+        reason: why; in an emergency it may be empty, and is asked for afterwards (`give_reason`).
+
+    Raises:
+        Forbidden: the caller may not open keys. Conflict: the plan is not blinded, not signed, or open already.
+        Invalid: no reason, and no emergency.
+    """
+    access.require(caller, can.OPEN_KEY, visit.participant)
+    if not sealed(plan):
+        why = "is not blinded" if not plan.blinded else "is not signed yet" if plan.approved_at is None else "has an open key already"
+        raise Conflict(f"Plan {plan.id} of visit {visit.number} {why}.", "Load the page again.")
+    if not reason.strip() and not emergency:
+        raise Invalid("A reason is missing.", "Say why the key is opened; in an emergency open it at once and give the reason afterwards.")
+    set_reason(db, reason.strip() or "emergency: the reason follows")
+    plan.key_opened_at, plan.key_opened_by = now(), caller.label
+    plan.key_opened_reason, plan.key_opened_in_emergency = reason.strip() or None, emergency
+    db.flush()
+    set_reason(db, None)
+
+
+def give_reason(db: Session, visit: Visit, plan: Plan, caller: Caller, reason: str) -> None:
+    """State afterwards why a key was opened in an emergency.
+
+    Raises:
+        Forbidden: the caller may not open keys. Conflict: a reason stands, or nothing was opened. Invalid: no reason.
+    """
+    access.require(caller, can.OPEN_KEY, visit.participant)
+    if plan.key_opened_at is None or plan.key_opened_reason is not None:
+        raise Conflict(f"Plan {plan.id} of visit {visit.number} waits for no reason.", "Load the page again.")
+    if not reason.strip():
+        raise Invalid("A reason is missing.", "Say why the key was opened.")
+    set_reason(db, reason.strip())
+    plan.key_opened_reason = reason.strip()
+    db.flush()
+    set_reason(db, None)
+
+
+def _letters(number: int) -> str:
+    """0 as A, 25 as Z, 26 as AA."""
+    text = ""
+    number += 1
+    while number:
+        number, digit = divmod(number - 1, 26)
+        text = chr(ord("A") + digit) + text
+    return text

@@ -20,12 +20,11 @@ from app.planning.grounds import events_against, unanswered
 from app.planning.notices import Code, PlanWarning, without_policies
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of
-from app.planning.plans.key import CommonLimits, common_limits, sealed
 from app.planning.plans.limits import require_limits
-from app.planning.plans.sign_off import signature_of
-from app.planning.plans.visits import today
+from app.planning.plans.repository import today
+from app.planning.plans.sign_off import CommonLimits, common_limits, sealed, signature_of
+from app.planning.plans.wording import ANSWER_EVENT, happened
 from app.planning.protocol.medication import due_before
-from app.planning.wording import ANSWER_EVENT, happened
 from app.platform.audit.signatures import SignatureState
 from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
 from app.platform.web.templates import Part, make_part
@@ -80,7 +79,7 @@ class PlanView:
 
     @property
     def sealed(self) -> bool:
-        """Whether nobody is shown which session is which (`app.planning.plans.key`)."""
+        """Whether nobody is shown which session is which (`app.planning.plans.sign_off`)."""
         return sealed(self.plan)
 
     @property

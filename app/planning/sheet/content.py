@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from app.evaluation.ranking.verdict_wording import STANDING_NAMES, effect, likely, plainly
-from app.planning import wording
+from app.planning.plans import wording
 from app.planning.plans.view import PlanLine, PlanView
 from app.planning.sheet.ink import clock, printed_name, printed_warning, shade
 from app.tables.sessions import Controller

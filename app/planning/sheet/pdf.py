@@ -12,7 +12,7 @@ from datetime import datetime
 from fpdf import FPDF
 from fpdf.enums import XPos, YPos
 
-from app.planning import wording
+from app.planning.plans import wording
 from app.planning.plans.view import PlanView, shown
 from app.planning.sheet.cards import WIDTH, draw_cards
 from app.planning.sheet.content import HASH

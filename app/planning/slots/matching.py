@@ -14,6 +14,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from app.platform.numbers import counted
 from app.tables.sessions import Controller
 
 FAR = timedelta(minutes=60)
@@ -227,3 +228,25 @@ def _judged(slot: Planned, session: Done | None, crossed: bool, day: date | None
     elif slot.began is not None and session.began is not None and abs(slot.began - session.began) > NEAR:
         said.append(Deviation.OTHER_TIME)
     return Match(slot.item_id, session.session_id, tuple(said))
+
+
+DEVIATIONS: dict[Deviation, str] = {
+    Deviation.MISSING: "not found",
+    Deviation.UNPLANNED: "not planned",
+    Deviation.OUT_OF_ORDER: "in another order than planned",
+    Deviation.SHORTER: "shorter than planned",
+    Deviation.LONGER: "longer than planned",
+    Deviation.OTHER_DAY: "held on another day than the visit's",
+    Deviation.OTHER_TIME: "began at another time than the clinic day says: one of the two clocks is wrong",
+    Deviation.OTHER_PLAN: "its log is of a session of another plan",
+    Deviation.EARLIER_PLAN: "of the plan that was signed before this one",
+    Deviation.ABORTED: "an aborted start of a planned session: its controller never decided",
+    Deviation.SECOND_RUN: "its log is of a slot that another session fills: a second run, or a second record of the same one",
+}
+
+
+def slots_summary(planned: int, missing: Sequence[str], due: bool = True, earlier: int = 0) -> str:
+    """How many of the planned sessions were found, and which are missing; before anything can be there (`due` False) none is."""
+    found = f"{planned - len(missing)} of {planned} planned sessions found"
+    found += f"; {counted(earlier, 'session')} of the plan signed before {'is' if earlier == 1 else 'are'} kept" if earlier else ""
+    return found if not missing or not due else f"{found}; {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"

@@ -11,10 +11,10 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
-from app.planning import wording
 from app.planning.plans import repository as plans
-from app.planning.plans.visits import today
+from app.planning.plans.repository import today
 from app.planning.slots import service
+from app.planning.slots.matching import DEVIATIONS, slots_summary
 from app.planning.slots.serializers import comparison_out
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
@@ -80,7 +80,7 @@ def _facts(found: service.Comparison, caller: Caller) -> dict[str, Any]:
         "asks_about_day": bool(found.asks_about_day),
         "due": due,
         "policies": {line.policy.id: line.policy.name for line in found.view.lines if line.policy},
-        "summary": wording.slots_summary(found.planned, shown.missing, due, found.carry_over),
-        "deviation_words": wording.DEVIATIONS,
+        "summary": slots_summary(found.planned, shown.missing, due, found.carry_over),
+        "deviation_words": DEVIATIONS,
         "may_confirm": may(caller, can.WRITE_STUDY, visit.participant) and not visit.locked,
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from app.planning import wording
+from app.planning.plans import wording
 from app.planning.plans.view import shown
 from app.planning.slots.matching import Deviation
 from app.planning.slots.schemas import SlotRowOut, VisitComparisonOut

@@ -13,7 +13,6 @@ from app.accounts.permissions import SYSTEM, Caller
 from app.ingest import repository as ingest
 from app.ingest.proposals import service as proposals
 from app.ingest.schemas import ProposalChange
-from app.planning import wording
 from app.planning.plans import view as plans
 from app.planning.plans.view import PlanLine, PlanView
 from app.planning.slots import repository
@@ -155,7 +154,7 @@ def confirm(db: Session, visit: Visit, caller: Caller, *, other_day: bool = Fals
         assert row.session is not None
         for sentence in _fill(db, row, waiting, caller):
             said.setdefault(sentence, []).append(row.session.id)
-    return [wording.of_sessions(ids, sentence) for sentence, ids in said.items()]
+    return [of_sessions(ids, sentence) for sentence, ids in said.items()]
 
 
 def _fill(db: Session, row: Row, waiting: dict[int, SessionProposal], caller: Caller) -> list[str]:
@@ -235,3 +234,8 @@ def _shown(db: Session, session: StudySession) -> dict[str, float]:
     found = {"energy": float(np.mean(fraction**2)) if fraction.size else None}
     found |= {name: getattr(session.qoc, name, None) for name in QUANTITIES[1:]}
     return {name: float(value) for name, value in found.items() if value is not None}
+
+
+def of_sessions(numbers: Sequence[int], sentence: str) -> str:
+    """Of which sessions something is said."""
+    return f"{'Session' if len(numbers) == 1 else 'Sessions'} {', '.join(map(str, numbers))}: {sentence}"

@@ -18,8 +18,7 @@ from starlette.datastructures import FormData
 
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
-from app.planning import wording
-from app.planning.visit_day import service
+from app.planning.visit_day import service, wording
 from app.planning.visit_day.record import (
     ASKED,
     ASKED_BY_KIND,

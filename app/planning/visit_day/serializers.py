@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.planning import wording
 from app.planning.plans.designs import Planned
-from app.planning.plans.key import common_limits, sealed
+from app.planning.plans.sign_off import common_limits, sealed
+from app.planning.plans.wording import STOP_RULES, design_name
 from app.planning.visit_day.schemas import DayDoseOut, DayOut, EntryOut, LimitsOut, SlotOut
 from app.planning.visit_day.service import Day
+from app.planning.visit_day.wording import MAY_NOT_RUN
 from app.platform.database import now
 from app.study import access
 from app.study.access import may
@@ -32,9 +33,9 @@ def day_out(day: Day, caller: Caller) -> DayOut:
         plan_id=plan.id,
         blinded=blinded,
         locked=visit.locked,
-        not_runnable=wording.MAY_NOT_RUN if blinded and day.not_runnable else day.not_runnable,
+        not_runnable=MAY_NOT_RUN if blinded and day.not_runnable else day.not_runnable,
         note="" if blinded else plan.note,
-        stop_rules=[wording.STOP_RULES],
+        stop_rules=[STOP_RULES],
         slots=[_slot(item, day, common if blinded else limits_of(item), blinded) for item in plan.items],
         entries=[EntryOut.model_validate(row) for row in day.entries],
         doses=[DayDoseOut.model_validate(row) for row in visit.doses],
@@ -59,7 +60,7 @@ def _slot(item: PlanItem, day: Day, limits: LimitsOut | None, blinded: bool) -> 
     if item.policy_id is not None:
         detail = day.policies[item.policy_id].name
     elif item.design is not None:
-        detail = wording.design_name(Planned.from_json(item.design))
+        detail = design_name(Planned.from_json(item.design))
     return SlotOut(
         plan_item_id=item.id,
         position=item.position,

@@ -14,10 +14,9 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation import repository as evaluations
-from app.planning import wording
 from app.planning.plans import repository as plans
 from app.planning.plans.view import read_plan, refuse_running
-from app.planning.visit_day import repository
+from app.planning.visit_day import repository, wording
 from app.planning.visit_day.record import GRADED, SEVERE, moment
 from app.planning.visit_day.schemas import AdverseEventPayload, DosePayload, EntryIn, EntryResult, NotePayload, StopCausePayload, Unreadable
 from app.planning.visit_day.screening import screen

@@ -11,8 +11,7 @@ from datetime import timedelta
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.planning import wording
-from app.planning.visit_day import repository
+from app.planning.visit_day import repository, wording
 from app.planning.visit_day.record import ASKED, GRADED, MILD, Entry, attempt_at, moment, outcome_of, said_of, standing
 from app.platform.database import set_reason
 from app.study import adverse_events as events

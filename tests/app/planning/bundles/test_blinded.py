@@ -267,7 +267,7 @@ def test_the_audit_trail_gives_no_limits_of_a_sealed_plans_bundles(
     kept = db.scalars(text("select reason from audit_event where entity = 'bundle_release' order by id")).all()
     assert kept == [f"session bundle of a blinded plan: session {n} of plan {plan['id']}, P1" for n in bundles]
     old = "controller bundle of P1, policy 7: 0.5 to 3 mA"  # as earlier versions wrote it
-    monkeypatch.setattr("app.planning.wording.release_reason", lambda manifest: old)
+    monkeypatch.setattr("app.planning.plans.wording.release_reason", lambda manifest: old)
     stored.remove(db.scalar(text("select sha256 from bundle_release order by id limit 1")))  # so that the file is stored anew
     assert client.get(f"/api/v1/visits/{study_world.visit}/plan/sessions/1/bundle").status_code == 200
     sealed = trail()

@@ -115,7 +115,7 @@ def test_the_audit_trail_says_who_took_which_limits_out(
 def test_a_release_is_a_row_and_no_sentence_is_read_for_it(
     client: TestClient, client_as: Callable[[str], TestClient], policy: int, db: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("app.planning.wording.release_reason", lambda manifest: "worded anew")
+    monkeypatch.setattr("app.planning.plans.wording.release_reason", lambda manifest: "worded anew")
     content = take(client_as("clinician"), policy, min_ma=0.5, max_ma=3.0, ramp_ma_per_s=0.25).content
     (row,) = releases(db, policy)
     assert (row.created_by, row.policy_id, row.hemisphere, row.approvals) == ("clinician@clinic.example", policy, None, [])

@@ -13,10 +13,10 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
-from app.planning.draft_form import held_rows
 from app.planning.plans.designs import Planned, SideBound, delivered_ma
+from app.planning.plans.draft_form import held_rows
 from app.planning.plans.suggested import Held
-from app.planning.wording import design_words
+from app.planning.plans.wording import design_words
 from ml.deploy.bundle import open_bundle
 from ml.designs import LOW_AMPLITUDE, LOW_SECONDS, NEAR_SPREAD, Bound, near_session
 from ml.ope.posterior.further_sessions import Hold, Place, reachable

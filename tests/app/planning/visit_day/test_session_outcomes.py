@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import SYSTEM
 from app.planning.visit_day.repository import entries_beside
 from app.planning.visit_day.session_outcomes import differences, take_outcomes
-from app.planning.wording import STOPPED_FOR_PARTICIPANT
+from app.planning.visit_day.wording import STOPPED_FOR_PARTICIPANT
 from app.tables.sessions import StudySession
 
 TABLE = "t_s,beta,amplitude_fraction\n" + "".join(f"{2 * k},1,1\n" for k in range(-9, 31))

@@ -17,8 +17,8 @@ from app.evaluation.ranking.judged import Judged
 from app.evaluation.ranking.service import current
 from app.evaluation.ranking.verdict_wording import plainly
 from app.learning import repository as learning
-from app.planning import wording
 from app.planning.grounds import events_against
+from app.planning.plans import wording
 from app.planning.plans.designs import offered
 from app.planning.plans.schemas import HeldIn, LimitIn, PlanIn, PlanOptions
 from app.planning.plans.service import rules_of

@@ -1,4 +1,4 @@
-"""Sentences of planning, made of typed values at the last moment; nothing reads them back."""
+"""Sentences about plans, made of typed values at the last moment; nothing reads them back."""
 
 from __future__ import annotations
 
@@ -10,11 +10,7 @@ from app.planning.notices import OF_METHODS, Code, PlanWarning
 from app.planning.plans.designs import NEAR, Planned, SideBound, delivered_ma, is_held
 from app.planning.plans.suggested import Held
 from app.planning.protocol.session_order import Order
-from app.planning.slots.matching import Deviation
-from app.planning.visit_day.record import ASKED, ASKED_BY_KIND, AskedOutcome, Contradiction, Entry, moment
-from app.planning.visit_day.schemas import SlotOut
-from app.planning.visit_day.screening import Found
-from app.platform.numbers import counted, stated
+from app.platform.numbers import counted, elapsed_time
 from app.study.blinding import CONTROLLER_NAMES
 from app.tables.adverse_events import AdverseEvent
 from app.tables.plans import Plan, PlanItem
@@ -22,13 +18,12 @@ from app.tables.sessions import Controller
 from ml.deploy.manifest import BundleManifest
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS, NEAR_SPREAD
 from ml.ope import Suggestion
-from ml.outcomes import BY_FIELD
 
 LEAVE_AT_ONCE = "A stop, an adverse event or a lost link: back to cDBS at once; the rest of the session is not made up for."
 
 
 def release_reason(manifest: BundleManifest) -> str:
-    """Why a bundle's bytes were stored, for the audit trail; of a blinded plan nothing that tells one session from another."""
+    """Describe why a bundle's bytes were stored, for the audit trail; of a blinded plan nothing that distinguishes its sessions."""
     if manifest.slot is not None and manifest.slot.label:
         place = f"session {manifest.slot.position} of plan {manifest.slot.plan_id}"
         return f"session bundle of a blinded plan: {place}, {manifest.participant}"
@@ -82,13 +77,13 @@ def happened(policy: str | None, events: Sequence[AdverseEvent]) -> str:
 
 
 def _listed(numbers: Sequence[int]) -> str:
-    """As "3", "3 and 4", "3, 4 and 5"."""
+    """List numbers as "3", "3 and 4", "3, 4 and 5"."""
     *first, last = map(str, numbers)
     return f"{', '.join(first)} and {last}" if first else last
 
 
 def warning(found: PlanWarning) -> str:
-    """The sentence of a warning."""
+    """Write the sentence of a warning."""
     values = dict(found.values) | {"policy": found.policy}
     if found.code is Code.ADVERSE_EVENT:
         return f"The plan may not run: {happened(found.policy, values.get('events', ()))}. {ANSWER_EVENT}"
@@ -106,7 +101,7 @@ def warning(found: PlanWarning) -> str:
 
 
 def plain_warnings(warnings: Sequence[PlanWarning]) -> list[tuple[PlanWarning, str]]:
-    """Those that whoever signs or runs the plan reads, with their sentences; what is about methods is told in plain words or left out."""
+    """Select the warnings for those who sign or run the plan, with their sentences; what is about methods is in plain words or excluded."""
     told = []
     for found in warnings:
         if found.code not in OF_METHODS:
@@ -117,7 +112,7 @@ def plain_warnings(warnings: Sequence[PlanWarning]) -> list[tuple[PlanWarning, s
 
 
 def method_notes(warnings: Sequence[PlanWarning]) -> list[str]:
-    """What engineers read of the ranking behind a plan."""
+    """List what engineers read of the ranking behind a plan."""
     return [warning(found) for found in warnings if found.code in OF_METHODS]
 
 
@@ -129,14 +124,14 @@ STOP_RULES = (
 
 
 def suggestion(why: Suggestion, first: bool) -> str:
-    """Why a policy is suggested for a visit, in one sentence."""
+    """Describe why a policy is suggested for a visit, in one sentence."""
     than = "than cDBS" if first else "than all above"
     tells = f"; its test alone would settle {chance(why.informs)} of what is open about the others" if why.informs >= TELLING else ""
     return f"{chance(why.better)} likely to turn out better on the whole {than}{tells}."
 
 
 def holding(held: Held) -> str:
-    """What sessions near an amplitude would tell, in one sentence."""
+    """Describe what sessions near an amplitude would show, in one sentence."""
     further = held.hold.further
     if further is None:
         return (
@@ -155,80 +150,22 @@ TELLING = 0.2
 """Share of what is open about the other candidates from which a policy's test is said to tell about them."""
 
 
-def screened(found: Sequence[Found]) -> str:
-    """Why a note is not kept, in one sentence."""
-    what = {"date": "a date", "number": "a number of four or more digits", "address": "an address", "name": "a word that looks like a name"}
-    return "The note holds " + "; ".join(f"{what[f.kind]} ('{f.text}')" for f in found) + "."
-
-
-DAY_STATES = {"waiting": "to come", "running": "running", "asked": "to be rated", "done": "finished", "skipped": "skipped"}
-"""How far a session of the clinic day is."""
-_MATTERS = {
-    "start": "starts", "stop": "stops", "stop_cause": "causes of the early stop",
-    **{one.kind: one.several for one in ASKED},
-    "skip": "reasons for skipping it", "speech": "grades of speech", "gait": "grades of gait", "dyskinesia": "grades of dyskinesia",
-}  # fmt: skip
-
-
-def contradiction(found: Contradiction, slots: Sequence[SlotOut]) -> str:
-    """What two entries say differently, in one sentence."""
-    position = next((slot.position for slot in slots if slot.plan_item_id == found.plan_item_id), 0)
-    said = ", ".join(f"{_entered(entry)} by {entry.entered_by} at {moment(entry):%H:%M:%S} UTC" for entry in found.entries)
-    what = _MATTERS.get(found.kind, "entries")
-    return f"Session {position} has {len(found.entries)} different {what}: {said}. None counts until one is chosen."
-
-
-MAY_NOT_RUN = "This plan may not run any more. A clinician who may open its key sees why on the page of the plan."
-CORRECTED_ON_THE_DAY = "the entry was corrected on the clinic day"
-STOPPED_FOR_PARTICIPANT = "stopped for the participant's sake on the clinic day"
-
-
-def from_the_day(who: Sequence[str]) -> str:
-    """Why a session has outcomes that nobody typed beside it."""
-    return "entered on the clinic day" + (f" by {', '.join(who)}" if who else "")
-
-
-def day_differs(outcome: AskedOutcome, entered: float, known: float | None) -> str:
-    """Describe a QoC that the clinic day has otherwise than the session, which keeps its own; `known` None: a person took it back."""
-    what = BY_FIELD[outcome.field].label.lower()
-    own = "none" if known is None else f"{stated(known, 3)}{outcome.unit}"
-    return f"The clinic day has a {what} of {stated(entered, 3)}{outcome.unit}, the session {own}; the session keeps its own."
-
-
-def day_ended(elapsed_s: float, recorded_s: float) -> str:
-    """Describe a session that the clinic day ends at another time than its recording."""
-    said, recorded = _clock(elapsed_s), _clock(recorded_s)
-    return f"The clinic day has it stopped after {said}, and its recording is {recorded} long: one of the two is wrong."
-
-
-def open_contradiction(kind: str) -> str:
-    """A matter of which the clinic day has two entries that say different things."""
-    return f"The clinic day has different {_MATTERS.get(kind, 'entries')}; none was taken. Choose one on the page of the day."
-
-
-def _entered(entry: Entry) -> str:
-    payload = entry.payload
-    if entry.kind in ASKED_BY_KIND:
-        return ASKED_BY_KIND[entry.kind].words(payload)
-    return str(payload.get("value") or payload.get("grade") or payload.get("reason") or payload.get("cause") or entry.kind)
-
-
 def scheduled_name(design: str, level: float | None) -> str:
-    """What a bundle calls a session without a policy."""
+    """Name a session without a policy, as its bundle does."""
     if design == NEAR and level is not None:
         return f"session held near {level:.2f} of cDBS"
     return "cDBS" if design == "constant" else f"random session, {design} design"
 
 
 def design_name(planned: Planned) -> str:
-    """A design in two words, for a table."""
+    """Name a design in two words, for a table."""
     if planned.design == NEAR:
         return f"held near {_near(planned)}"
     return {"paper": "paper's draws", "ladder": "titration ladder"}.get(planned.design) or f"level {planned.level:.2f} of cDBS"
 
 
 def design_words(planned: Planned) -> str:
-    """What a random session tries, in one clause."""
+    """Describe what a random session tries, in one clause."""
     if planned.design == "paper":
         return f"the paper's design: a new draw every {planned.period_s:g} s, uniform from {planned.bound:g} to 1 of cDBS"
     if planned.design == "ladder":
@@ -243,14 +180,14 @@ def design_words(planned: Planned) -> str:
 
 
 def _near(planned: Planned) -> str:
-    """The amplitude of a session that is held near one: milliamperes by side where they are known, and the share of cDBS."""
+    """Format the amplitude near which a session stays: milliamperes by side where they are known, and the share of cDBS."""
     share = f"{planned.level:.2f} of cDBS"
     given = ", ".join(_side(b, f"{(planned.level or 0.0) * b.cdbs_ma:.1f} mA") for b in planned.bounds)
     return f"{given} ({share})" if given else share
 
 
 def bound_words(planned: Planned, bounds: tuple[SideBound, ...]) -> str:
-    """What a random session never does, in milliamperes where the cDBS amplitude is known."""
+    """Describe what a random session never does, in milliamperes where the cDBS amplitude is known."""
     if not bounds:
         return f"never below {planned.bound:g} of cDBS; its cDBS amplitude is not known, so that no bound in mA can be given"
     lowest = ", ".join(_side(b, f"{b.lowest_ma:g} mA") for b in bounds)
@@ -263,10 +200,10 @@ def bound_words(planned: Planned, bounds: tuple[SideBound, ...]) -> str:
 
 
 def schedule_words(planned: Planned, bounds: tuple[SideBound, ...]) -> str:
-    """Every held amplitude with the minute it begins at: milliamperes by side, fractions of cDBS where those are not known."""
-    held = [f"{_clock(h.start * planned.period_s)} {_given(h.amplitude, bounds)}" for h in planned.holds]
+    """List every amplitude with the minute it begins at: milliamperes by side, fractions of cDBS where those are not known."""
+    held = [f"{elapsed_time(h.start * planned.period_s)} {_given(h.amplitude, bounds)}" for h in planned.holds]
     last = planned.holds[-1]
-    after = [f"{_clock((last.start + last.steps) * planned.period_s)} cDBS"]  # a ladder may end before the session does
+    after = [f"{elapsed_time((last.start + last.steps) * planned.period_s)} cDBS"]  # a ladder may end before the session does
     return "  ".join(held + after)
 
 
@@ -293,42 +230,15 @@ ORDER_NAMES = {
 }
 
 
-DEVIATIONS: dict[Deviation, str] = {
-    Deviation.MISSING: "not found",
-    Deviation.UNPLANNED: "not planned",
-    Deviation.OUT_OF_ORDER: "in another order than planned",
-    Deviation.SHORTER: "shorter than planned",
-    Deviation.LONGER: "longer than planned",
-    Deviation.OTHER_DAY: "held on another day than the visit's",
-    Deviation.OTHER_TIME: "began at another time than the clinic day says: one of the two clocks is wrong",
-    Deviation.OTHER_PLAN: "its log is of a session of another plan",
-    Deviation.EARLIER_PLAN: "of the plan that was signed before this one",
-    Deviation.ABORTED: "an aborted start of a planned session: its controller never decided",
-    Deviation.SECOND_RUN: "its log is of a slot that another session fills: a second run, or a second record of the same one",
-}
-
-
-def slots_summary(planned: int, missing: Sequence[str], due: bool = True, earlier: int = 0) -> str:
-    """How many of the planned sessions were found, and which are missing; before anything can be there (`due` False) none is."""
-    found = f"{planned - len(missing)} of {planned} planned sessions found"
-    found += f"; {counted(earlier, 'session')} of the plan signed before {'is' if earlier == 1 else 'are'} kept" if earlier else ""
-    return found if not missing or not due else f"{found}; {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
-
-
-def of_sessions(numbers: Sequence[int], sentence: str) -> str:
-    """Of which sessions something is said."""
-    return f"{'Session' if len(numbers) == 1 else 'Sessions'} {', '.join(map(str, numbers))}: {sentence}"
-
-
 def order_words(plan: Plan) -> str:
-    """How the order of a plan's policies was found."""
+    """Describe how the order of a plan's policies was found."""
     order = Order(plan.rules.get("order", Order.DRAWN))
     block = f", block {plan.rules.get('block', 0) + 1}" if order in (Order.WILLIAMS, Order.LATIN_SQUARE) else ""
     return ORDER_NAMES[order] + block
 
 
 def limits_ma(item: PlanItem) -> str:
-    """The limits of a planned session, mA."""
+    """Format the limits of a planned session, mA."""
     if item.min_ma is None or item.max_ma is None:
         return "not set"
     return f"{item.min_ma:g}" if item.min_ma == item.max_ma else f"{item.min_ma:g} to {item.max_ma:g}"
@@ -336,10 +246,6 @@ def limits_ma(item: PlanItem) -> str:
 
 def _given(fraction: float, bounds: tuple[SideBound, ...]) -> str:
     return "/".join(f"{delivered_ma(fraction, b):.1f}" for b in bounds) or f"{fraction:.2f}"
-
-
-def _clock(seconds: float) -> str:
-    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
 def _side(bound: SideBound, words: str) -> str:
