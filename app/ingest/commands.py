@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 from app.accounts.permissions import SYSTEM
@@ -16,14 +17,18 @@ from app.platform.database import transaction
 from app.platform.terminal import ACTOR, AsJson, show
 from app.settings import get_settings
 
+if TYPE_CHECKING:
+    from app.ingest.study_import import StudyReport
+
 ingest_app = typer.Typer(no_args_is_help=True, help="Stored uploads.")
 
 
 def import_(
-    path: Annotated[
-        Path, typer.Argument(exists=True, dir_okay=False, help="A zip of an RC+S session folder, a Percept report, a table, an export.")
+    paths: Annotated[
+        list[Path],
+        typer.Argument(exists=True, help="A zip of an RC+S session folder, a Percept report, a table, an export; with --study folders."),
     ],
-    participant: Annotated[str, typer.Option(help="Code of the participant.")],
+    participant: Annotated[str | None, typer.Option(help="Code of the participant; with --study the sheet names them.")] = None,
     visit: Annotated[int | None, typer.Option(min=1, help="Number of the visit; left out, it is proposed by its date.")] = None,
     controller: Annotated[
         str | None, typer.Option(help="cdbs, rl, distilled, no_dbs, random or other; left out, sessions are proposed.")
@@ -31,17 +36,45 @@ def import_(
     policy: Annotated[str | None, typer.Option(help="Name or number of the policy that ran.")] = None,
     started_at: Annotated[datetime | None, typer.Option(help="Start of the session, UTC.")] = None,
     beta_unit: Annotated[str | None, typer.Option(help="Unit of a table's beta; the participant's when left out.")] = None,
+    study: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Sheet with a row per session, CSV or xlsx.")] = None,
+    zone: Annotated[str | None, typer.Option(help="Zone of the sheet's times, such as Europe/Berlin or +01:00.")] = None,
+    dictionary: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="The sheet's REDCap data dictionary.")] = None,
+    column: Annotated[list[str] | None, typer.Option(help="Meaning and header of a column, such as start=Begin; repeated.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what --study would do, and change nothing.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Import a file, as an upload does: with visit and controller its sessions count at once, else they wait for confirmation."""
+    """Import a file, or with --study folders of files and a sheet with a row per session.
+
+    A file's sessions count at once with visit and controller, else they wait for confirmation. A study's sessions are those of the sheet.
+    """
+    if (store := bucket()) is not None:
+        store.check_keys(get_settings())
+    if study is not None:
+        if participant or visit or controller or policy or started_at or beta_unit:
+            raise typer.BadParameter("With --study the sheet says what each session is.", param_hint="--study")
+        _import_study(paths, study, zone, dictionary, column or [], dry_run, as_json)
+        return
+    if participant is None or len(paths) != 1 or paths[0].is_dir():
+        raise typer.BadParameter("Name one file and --participant, or folders and --study.", param_hint="PATHS")
+    _import_file(paths[0], participant, visit, controller, policy, started_at, beta_unit, as_json)
+
+
+def _import_file(
+    path: Path,
+    participant: str,
+    visit: int | None,
+    controller: str | None,
+    policy: str | None,
+    started_at: datetime | None,
+    beta_unit: str | None,
+    as_json: bool,
+) -> None:
     from app.ingest.uploads import api, service
     from app.study import repository as study
     from app.tables.sessions import Controller
 
     if controller is not None and controller not in set(Controller):
         raise typer.BadParameter(f"'{controller}' is none of {', '.join(Controller)}.", param_hint="--controller")
-    if (store := bucket()) is not None:
-        store.check_keys(get_settings())
     with transaction(ACTOR) as db, path.open("rb") as stream:
         person = study.participant_by_code(db, participant, SYSTEM)
         arm = Controller(controller) if controller is not None else None
@@ -52,6 +85,57 @@ def import_(
         answer = api.upload_out(db, outcome, SYSTEM).model_dump(mode="json")
     lines = [f"{r['name']}: {s}" for r in answer["report"] for key in ("understood", "repaired", "flagged", "removed") for s in r[key]]
     show(answer, as_json, "\n".join(lines))
+
+
+def _import_study(
+    folders: list[Path], sheet: Path, zone: str | None, dictionary: Path | None, columns: list[str], dry_run: bool, as_json: bool
+) -> None:  # fmt: skip
+    from app.ingest.study_import import import_study
+    from ml.formats import UndecodableFile
+    from ml.formats.studies.sheet import read_sheet
+    from ml.formats.tables.cells.dates import zone_named
+
+    named = zone_named(zone) if zone is not None else None
+    if zone is not None and named is None:
+        raise typer.BadParameter(f"'{zone}' is neither an offset nor a zone with a name.", param_hint="--zone")
+    if wrong := [c for c in columns if "=" not in c]:
+        raise typer.BadParameter(f"'{wrong[0]}' is not written as MEANING=HEADER.", param_hint="--column")
+    try:
+        meaning = dict(c.split("=", 1) for c in columns)
+        rows = read_sheet(sheet.read_bytes(), named, dictionary.read_bytes() if dictionary else None, meaning)
+    except UndecodableFile as error:
+        raise typer.BadParameter(f"{error.what} ({error.where}). {error.hint}", param_hint="--study") from error
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("reading", total=None)
+        report = import_study(
+            folders, rows, SYSTEM, ACTOR, dry_run, lambda n, of, name: bar.update(task, completed=n, total=of, description=name[-40:])
+        )  # fmt: skip
+    if as_json:
+        show({**vars(report), "ignored_columns": rows.ignored}, True, "")
+    else:
+        _print_study(report, rows.ignored)
+    if report.problems or report.rows or report.files:
+        raise typer.Exit(1)
+
+
+def _print_study(report: StudyReport, columns: list[str]) -> None:
+    listed = Table("line", "participant", "file", "would be done" if report.dry_run else "done")
+    for line, code, file, said in report.sessions:
+        listed.add_row(str(line), code, file, said)
+    Console().print(listed)
+    for title, found in (
+        ("Rows without a session", [(f"line {line}", why) for line, why in report.rows]),
+        ("Files without a row", report.files),
+        ("Files that could not be read", report.problems),
+    ):
+        typer.echo(f"{title}: {len(found)}")
+        for name, why in found:
+            typer.echo(f"  {name}: {why}")
+    if report.notes:
+        typer.echo(f"Notes of {report.notes} rows were not kept: they may name people.")
+    if columns:
+        typer.echo(f"Columns of no use: {', '.join(columns)}")
+    typer.echo("Nothing was changed." if report.dry_run or not report.changed else f"Changed: {report.changed} files, visits and sessions.")
 
 
 @ingest_app.command("redecode", epilog="Example: betaloop ingest redecode --participant P1 --dry-run")

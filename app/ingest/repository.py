@@ -44,6 +44,12 @@ def failed_file(db: Session, participant_id: int, file: UploadFile) -> UploadFil
     return db.scalar(query.order_by(UploadFile.id).limit(1))
 
 
+def refused_file(db: Session, participant_id: int, sha256: str) -> UploadFile | None:
+    """Find the participant's file of these original bytes that could not be used, and that awaits a decision."""
+    same = (UploadFile.participant_id == participant_id) & (UploadFile.original_sha256 == sha256) & (UploadFile.status == "failed")
+    return db.scalar(select(UploadFile).where(same, UploadFile.decided_at.is_(None)).order_by(UploadFile.id).limit(1))
+
+
 def names_stored(db: Session, sha256: str) -> bool:
     """Decide whether any uploaded file has these stored bytes, cleaned, encrypted or released."""
     columns = (UploadFile.stored_sha256, UploadFile.quarantine_sha256, UploadFile.released_sha256)

@@ -15,17 +15,18 @@ from app.platform.terminal import ACTOR, AsJson, Code, bad_call, reason, say, sh
 def export_package(
     code: Code,
     to: Annotated[Path | None, typer.Option(help="Zip to write; CODE.zip when left out.")] = None,
+    sheet: Annotated[bool, typer.Option("--sheet", help="A CSV of its sessions, as `betaloop import --study` reads it.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Write everything of a participant as a zipped Frictionless data package, with a script that recomputes its primary tables."""
-    from app.overview.package import export_participant
+    from app.overview.package import export_participant, export_sheet
     from app.study import repository as study
 
-    target = to or Path(f"{code}.zip")
+    target = to or Path(f"{code}.csv" if sheet else f"{code}.zip")
     if target.is_dir() or not target.parent.is_dir():
         raise bad_call(f"{target} cannot be written: " + ("it is a folder." if target.is_dir() else f"there is no folder {target.parent}."))
     with transaction(ACTOR) as db:
-        content = export_participant(db, study.participant_by_code(db, code, SYSTEM), SYSTEM)
+        content = (export_sheet if sheet else export_participant)(db, study.participant_by_code(db, code, SYSTEM), SYSTEM)
     try:
         target.write_bytes(content)
     except OSError as error:

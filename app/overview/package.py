@@ -20,6 +20,7 @@ from app.analysis.standing import standing_sentences
 from app.evaluation import wording
 from app.evaluation.estimates.coverage import coverage_by_policy
 from app.evaluation.estimates.rows import estimate_of
+from app.ingest.study_import import sheet_of
 from app.overview import repository
 from app.overview.package_dictionary import FIELDS, TITLES, Days, descriptor
 from app.platform.audit import record
@@ -34,11 +35,19 @@ from app.study.settings_types import SettingsOut
 from app.tables.learning import Policy
 from app.tables.participants import Participant
 from app.tables.visits import Drug
+from ml.formats.studies.sheet import write_sheet
 from ml.outcomes import BY_KEY, OUTCOMES, Outcome
 from ml.qoc import Margins
 from ml.statistics.within_visits.contrasts import Average
 
 # A participant's record as a Frictionless data package: tables, their dictionary, and a script that checks them.
+
+
+def export_sheet(db: Session, participant: Participant, caller: Caller) -> bytes:
+    """Write a participant's confirmed sessions as the sheet that imports them with their files."""
+    access.require(caller, can.READ, participant)
+    record(db, "export", "participant", participant.id)
+    return write_sheet(sheet_of(db, participant, caller)).encode()
 
 
 def export_participant(db: Session, participant: Participant, caller: Caller) -> bytes:

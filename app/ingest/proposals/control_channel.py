@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from app.ingest import channels, programs
+from app.ingest import channels
 from app.ingest.proposals.evidence import Evidence, Reason, Source
 from app.study import repository as study
 from app.study.sessions import changes
@@ -57,13 +57,13 @@ def choose_program(db: Session, session: StudySession) -> Evidence | None:
     """Take the program that the controller is likely to have set; why, None where the control recording has one program at most."""
     control = next(s for s in session.segments if s.is_control)
     traces = study.traces_of_recording(db, control.recording_id)
-    found = programs.of_part(traces, control.start_s, control.stop_s)
+    found = channels.programs_of_part(traces, control.start_s, control.stop_s)
     if len(found) < 2:
         session.control_program = None
         return None
     session.control_program = found[0].number
-    known = [{"number": p.number, "how": p.how, "low": p.low, "high": p.high} for p in found if p.how is not programs.How.UNKNOWN]
-    unknown = [{"number": p.number, "how": p.how} for p in found if p.how is programs.How.UNKNOWN]
+    known = [{"number": p.number, "how": p.how, "low": p.low, "high": p.high} for p in found if p.how is not channels.How.UNKNOWN]
+    unknown = [{"number": p.number, "how": p.how} for p in found if p.how is channels.How.UNKNOWN]
     return Evidence(Source.RECORDING, Reason.PROGRAM, {"program": found[0].number, "programs": [*known, *unknown]})
 
 

@@ -40,6 +40,9 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 _CODE = re.compile(r"[A-Za-z0-9_.-]{1,40}")
 _LONGEST = 8000
 
+STATED_FIELDS = ("lower_bound", "design", "design_parameters")
+"""What may be stated of the design of a random session: B, the name, and levels and holds."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Ran:

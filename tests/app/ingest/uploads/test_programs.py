@@ -109,6 +109,12 @@ def test_the_proposal_says_which_program_was_taken_and_a_person_names_another(se
     wrong = correct(client, named | {"version": named["version"] + 1}, control_program=3)
     assert (wrong.status_code, "no amplitude of program 3" in wrong.text) == (422, True)
     current = client.get(f"/api/v1/proposals/{named['session']['id']}").json()
+    # the settings say another amplitude of program 0 than the log does
+    path = f"/api/v1/proposals/{named['session']['id']}"
+    choice = {"source": "StimLog", "reason": "as it ran", "version": current["version"]}
+    chosen = client.put(f"{path}/amplitude-source", json=choice)
+    assert chosen.status_code == (200 if current["amplitude_conflicts"] else 422), chosen.text
+    current = client.get(path).json()
     notes = " ".join(post(client, current, "confirm", controller="random").json()["notes"])
     assert "moved as well as that of right side, program 0" in notes
 
