@@ -1,6 +1,6 @@
 """Samples and amplitudes that are wrong in random files of every lab format, and what reading a large file takes.
 
-    python benchmarks/recordings.py [--files 500] [--quick]
+    python benchmarks/recordings.py [--files 500] [--kinds nwb bids] [--quick]
 
 The files are those of `tests/ml/formats/peers`, written by another library or by the specification, with known samples, bursts, gaps and
 steps. Nothing may be wrong, at least 95 % of what a perfect reader could use must be usable. A large file is then read by the format's
@@ -97,6 +97,7 @@ def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--files", type=int, default=500, help="random files of each format")
+    parser.add_argument("--kinds", nargs="+", choices=sorted(WRITERS), default=sorted(WRITERS), help="formats to measure (default: all)")
     parser.add_argument("--quick", action="store_true", help="five files of each format, and a large one of 5 MB")
     args = parser.parse_args()
     files, megabytes = (5, 5) if args.quick else (args.files, 50)
@@ -106,7 +107,7 @@ def main() -> None:
     faults: list[str] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for kind in sorted(WRITERS):
+        for kind in sorted(args.kinds):
             n, found = judge(kind, files, folder)
             faults += found
             usable, known = 100 * n["found_samples"] / max(1, n["samples"]), 100 * n["known_steps"] / max(1, n["steps"])
@@ -117,7 +118,7 @@ def main() -> None:
         sys.stdout.write(
             "\n| format | file | CPU, library | CPU, ours | ratio | memory, library | memory, ours |\n|---|---|---|---|---|---|---|\n"
         )
-        for kind, (ours, library, load) in READERS.items():
+        for kind, (ours, library, load) in ((k, v) for k, v in READERS.items() if k in args.kinds):
             LARGE[kind](folder / "large", megabytes)
             redact(folder / "large", folder / "clean", kind, bytes(32))
             size = (folder / "clean").stat().st_size

@@ -27,6 +27,7 @@ from app.study.repository import participant_by_code
 from app.tables.participants import Hemisphere
 from app.tables.sessions import StudySession
 from app.tables.visits import CdbsAmplitude
+from tests.app.ingest.uploads.test_uploads_of_formats import FILES
 
 COMMANDS = (
     "serve", "worker", "demo", "migrate", "user add", "token create", "import", "pipeline", "rank", "export", "control",
@@ -108,6 +109,16 @@ def test_import_and_export_carry_a_session_round(study: str, tmp_path: Path, bet
         sessions = archive.read(f"{study}/sessions.csv").decode()
     assert steps[-1].split(",")[1:] == ["4.0", "2.0", "1.5", "0.5"]
     assert "random" in sessions
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("kind", sorted(FILES))
+def test_import_reads_a_lab_s_recording(kind: str, study: str, tmp_path: Path, betaloop: Betaloop) -> None:
+    FILES[kind](tmp_path / "file")
+    done = betaloop("import", str(tmp_path / "file"), "--participant", study, "--visit", "1", "--controller", "other", "--json")
+    assert done.returncode == 0, done.stderr
+    (session,) = json.loads(done.stdout)["sessions"]
+    assert (session["controller"], session["duration_s"]) == ("other", 60)
 
 
 @pytest.mark.parametrize(

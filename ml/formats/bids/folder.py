@@ -98,7 +98,7 @@ def find_runs(files: Files) -> tuple[list[Run], list[str]]:
     if (people := len({dict(n.entities).get("sub", "") for n in data})) > 1:
         raise UndecodableFile(f"the folder has recordings of {people} participants", "sub-…", f"Upload them one by one. {HINT}")
     runs = [_run(one, names) for one in data]
-    used = {path for run in runs for path in (*run.sidecars, run.channels, run.events)}
+    used = {path for run in runs for path in (*run.sidecars, *run.event_heads, run.channels, run.events)}
     orphans = {
         n.entities for n in names if n.suffix in ("ieeg", "channels", "events") and n.ending in (".json", ".tsv") and n.path not in used
     }

@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 Rows = tuple[Floats, Floats]
 """Mean amplitude per row, mA, [rows], NaN where unknown; and the known share of each row, [rows]."""
 
+SAME_S = 1e-3
+"""An end and the next begin that are no further apart are one moment, as texts round both."""
 WAVEFORM = 0.05
 """A channel that changes at more than this share of its samples shows the pulses, not the amplitude."""
 
@@ -115,17 +117,20 @@ def _of_marks(
 ) -> Rows:  # fmt: skip
     """Compute the amplitude that marks state. A mark of one moment holds until the next; one with a duration holds for that alone."""
     knots: list[tuple[float, int, float]] = []
+    begins = np.array(sorted(m.t_s for m in marks))
     for mark in sorted(marks, key=lambda m: m.t_s):
         dose = mark.statement.dose_ma
         value = np.nan if dose is None or dose >= UPPER_PLAUSIBLE_MA else dose
-        # to the microsecond: an end that is the next one's begin is not after it
-        knots.append((round(mark.t_s, 6), 2, value))
+        knots.append((mark.t_s, 2, value))
         if mark.duration_s:
-            knots.append((round(mark.t_s + mark.duration_s, 6), 1, np.nan))
+            end = mark.t_s + mark.duration_s
+            after = max(np.searchsorted(begins, end - SAME_S), np.searchsorted(begins, mark.t_s, "right"))
+            if after == begins.size or begins[after] > end + SAME_S:
+                knots.append((end, 1, np.nan))
     if content.marks_pause:
         # what was set while nothing was recorded is in no mark
-        lasting = [(m.t_s, m.t_s + m.duration_s) for m in marks if m.lasting and m.duration_s]
-        knots += [(at, 0, np.nan) for at, _ in _pauses(content) if not any(begin <= at < end for begin, end in lasting)]
+        lasting = np.array([(m.t_s, m.t_s + m.duration_s) for m in marks if m.lasting and m.duration_s]).reshape(-1, 2)
+        knots += [(at, 0, np.nan) for at, _ in _pauses(content) if not np.any((lasting[:, 0] <= at) & (at < lasting[:, 1]))]
     if content.cut_s is not None:
         knots.append((content.cut_s, 3, np.nan))
     knots.sort(key=lambda k: (k[0], k[1]))

@@ -72,6 +72,8 @@ def test_events_state_the_amplitude_for_their_duration_and_in_the_unit_of_the_si
     files["task-rest_events.json"] = json.dumps({"amplitude": {"Units": "uA"}}).encode()
     got = amplitude(read(tmp_path / "a.zip", files)[0])
     np.testing.assert_allclose(got[:16], [np.nan] * 2 + [2.5] * 5 + [np.nan] * 3 + [1.5] * 6)
+    _, done = read(tmp_path / "c.zip", files)
+    assert not any("no data file" in s for s in done.flagged)
     del files["task-rest_events.json"]
     found, _ = read(tmp_path / "b.zip", files)
     assert np.isnan(amplitude(found)).all()

@@ -155,7 +155,7 @@ def write_nwb(path: Path, rng: np.random.Generator, marked: bool = True) -> Writ
     pause = not marked or nwb.add_dose(file, truth, rng, WORDS, begin_s)
     if rng.integers(2):
         # what another sensor recorded meanwhile shows that the recording went on, and so did its marks
-        nwb.add_others(file, truth)
+        nwb.add_others(file, truth, begin_s)
         pause = False
     nwb.write(path, file)
     target = "" if place == "unknown" else "STN "

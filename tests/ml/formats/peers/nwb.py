@@ -103,8 +103,10 @@ def add_dose(file: pynwb.NWBFile, truth: Truth, rng: np.random.Generator, words:
     return how == "annotations"
 
 
-def add_others(file: pynwb.NWBFile, truth: Truth) -> None:
+def add_others(file: pynwb.NWBFile, truth: Truth, begin_s: float) -> None:
     """Add what is no field potential: an accelerometer in g, and a hand's place."""
     n = int(truth.total / truth.rate_hz * 50)
-    file.add_acquisition(pynwb.TimeSeries(name="ACC", data=np.random.default_rng(0).normal(0, 1, (n, 3)), unit="g", rate=50.0))
-    file.add_acquisition(SpatialSeries(name="hand", data=np.zeros((n, 2)), reference_frame="the corner", rate=50.0))
+    file.add_acquisition(
+        pynwb.TimeSeries(name="ACC", data=np.random.default_rng(0).normal(0, 1, (n, 3)), unit="g", rate=50.0, starting_time=begin_s)
+    )
+    file.add_acquisition(SpatialSeries(name="hand", data=np.zeros((n, 2)), reference_frame="the corner", rate=50.0, starting_time=begin_s))
