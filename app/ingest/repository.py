@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
+from typing import Any
 
 from sqlalchemy import func, or_, select, text, true
 from sqlalchemy.orm import Session, joinedload, selectinload
@@ -15,7 +16,7 @@ from app.study.sessions.repository import SLACK_S
 from app.tables.participants import Participant
 from app.tables.recordings import Device, Recording
 from app.tables.sessions import SessionSegment, StudySession
-from app.tables.uploads import SessionProposal, Upload, UploadFile
+from app.tables.uploads import SessionProposal, SignalMeaning, Upload, UploadFile
 from app.tables.visits import Visit
 
 GRASP_KIND = "grasp"
@@ -260,3 +261,26 @@ def readable_files(db: Session, participant_id: int | None, upload_file_id: int 
 def defer_counting(db: Session, deferred: bool) -> None:
     """Let minutes count twice until this is called again with False, which raises IntegrityError where they still do."""
     db.execute(text(f"set constraints counted_time_once {'deferred' if deferred else 'immediate'}"))
+
+
+def meanings(db: Session, study_id: int) -> dict[str, SignalMeaning]:
+    """Find the newest version of each meaning of markers and channels in a study, by its key, removed ones too."""
+    rows = db.scalars(select(SignalMeaning).where(SignalMeaning.study_id == study_id).order_by(SignalMeaning.version)).all()
+    return {row.key: row for row in rows}
+
+
+def meanings_in_force(db: Session, study_id: int) -> dict[str, Mapping[str, Any]]:
+    """Collect the meanings of markers and channels by which recordings of a study are read, by their keys."""
+    return {key: row.meaning for key, row in meanings(db, study_id).items() if not row.removed}
+
+
+def lock_meanings(db: Session, study_id: int) -> None:
+    """Let others who state meanings in the study wait until the transaction ends."""
+    db.execute(select(func.pg_advisory_xact_lock(func.hashtext("signal_meaning"), study_id)))
+
+
+def sessions_of_file(db: Session, file_id: int) -> Sequence[StudySession]:
+    """List the sessions that use a recording of a file."""
+    of_file = select(Recording.id).where(Recording.upload_file_id == file_id)
+    used = select(SessionSegment.session_id).where(SessionSegment.recording_id.in_(of_file))
+    return db.scalars(select(StudySession).where(StudySession.id.in_(used)).order_by(StudySession.id)).all()

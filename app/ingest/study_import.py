@@ -214,7 +214,7 @@ def _of_session(db: Session, number: int, participant: Participant, name: str, s
 
 def _dry(db: Session, one: Incoming, participant: Participant, name: str, sha256: str, offset: int) -> Iterator[Candidate]:
     """Read a file without storing anything; one candidate per run of its recordings, with negative keys."""
-    options = service.decode_options(participant, service.BetaStated())
+    options = service.decode_options(db, participant, service.BetaStated())
     clean = files.draft_path()
     try:
         with raw_bytes.received(one.stream, get_settings().upload_limit_mb * 1024 * 1024) as (raw, _, _):

@@ -169,6 +169,11 @@ def _column_mapping(before: Row, after: Row, names: Names) -> str:
     return f"{'removed' if row.get('removed') else 'stated'} the column mapping '{row['name']}'"
 
 
+def _signal_meaning(old_row: Row, new_row: Row, names: Names) -> str:
+    row = new_row or old_row
+    return f"{'removed' if row.get('removed') else 'stated'} the meaning of '{row['shown']}' in recordings"
+
+
 def _membership(before: Row, after: Row, names: Names) -> str:
     row = after or before
     who, role = names.person(row["user_id"]), str(row["role"]).replace("_", " ")
@@ -353,6 +358,7 @@ SAID: dict[str, Callable[[Row, Row, Names], str]] = {
     "second_factor": _second_factor,
     "sign_on_link": _sign_on_link,
     "column_mapping": _column_mapping,
+    "signal_meaning": _signal_meaning,
     "upload": _upload,
     "upload_file": _file,
     "session_proposal": _proposal,

@@ -222,14 +222,16 @@ def traces_read_once(db: Session) -> Iterator[None]:
 
 
 _TRACES = "traces by recording"
+_READING = Trace.decode_version * 1_000_000 + Trace.reading
+"""Order of the readings of a recording: by version, then by number."""
 
 
 def traces_of_recording(db: Session, recording_id: int) -> Sequence[Trace]:
     """The traces of a recording in its newest decode version."""
     known: dict[int, Sequence[Trace]] = db.info.get(_TRACES, {})
     if recording_id not in known:
-        newest = select(func.max(Trace.decode_version)).where(Trace.recording_id == recording_id).scalar_subquery()
-        query = select(Trace).where(Trace.recording_id == recording_id, Trace.decode_version == newest)
+        newest = select(func.max(_READING)).where(Trace.recording_id == recording_id).scalar_subquery()
+        query = select(Trace).where(Trace.recording_id == recording_id, newest == _READING)
         known[recording_id] = db.scalars(query.order_by(Trace.stream, Trace.channel)).all()
     return known[recording_id]
 
@@ -242,8 +244,13 @@ def traces_of_recordings(db: Session, recording_ids: Collection[int]) -> dict[in
     found: dict[int, list[Any]] = {}
     for row in db.execute(query):
         found.setdefault(row.recording_id, []).append(row)
-    newest = {i: max(t.decode_version for t in traces) for i, traces in found.items()}
-    return {i: [t for t in traces if t.decode_version == newest[i]] for i, traces in found.items()}
+    return _newest_reading(found)
+
+
+def _newest_reading(traces_of: Mapping[int, list[Any]]) -> dict[int, list[Any]]:
+    """Keep the traces of each recording's newest reading."""
+    newest = {i: max((t.decode_version, t.reading) for t in traces) for i, traces in traces_of.items()}
+    return {i: [t for t in traces if (t.decode_version, t.reading) == newest[i]] for i, traces in traces_of.items()}
 
 
 @dataclass(frozen=True)
@@ -255,18 +262,18 @@ class TraceHead:
     stream: str
     channel: str
     decode_version: int
+    reading: int
 
 
 def trace_heads(db: Session, recording_ids: Collection[int]) -> dict[int, list[TraceHead]]:
-    """The traces of recordings in their newest decode version, by recording, in the order of `traces_of_recording`; no values are read."""
-    columns = (Trace.id, Trace.recording_id, Trace.stream, Trace.channel, Trace.decode_version)
+    """The traces of recordings in their newest reading, by recording, in the order of `traces_of_recording`; no values are read."""
+    columns = (Trace.id, Trace.recording_id, Trace.stream, Trace.channel, Trace.decode_version, Trace.reading)
     wanted = any_(cast(list(recording_ids), ARRAY(Integer)))  # one parameter, where `in` has one for each
     query = select(*columns).where(Trace.recording_id == wanted).order_by(Trace.stream, Trace.channel)
     found: dict[int, list[TraceHead]] = {}
     for row in db.execute(query):
         found.setdefault(row.recording_id, []).append(TraceHead(*row))
-    newest = {i: max(head.decode_version for head in heads) for i, heads in found.items()}
-    return {i: [head for head in heads if head.decode_version == newest[i]] for i, heads in found.items()}
+    return _newest_reading(found)
 
 
 def recording_by_fingerprint(db: Session, participant_id: int, fingerprint: str) -> Recording | None:

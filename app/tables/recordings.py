@@ -67,13 +67,15 @@ class Trace(Base):
 
     __tablename__ = "trace"
     __table_args__ = (
-        UniqueConstraint("recording_id", "decode_version", "stream", "channel"),
+        UniqueConstraint("recording_id", "decode_version", "reading", "stream", "channel"),
         CheckConstraint("n >= 0 and dt_s > 0 and octet_length(values_f32) = 4 * n", name="length"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
     recording_id: Mapped[int] = mapped_column(ForeignKey("recording.id", ondelete="CASCADE"))
     decode_version: Mapped[int]
+    reading: Mapped[int] = mapped_column(server_default="1")
+    """Number of the reading by this version: a further one follows when the lab states what markers and channels mean."""
     stream: Mapped[str] = mapped_column(String(40))
     channel: Mapped[str] = mapped_column(String(80), server_default="")
     unit: Mapped[str] = mapped_column(String(40))

@@ -136,6 +136,28 @@ class ColumnMapping(Base):
         return TableMapping.from_json(self.mapping)
 
 
+class SignalMeaning(Base):
+    """Meaning of a marker, or of an amplitude channel without a unit, in one study. Never changed, only followed by a newer version.
+
+    `key` is that of `ml.formats.labs.meanings`: a keyed hash of the marker's words, its code, or the name of the channel. `shown` has those
+    words that may be shown. A version that is `removed` ends a meaning: the marker is asked about again.
+    """
+
+    __tablename__ = "signal_meaning"
+    __table_args__ = (UniqueConstraint("study_id", "key", "version"), CheckConstraint("version >= 1", name="version"))
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    study_id: Mapped[int] = mapped_column(ForeignKey("study.id"), index=True)
+    key: Mapped[str] = mapped_column(String(80))
+    version: Mapped[int]
+    shown: Mapped[str] = mapped_column(String(100))
+    meaning: Mapped[dict[str, Any]]
+    removed: Mapped[bool] = mapped_column(server_default="false")
+    created_at: Mapped[datetime] = mapped_column(server_default=func.now())
+    created_by: Mapped[str] = mapped_column(String(254))
+    reason: Mapped[str | None] = mapped_column(Text)
+
+
 class SessionProposal(Base):
     """Evidence for a session that an upload proposes, and the number of its changes. The row stays after the session is confirmed.
 

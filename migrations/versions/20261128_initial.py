@@ -6,7 +6,7 @@ import sqlalchemy as sa
 from alembic import op
 from sqlalchemy.dialects import postgresql
 
-revision = "first_e7e55bd2"
+revision = "first_4aed51d5"
 down_revision = None
 branch_labels = None
 depends_on = None
@@ -184,6 +184,7 @@ AUDITED = (
     ("settings_version", "id", ""),
     ("sign_in", "id", "token_sha256,last_seen_at"),
     ("sign_on_link", "id", "last_used_at"),
+    ("signal_meaning", "id", ""),
     ("signature", "id", "content"),
     ("site", "id", ""),
     ("snapshot_session", "snapshot_id,session_id", ""),
@@ -220,6 +221,7 @@ NEVER_CHANGED = (
     "qoc",
     "session_conditions",
     "settings_version",
+    "signal_meaning",
     "signature",
     "snapshot_session",
     "sweep",
@@ -340,6 +342,24 @@ def upgrade() -> None:
         sa.UniqueConstraint("user_id", "name", name=op.f("uq_api_token_user_id_name")),
     )
     op.create_index(op.f("ix_api_token_user_id"), "api_token", ["user_id"], unique=False)
+    op.create_table(
+        "signal_meaning",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("study_id", sa.Integer(), nullable=False),
+        sa.Column("key", sa.String(length=80), nullable=False),
+        sa.Column("version", sa.Integer(), nullable=False),
+        sa.Column("shown", sa.String(length=100), nullable=False),
+        sa.Column("meaning", postgresql.JSONB(astext_type=sa.Text()), nullable=False),
+        sa.Column("removed", sa.Boolean(), server_default="false", nullable=False),
+        sa.Column("created_at", sa.DateTime(timezone=True), server_default=sa.text("now()"), nullable=False),
+        sa.Column("created_by", sa.String(length=254), nullable=False),
+        sa.Column("reason", sa.Text(), nullable=True),
+        sa.CheckConstraint("version >= 1", name=op.f("ck_signal_meaning_version")),
+        sa.ForeignKeyConstraint(["study_id"], ["study.id"], name=op.f("fk_signal_meaning_study_id_study")),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_signal_meaning")),
+        sa.UniqueConstraint("study_id", "key", "version", name=op.f("uq_signal_meaning_study_id_key_version")),
+    )
+    op.create_index(op.f("ix_signal_meaning_study_id"), "signal_meaning", ["study_id"], unique=False)
     op.create_table(
         "column_mapping",
         sa.Column("id", sa.Integer(), nullable=False),
@@ -1395,6 +1415,7 @@ def upgrade() -> None:
         sa.Column("id", sa.Integer(), nullable=False),
         sa.Column("recording_id", sa.Integer(), nullable=False),
         sa.Column("decode_version", sa.Integer(), nullable=False),
+        sa.Column("reading", sa.Integer(), server_default="1", nullable=False),
         sa.Column("stream", sa.String(length=40), nullable=False),
         sa.Column("channel", sa.String(length=80), server_default="", nullable=False),
         sa.Column("unit", sa.String(length=40), nullable=False),
@@ -1409,7 +1430,12 @@ def upgrade() -> None:
         sa.ForeignKeyConstraint(["recording_id"], ["recording.id"], name=op.f("fk_trace_recording_id_recording"), ondelete="CASCADE"),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_trace")),
         sa.UniqueConstraint(
-            "recording_id", "decode_version", "stream", "channel", name=op.f("uq_trace_recording_id_decode_version_stream_channel")
+            "recording_id",
+            "decode_version",
+            "reading",
+            "stream",
+            "channel",
+            name=op.f("uq_trace_recording_id_decode_version_reading_stream_channel"),
         ),
     )
     op.create_table(

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ml.formats.archive import ZipFiles
 from ml.formats.facts.clocks import lead_in_words
+from ml.formats.labs.meanings import AMPLITUDE_UNITS, CHANNEL_KEY, LEVER_KEY, Meaning, Means
 from ml.formats.options import ArchiveLimits, BetaMeasure, DecodeOptions
 from ml.formats.recording import (
     DECODE_VERSION,
@@ -36,11 +37,14 @@ from ml.formats.tables.outcome_tables import OUTCOME_TABLES
 from ml.formats.tables.strivepd import TremorLog
 
 __all__ = [
+    "AMPLITUDE_UNITS",
     "BY_KIND",
+    "CHANNEL_KEY",
     "DECODE_VERSION",
     "DEVICES",
     "DEVICE_NAMES",
     "FILE_NAMES",
+    "LEVER_KEY",
     "OUTCOME_TABLES",
     "REDACTOR_VERSION",
     "SOURCE_NAMES",
@@ -54,6 +58,8 @@ __all__ = [
     "FileKind",
     "FileReport",
     "GraspLog",
+    "Meaning",
+    "Means",
     "OutcomeLog",
     "Problem",
     "RecordingLog",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 BetaMeasure = Literal["rms", "power"]
 
@@ -33,6 +34,7 @@ class DecodeOptions:
         table_lfp_unit: unit of `lfp` in a table whose header states none; without it such a table is refused.
         max_table_rows: rows a table of steps may have.
         max_lfp_rows: rows a table of raw LFP may have.
+        meanings: meanings that a lab has stated of its markers and channels, as JSON, by their keys (`ml.formats.labs.meanings`).
         keep_samples: keep the samples of each recording (`RecordingLog.samples`), which changes no other number.
         archive: bounds for archives.
     """
@@ -46,6 +48,7 @@ class DecodeOptions:
     table_lfp_unit: str | None = None
     max_table_rows: int = 500_000
     max_lfp_rows: int = 1_500_000
+    meanings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     keep_samples: bool = False
     archive: ArchiveLimits = field(default_factory=ArchiveLimits)
 

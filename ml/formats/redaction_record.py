@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass, field
 from hashlib import sha256
 
-REDACTOR_VERSION = 7
+REDACTOR_VERSION = 8
 PSEUDONYM = re.compile(r"device-[0-9a-f]{16}")
 
 

@@ -176,6 +176,7 @@ class World:
                 "data": {"participant": "P3", "visit": "1", "controller": "cdbs"},
                 "files": {"file": ("other.csv", TABLE + b"42,1,1\n")},
             },
+            ("put", "/sessions/{session_id}/markers"): {"json": {"meanings": []}},
             ("put", "/sessions/{session_id}/clock"): {
                 "session_id": dated,
                 "json": {"ahead_s": 60, "uncertainty_s": 5, "reason": "compared on the day"},

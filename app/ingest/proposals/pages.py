@@ -27,10 +27,10 @@ from app.ingest.proposals.forms import (
     is_clocked,
     own_texts,
     texts,
+    thumbnail,
     typed_own,
     typed_parts,
 )
-from app.ingest.proposals.thumbnail import thumbnail
 from app.ingest.proposals.visit_of_recording import add_visit_of_recording, visit_to_add
 from app.ingest.uploads import service
 from app.platform.database import Db
@@ -49,6 +49,7 @@ from app.study.sessions import designs
 from app.study.sessions import pages as session_pages
 from app.study.sessions.charts import control_chart
 from app.study.sessions.contradictions import contradictions, control_recording
+from app.study.sessions.stimulation import has_markers, open_questions
 from app.study.sessions.usable_steps import SessionData, session_data, usable_steps
 from app.study.sessions.wording import drawn_words, sentences
 from app.study.traces import control_programs
@@ -281,6 +282,8 @@ def _form(
         error.problem(request.url.path) if error else None,
         remarks,
         visit_to_add(session, proposal, visits),
+        told and has_markers(session),
+        open_questions(session) if told else 0,
         [c.as_api(told) for c in amplitude_sources.of_session(session)],
         clock_words(control) if control.started_at is not None else "",
         unknown_clock(control),

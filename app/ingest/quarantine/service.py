@@ -71,7 +71,7 @@ def read_held(db: Session, file: UploadFile, participant: Participant, reason: s
     upload = repository.upload(db, file.upload_id, caller)[0]
     said = upload.stated
     beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
-    options = service.decode_options(participant, beta)
+    options = service.decode_options(db, participant, beta)
     clean = files.draft_path()
     known_mappings = mappings.present(db, participant.site.study_id)
     ways = [m.as_mapping for m in known_mappings]

@@ -95,7 +95,7 @@ def _resume(db: Session, upload_id: int) -> ResumedUpload:
     if why := why_left(participant):
         return ResumedUpload(upload_id, wording.left(why), False, left=True)
     beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
-    receiver = Receiver(db, participant, upload, service.decode_options(participant, beta), beta)
+    receiver = Receiver(db, participant, upload, service.decode_options(db, participant, beta), beta)
     outcome = UploadOutcome(upload, participant, [receiver.resume(row) for row in list(upload.files)])
     try:
         stated = service.as_stated(db, participant, said)

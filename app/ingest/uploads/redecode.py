@@ -6,9 +6,10 @@ traces that they pin.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from typing import Any
 
 import numpy as np
 import structlog
@@ -85,7 +86,7 @@ def redecode(participant_id: int | None, upload_file_id: int | None, dry_run: bo
             try:
                 with db.begin_nested() as savepoint:
                     repository.lock_participant(db, participant.id)
-                    change.said, change.sessions = _read_again(db, file, participant, actor)
+                    change.said, change.sessions = read_again(db, file, participant, actor)
                     if dry_run:
                         savepoint.rollback()
                 if not change.said:
@@ -100,11 +101,13 @@ def redecode(participant_id: int | None, upload_file_id: int | None, dry_run: bo
         yield change
 
 
-def _read_again(db: Session, file: UploadFile, participant: Participant, actor: str) -> tuple[list[str], list[str]]:
+def read_again(db: Session, file: UploadFile, participant: Participant, actor: str) -> tuple[list[str], list[str]]:
     """Read a file again; what changed, and the sessions whose time or dose did."""
     known = [*repository.recordings_of_file(db, file.id)]
     outcomes_only = any(file.kind == one.kind for one in OUTCOME_TABLES)
-    if not outcomes_only and all(_version(db, r) >= DECODE_VERSION for r in known):
+    meanings = repository.meanings_in_force(db, participant.site.study_id)
+    old = [r for r in known if _version(db, r) < DECODE_VERSION or explained_otherwise(r, meanings)]
+    if not outcomes_only and not old:
         return [], []
     decoded = _decoded(db, file, participant)
     if outcomes_only:
@@ -113,7 +116,7 @@ def _read_again(db: Session, file: UploadFile, participant: Participant, actor: 
     starts: dict[Recording, datetime] = {}
     pairs, added = _matched(known, decoded.recordings)
     for recording, fresh in pairs:
-        if _version(db, recording) < DECODE_VERSION:
+        if recording in old:
             fresh = clocks.keep_stated(recording, fresh)
             renewed, doses = _renew(db, recording, fresh)
             said.append(renewed)
@@ -130,6 +133,8 @@ def _read_again(db: Session, file: UploadFile, participant: Participant, actor: 
         raise Refused(f"the present decoder no longer finds recording {lost.id} in the file")
     why = f"decode version {DECODE_VERSION} reads another start"
     timed = clocks.move(db, starts, actor, why, lambda r: _version(db, r) >= DECODE_VERSION) if starts else []
+    if decoded.outcomes and not outcomes_only:
+        said += _outcomes_again(db, file, decoded)
     return said, [*timed, *dosed]
 
 
@@ -150,6 +155,14 @@ def _outcomes_again(db: Session, file: UploadFile, decoded: DecodedFile) -> list
     if file.session_id is not None:
         said += outcomes_intake.take_of_session(db, file, decoded.outcomes, db.get_one(StudySession, file.session_id))
     return said if outcomes_intake.stored_of(db, file) != before else []
+
+
+def explained_otherwise(recording: Recording, meanings: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Decide whether markers or channels of a recording have another meaning in its study than it was read by."""
+    quality = recording.details.get("quality", {})
+    used = quality.get("meanings", {})
+    keys = {*used, *(q["key"] for q in quality.get("questions", ()))}
+    return any(meanings.get(key) != used.get(key) for key in keys)
 
 
 def _version(db: Session, recording: Recording) -> int:
@@ -194,6 +207,9 @@ def _renew(db: Session, recording: Recording, fresh: RecordingLog) -> tuple[str,
     before = {(t.stream, t.channel): t for t in study.traces_of_recording(db, recording.id)}
     session_ids = sorted(study.session_ids_of_recording(db, recording.id))
     rows = [recordings.trace_row(recording.id, t) for t in fresh.traces]
+    same = [t.reading for t in before.values() if t.decode_version == DECODE_VERSION]
+    for row in rows:
+        row.reading = max(same, default=0) + 1
     after = {(t.stream, t.channel): t for t in rows}
     for session in (db.get_one(StudySession, i) for i in session_ids):
         _refuse_loss(session, recording, before, after)
@@ -211,7 +227,8 @@ def _renew(db: Session, recording: Recording, fresh: RecordingLog) -> tuple[str,
     old = max((t.decode_version for t in before.values()), default=0)
     used = f" (session{'s' if len(session_ids) > 1 else ''} {', '.join(map(str, session_ids))})" if session_ids else ""
     doses = [_dose_change(db.get_one(StudySession, i), recording, before, after) for i in session_ids]
-    return f"recording {recording.id}{used}, version {old} to {DECODE_VERSION}: {listed}", [d for d in doses if d]
+    versions = f"version {old} to {DECODE_VERSION}" if old < DECODE_VERSION else "as markers and channels are explained now"
+    return f"recording {recording.id}{used}, {versions}: {listed}", [d for d in doses if d]
 
 
 def _dose_change(

@@ -32,7 +32,7 @@ from app.study.visits import require_unlocked
 from app.tables.participants import Hemisphere, Participant
 from app.tables.sessions import Controller, StudySession
 from app.tables.uploads import Upload, UploadFile
-from ml.formats import BetaMeasure, DecodeOptions, FileReport, Problem, UndecodableFile
+from ml.formats import BetaMeasure, DecodeOptions, FileReport, GraspLog, Problem, UndecodableFile
 
 __all__ = ["BetaStated", "FileOutcome", "Incoming", "UploadOutcome", "receive", "state_session", "stored_reports", "unreadable_members"]
 
@@ -180,7 +180,7 @@ def receive(
     number = upload.id  # known whatever becomes of the database
     with place(), in_progress(number):
         arranged = arrange(incoming)
-        receiver = Receiver(db, participant, upload, decode_options(participant, beta), beta)
+        receiver = Receiver(db, participant, upload, decode_options(db, participant, beta), beta)
         outcome = UploadOutcome(upload, participant, [], alike_together(arranged.asides))
         try:
             _take(receiver, outcome, arranged.incoming)
@@ -327,6 +327,8 @@ def attach_grasps_of(db: Session, outcome: UploadOutcome, stated: StatedSession)
     if target is None and len(outcome.session_ids) == 1:
         target = db.get_one(StudySession, outcome.session_ids[0])
     for file in outcome.files:
+        if file.row.kind != repository.GRASP_KIND and file.outcomes and not file.same_bytes:
+            _attach_own(db, file)
         if file.row.kind != repository.GRASP_KIND or file.row.status != "decoded":
             continue
         if file.row.session_id is not None:
@@ -340,6 +342,14 @@ def attach_grasps_of(db: Session, outcome: UploadOutcome, stated: StatedSession)
             said = [str(error)]
         file.reports[0].understood.extend(said)
         file.session_ids = [file.row.session_id] if file.row.session_id is not None else []
+        _keep_reports(file)
+
+
+def _attach_own(db: Session, file: FileOutcome) -> None:
+    """Attach the grasp tests within a recording to the session of that recording, where it has one."""
+    if len(file.session_ids) == 1 and any(isinstance(log, GraspLog) for log in file.outcomes):
+        session = db.get_one(StudySession, file.session_ids[0])
+        file.reports[0].understood.extend(outcomes_intake.take_of_session(db, file.row, file.outcomes, session))
         _keep_reports(file)
 
 
@@ -365,8 +375,8 @@ def attach_grasps(db: Session, file: UploadFile, session: StudySession) -> list[
     return outcomes_intake.take_of_session(db, file, decoded.outcomes, session)
 
 
-def decode_options(participant: Participant, beta: BetaStated) -> DecodeOptions:
-    """Combine the participant's choices for decoders with what the sender stated of a table."""
+def decode_options(db: Session, participant: Participant, beta: BetaStated) -> DecodeOptions:
+    """Combine the participant's choices for decoders with what the sender stated of a table, and the study of markers."""
     settings = participant.current_settings
     return DecodeOptions(
         period_s=settings.period_s,
@@ -376,12 +386,13 @@ def decode_options(participant: Participant, beta: BetaStated) -> DecodeOptions:
         min_valid_fraction=settings.min_valid_fraction,
         table_beta_unit=beta.unit or settings.beta_unit or "unstated",
         table_lfp_unit=beta.lfp_unit,
+        meanings=repository.meanings_in_force(db, participant.site.study_id),
     )
 
 
 def options_of_file(db: Session, file: UploadFile, participant: Participant) -> DecodeOptions:
     """Build the options for a stored file, with what its sender had stated of it."""
-    return decode_options(participant, stated_beta(db, file))
+    return decode_options(db, participant, stated_beta(db, file))
 
 
 def stated_beta(db: Session, file: UploadFile) -> BetaStated:

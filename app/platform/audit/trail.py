@@ -51,6 +51,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "upload": ("report",),
     "upload_file": ("report",),
     "column_mapping": (),
+    "signal_meaning": (),
     "session_proposal": (),
     "policy": (),
     "buffer_snapshot": (),

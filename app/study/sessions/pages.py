@@ -33,7 +33,7 @@ from app.study.sessions import conditions, designs
 from app.study.sessions import view as session_view
 from app.study.sessions.charts import beta_by_amplitude, in_chart_table, notes, operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
-from app.study.sessions.stimulation import beside, delivered
+from app.study.sessions.stimulation import beside, delivered, has_markers, open_questions
 from app.study.sessions.usable_steps import LEAST_SHARE, SessionData, session_data
 from app.study.sessions.wording import ACTIVITIES, drawn_words, sentences
 from app.study.settings_form import Shown, own_changes
@@ -309,6 +309,8 @@ def _page(
         programs=control_programs(db, session),
         streams=[t for r in recordings for t in traces[r.id] if t.stream not in NO_CONTROL],
         recordings=recordings,
+        markers=has_markers(session),
+        questions=open_questions(session),
         samples=any(recording.details.get("spectra") for recording in recordings),
         qoc=known | {"reason": ""} | {k: v for k, v in (typed or {}).items() if k in (*known, "reason")},
         correction=seen | {"correction_reason": ""} | {k: v for k, v in (typed or {}).items() if k in _CORRECTION_LABELS},

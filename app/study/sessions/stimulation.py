@@ -237,3 +237,16 @@ def _side(session: StudySession, recording: Recording, is_control: bool) -> Hemi
 def _stated(session: StudySession, side: Hemisphere | None, trace: Trace) -> bool:
     program = amplitude_program(trace)
     return any(a.program == program and side in (None, a.hemisphere) for a in session.visit.cdbs_amplitudes)
+
+
+def open_questions(session: StudySession) -> int:
+    """Count the markers and channels that leave amplitudes of a session unknown until a person explains them."""
+    recordings = {s.recording.id: s.recording for s in session.segments}.values()
+    keys = {q["key"] for r in recordings for q in r.details.get("quality", {}).get("questions", ()) if q["asked"]}
+    return len(keys)
+
+
+def has_markers(session: StudySession) -> bool:
+    """Decide whether recordings of a session have markers whose meaning a lab may state."""
+    quality = [s.recording.details.get("quality", {}) for s in session.segments]
+    return any(q.get("questions") or q.get("meanings") for q in quality)

@@ -20,7 +20,7 @@ from ml.formats.brainvision.redact import archive_entry, clean_texts
 from ml.formats.edf.head import read_head
 from ml.formats.edf.redact import redact_edf
 from ml.formats.labs.events import labels_of
-from ml.formats.labs.marks import clean_text
+from ml.formats.labs.marks import parse, render
 from ml.formats.labs.names import clean_label, clean_unit
 from ml.formats.nwb.redact import redact_nwb
 from ml.formats.options import ArchiveLimits
@@ -86,7 +86,7 @@ def _write_run(
     files: Files, run: Run, number: int, archive: zipfile.ZipFile, room: Path, key: bytes, limits: ArchiveLimits, account: Redaction
 ) -> None:
     """Write the data file of a run and what describes it, under names that are numbers."""
-    tables = _channels(files, run), _events(files, run, account), _sidecar(read_json(files, run.sidecars)), _start(files, run)
+    tables = _channels(files, run), _events(files, run, key, account), _sidecar(read_json(files, run.sidecars)), _start(files, run)
     base = f"sub-01_task-rest_run-{number:03d}"
     try:
         labels = _write_data(files, run, f"{base}_ieeg", archive, room, key, limits, account)
@@ -114,7 +114,7 @@ def _write_data(
         part = parts[0]
         with view.open(part.samples) as stream:
             samples = stream.read()
-        header, markers = clean_texts(view, part, account)
+        header, markers = clean_texts(view, part, key, account)
         archive.writestr(archive_entry(f"sub-01/ieeg/{base}.vhdr"), header.format(base=base))
         if markers is not None:
             archive.writestr(archive_entry(f"sub-01/ieeg/{base}.vmrk"), markers.format(base=base))
@@ -181,7 +181,7 @@ def _tsv(rows: Sequence[Mapping[str, str]], heads: Sequence[str]) -> str:
     return "\n".join(["\t".join(heads), *("\t".join(r[h].replace("\t", " ") for h in heads) for r in rows), ""])
 
 
-def _events(files: Files, run: Run, account: Redaction) -> str:
+def _events(files: Files, run: Run, key: bytes, account: Redaction) -> str:
     """Write events.tsv with times and the labels of marks; a row without a time is excluded."""
     units = {name: str(one.get("Units", "")) for name, one in read_json(files, run.event_heads).items() if isinstance(one, dict)}
     out, without = [], 0
@@ -196,7 +196,7 @@ def _events(files: Files, run: Run, account: Redaction) -> str:
             f"{duration:.9g}" if duration and duration > 0 else "n/a",
             f"{sample:.12g}" if sample is not None else "n/a",
         ]
-        out += ["\t".join([*times, label]) for label in labels_of(cells, units)]
+        out += ["\t".join([*times, label]) for label in labels_of(cells, units, key)]
     if without:
         account.flagged.append(f"{without} rows of events.tsv have no onset: excluded")
     return "\n".join(["onset\tduration\tsample\ttrial_type", *out, ""]) if out else ""
@@ -217,7 +217,7 @@ def _sidecar(fields: Mapping[str, Any]) -> str:
     if (kind := str(fields.get("RecordingType", "")).lower()) in RECORDING_TYPES:
         kept["RecordingType"] = kind
     if parameters := fields.get("ElectricalStimulationParameters"):
-        kept["ElectricalStimulationParameters"] = clean_text(str(parameters))
+        kept["ElectricalStimulationParameters"] = render(parse(str(parameters)))
     if any("notch" in json.dumps(fields.get(name, "")).lower() for name in ("SoftwareFilters", "HardwareFilters")):
         kept["SoftwareFilters"] = "notch"
     return json.dumps(kept, sort_keys=True)

@@ -35,7 +35,7 @@ def redact_brainvision(source: Source, target: Path, key: bytes, limits: Archive
             raise UndecodableFile("no BrainVision recording in here", "archive", "Zip its three files and upload that.")
         texts = []
         for part in parts:
-            texts.append(clean_texts(files, part, done))
+            texts.append(clean_texts(files, part, key, done))
         used = {name for p in parts for name in (p.header, p.samples, p.markers)}
         others = [n for n in files.names() if n not in used]
         done.ignored += told(files.left_out) + ([f"{len(others)} other files of the archive"] if others else [])
@@ -51,11 +51,11 @@ def redact_brainvision(source: Source, target: Path, key: bytes, limits: Archive
     return done
 
 
-def clean_texts(files: Files, part: Parts, account: Redaction) -> tuple[str, str | None]:
+def clean_texts(files: Files, part: Parts, key: bytes, account: Redaction) -> tuple[str, str | None]:
     """Write header and markers of a recording from what may stay; `{base}` is in the place of its name."""
     head = read_head(read_text(files, part.header))
     markers = read_markers(read_text(files, part.markers)) if part.markers else None
-    return _header(head, markers is not None, account), None if markers is None else _markers(markers, account)
+    return _header(head, markers is not None, account), None if markers is None else _markers(markers, key, account)
 
 
 def archive_entry(name: str) -> zipfile.ZipInfo:
@@ -80,11 +80,11 @@ def _header(head: Head, marked: bool, account: Redaction) -> str:
     return "\n".join([*lines, "[Binary Infos]", f"BinaryFormat={head.binary}", "[Channel Infos]", *rows, ""])
 
 
-def _markers(markers: list[Marker], account: Redaction) -> str:
+def _markers(markers: list[Marker], key: bytes, account: Redaction) -> str:
     rows, words = [], 0
     for number, marker in enumerate(markers, start=1):
         kind = marker.kind if marker.kind in KINDS else "Comment"
-        text = "" if kind == SEGMENT else clean_text(marker.text)
+        text = "" if kind == SEGMENT else clean_text(marker.text, key)
         words += text != marker.text
         date = f",{marker.date}" if kind == SEGMENT and _DATE.fullmatch(marker.date) else ""
         rows.append(f"Mk{number}={kind},{text},{marker.sample + 1},{marker.length},0{date}")

@@ -33,7 +33,7 @@ def redact_edf(source: Source, target: Path, key: bytes, limits: ArchiveLimits |
             said = f"the header says {head.records} records, the file has {records}"
             done.flagged.append(f"{said}{f' and {rest} bytes of another' if rest else ''}: the {records} whole records are kept")
         place = _annotation_places(head)
-        texts, removed = _annotations(stream, head, records, place)
+        texts, removed = _annotations(stream, head, records, place, key)
         new = _new_head(raw, head, records, max((len(t) for row in texts for t in row), default=0), done)
         with target.open("wb") as sink:
             sink.write(new)
@@ -50,7 +50,7 @@ def _annotation_places(head: Head) -> list[int]:
     return [i for i, s in enumerate(head.signals) if s.annotations]
 
 
-def _annotations(stream: BinaryIO, head: Head, records: int, places: list[int]) -> tuple[list[list[bytes]], int]:
+def _annotations(stream: BinaryIO, head: Head, records: int, places: list[int], key: bytes) -> tuple[list[list[bytes]], int]:
     """Clean the annotations of every record; returns them per record and signal, and how many texts changed."""
     rows: list[list[bytes]] = []
     removed = 0
@@ -59,7 +59,7 @@ def _annotations(stream: BinaryIO, head: Head, records: int, places: list[int]) 
         for i in places:
             stream.seek(head.size + number * head.record_bytes + head.offset(i))
             found = read_annotations(stream.read(head.width * head.signals[i].samples))
-            kept = [Annotation(a.onset_s, a.duration_s, tuple(clean_text(t) if t else "" for t in a.texts)) for a in found]
+            kept = [Annotation(a.onset_s, a.duration_s, tuple(clean_text(t, key) if t else "" for t in a.texts)) for a in found]
             removed += sum(a.texts != b.texts for a, b in zip(found, kept, strict=True))
             row.append(write_annotations(kept))
         rows.append(row)

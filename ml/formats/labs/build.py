@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from ml.formats.beta import LARGEST_UV, channel_spectrum, living, step_trace, time_domain_traces
 from ml.formats.labs.content import Channel, Content, measured_samples
 from ml.formats.labs.dose import amplitude_traces
+from ml.formats.labs.marks import parse, render
+from ml.formats.labs.meanings import explain, open_questions
 from ml.formats.labs.names import UV
 from ml.formats.options import DecodeOptions
 from ml.formats.recording import EventLog, FileReport, Hemisphere, RecordingLog, SampleLog, TraceLog, UndecodableFile, fingerprint
@@ -35,6 +37,7 @@ def recordings_of(content: Content, options: DecodeOptions, report: FileReport) 
     Raises:
         UndecodableFile: no channel of a local field potential in a known unit.
     """
+    used = explain(content, options.meanings)
     chosen = _pairs(_usable(content, options, report), report)
     if not chosen:
         hint = (
@@ -50,8 +53,13 @@ def recordings_of(content: Content, options: DecodeOptions, report: FileReport) 
     sides: list[Hemisphere | None] = [side for side in ("left", "right", None) if any(c.name.side == side for c in chosen)]
     report.flagged.extend(dict.fromkeys(s for c in chosen for s in c.timing.sentences(c.shown)))
     _flag_aliases(content, chosen, options, report)
+    questions = open_questions(content, used, origin)
+    explanations = {"questions": questions, "meanings": used}
+    if any(q["asked"] for q in questions):
+        report.flagged.append("markers or channels of stimulation are not explained yet: state what they mean on the session's page")
     return tuple(
-        _recording(content, side, [c for c in chosen if c.name.side == side], origin, end, rows, options, report) for side in sides
+        _recording(content, side, [c for c in chosen if c.name.side == side], origin, end, rows, options, report, explanations)
+        for side in sides
     )
 
 
@@ -148,10 +156,11 @@ def _recording(
     rows: int,
     options: DecodeOptions,
     report: FileReport,
+    explanations: Mapping[str, Any],
 ) -> RecordingLog:
     traces: list[TraceLog] = []
     spectra, samples = [], []
-    quality: dict[str, Any] = {"time_domain": {}}
+    quality: dict[str, Any] = {"time_domain": {}, **explanations}
     parts: list[str | bytes | NDArray[Any]] = [str(content.start_at(origin)), str(side)]
     named = _distinct(channels, report)
     for shown, channel in named:
@@ -179,7 +188,10 @@ def _recording(
         report.flagged.append(
             f"{side or 'side unknown'}: no amplitude in the file: no policy can learn from this session until one is known"
         )
-    parts += [t.values for t in doses]
+    # of what the file says: the same recording is known again whatever its markers are stated to mean
+    parts += [repr([(round(m.t_s - origin, 6), m.label, m.duration_s) for m in content.marks])]
+    parts += [np.concatenate([course.t_s - origin, course.values]) for course in content.courses]
+    parts += [c.read() for c in content.channels if c.name.kind == "stimulation"]
     traces += [*doses, *_motion(content, origin, rows, options)]
     leads = sorted({c.name.lead for c in channels if c.name.target})
     started = content.start_at(origin)
@@ -229,7 +241,8 @@ def _events(content: Content, side: Hemisphere | None, origin: float) -> Iterato
             data = {"duration_s": mark.duration_s} if mark.duration_s else {}
             if found.mentions:
                 data |= {"amplitude_ma": found.dose_ma} if found.dose_ma is not None else {}
-            yield EventLog(round(mark.t_s - origin, 4), "operator_note", mark.label, data)
+            label = render(replace(parse(mark.label), words=""))
+            yield EventLog(round(mark.t_s - origin, 4), "operator_note", label, data)
 
 
 def _motion(content: Content, origin: float, rows: int, options: DecodeOptions) -> list[TraceLog]:

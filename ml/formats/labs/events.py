@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ml.formats.labs.marks import Side, Statement, parse, render
+from ml.formats.labs.marks import Side, Statement, clean_text, parse, render
 from ml.formats.labs.names import MA
 from ml.formats.tables.cells.numbers import MISSING, NotANumber, column_name, known_unit, parse_number
 
@@ -22,21 +22,22 @@ _SIDE: dict[str, Side] = {"l": "left", "left": "left", "lh": "left", "r": "right
 _UNITS = {"ma": "mA", "milliamps": "mA", "ua": "uA", "v": "V"}
 
 
-def labels_of(cells: Mapping[str, str], units: Mapping[str, str]) -> list[str]:
+def labels_of(cells: Mapping[str, str], units: Mapping[str, str], key: bytes) -> list[str]:
     """Reduce a row to the labels of its marks: one, or one per side where columns state the amplitude of each.
 
     An amplitude in a column without a unit, or one that a text of the row contradicts, is unknown.
 
     Args:
         cells: texts of the row by the header of their column. units: that another file states, by header.
+        key: secret of the installation, for unknown words.
     """
     lower = {header.strip().lower(): cell for header, cell in cells.items()}
-    said = [parse(lower[name]) for name in TEXTS if lower.get(name, "").strip().lower() not in MISSING]
+    said = [parse(clean_text(lower[name], key)) for name in TEXTS if lower.get(name, "").strip().lower() not in MISSING]
     mentions = [one for one in said if one.mentions]
     side = next((_SIDE.get(lower[name].strip().lower()) for name in SIDES if name in lower), None)
     amounts = [found for header, cell in cells.items() if (found := _amount(header, cell, units)) is not None]
     if not mentions and not amounts:
-        return [render(next((one for one in said if one.code), Statement()))]
+        return [render(next((one for one in said if one.code or one.words), Statement()))]
     text = mentions[0] if mentions else Statement(mentions=True)
     if any(one != text for one in mentions):
         text = replace(text, clear=False)

@@ -9,13 +9,15 @@ from typing import Literal
 from ml.formats.tables.cells.numbers import known_unit
 from ml.formats.tables.columns import LFP_SCALE
 
-Kind = Literal["lfp", "stimulation", "acceleration", "other"]
+Kind = Literal["lfp", "stimulation", "acceleration", "rotation", "opening", "other"]
 Side = Literal["left", "right"]
 
 _TARGETS = {t.lower(): t for t in ("STN", "GPi", "GPe", "VIM", "ANT", "CM", "PPN", "SNr", "ZI", "NAc", "M1", "S1", "PMC", "SMA", "PFC")}
 _LFP = frozenset({"lfp", "dbs", "lead", "depth", "seeg", "ieeg", "ecog", "contact", "cont", "chan", "channel", "ch", "macro", "micro"})
 _STIM = frozenset({"stim", "stimulation", "amplitude", "amp", "current", "dose"})
-_MOTION = frozenset({"acc", "accel", "accelerometer", "acceleration", "gyr", "gyro", "gyroscope", "imu"})
+_MOTION = frozenset({"acc", "accel", "accelerometer", "acceleration", "imu"})
+_ROTATION = frozenset({"gyr", "gyro", "gyroscope", "rotation"})
+_OPENING = frozenset({"opening", "aperture"})
 _OTHER = frozenset(
     ("eeg", "emg", "ecg", "ekg", "eog", "trig", "trigger", "status", "sync", "event", "events", "marker", "markers", "audio", "ref",
      "reference", "ground", "gnd", "misc", "resp", "temp", "hand", "finger", "force", "time", "timestamp",
@@ -29,10 +31,13 @@ _PAIR = re.compile(r"\+?(?<!\d)(\d{1,2})\s*[-–]\s*(?:[lr]\s?)?(\d{1,2})(?!\d)"
 _NUMBER = re.compile(r"(\d{1,2})(?!.*\d)")
 _TYPES: dict[str, Kind] = {
     "lfp": "lfp", "seeg": "lfp", "ieeg": "lfp", "ecog": "lfp", "dbs": "lfp", "accelerometer": "acceleration", "accel": "acceleration",
-    "acc": "acceleration", "gyro": "acceleration", "gyroscope": "acceleration", "eeg": "other", "emg": "other", "ecg": "other",
+    "acc": "acceleration", "gyro": "rotation", "gyroscope": "rotation", "eeg": "other", "emg": "other", "ecg": "other",
     "eog": "other", "trig": "other", "markers": "other", "audio": "other", "mocap": "other", "gaze": "other",
 }  # fmt: skip
 LONGEST = 60
+_MOTION_UNITS = {
+    "g": "g", "m/s^2": "m/s2", "m/s2": "m/s2", "m/s²": "m/s2", "deg/s": "deg/s", "°/s": "deg/s", "dps": "deg/s", "rad/s": "rad/s",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +78,11 @@ def channel_name(label: str, of_type: str = "") -> ChannelName:
     sides = {_SIDES[w] for w in names & _SIDES.keys()}
     targets = {_TARGETS[w] for w in names & _TARGETS.keys()} | {t for t in ("M1", "S1") if t in text.upper().split()}
     kind: Kind = "lfp"
-    if names & _MOTION:
+    if names & _ROTATION:
+        kind = "rotation"
+    elif names & _OPENING:
+        kind = "opening"
+    elif names & _MOTION:
         kind = "acceleration"
     elif names & _OTHER:
         kind = "other"
@@ -92,7 +101,7 @@ def channel_name(label: str, of_type: str = "") -> ChannelName:
 
 
 def _known(word: str) -> bool:
-    lists = (_TARGETS, _LFP, _STIM, _MOTION, _OTHER, _SIDES, _PLAIN)
+    lists = (_TARGETS, _LFP, _STIM, _MOTION, _ROTATION, _OPENING, _OTHER, _SIDES, _PLAIN)
     return any(word in one for one in lists)
 
 
@@ -107,10 +116,12 @@ def clean_unit(text: str) -> str:
     unit = known_unit(" ".join(text.split())) or ""
     if unit in LFP_SCALE or unit in MA:
         return unit
-    return {"g": "g", "m/s^2": "m/s2", "m/s2": "m/s2", "m/s²": "m/s2"}.get(text.strip().lower(), "")
+    return _MOTION_UNITS.get(text.strip().lower(), "")
 
 
 MA = {"mA": 1.0, "uA": 1e-3, "A": 1e3}
 """How many mA one of the unit is."""
+TURNS = {"rad/s": 1.0, "deg/s": 0.017453292519943295}
+"""How many rad/s one of the unit is."""
 UV = LFP_SCALE
 """How many uV one of the unit is."""

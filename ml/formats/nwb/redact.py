@@ -52,7 +52,7 @@ def redact_nwb(source: Source, target: Path, key: bytes, limits: ArchiveLimits |
                 what = f"its samples have {total / 1e6:.0f} MB, more than {most.total_bytes / 1e6:.0f} MB"
                 raise UndecodableFile(what, "series", "Upload fewer sessions at once.")
             _account(file, objects, done)
-            _write(target, file, objects, done)
+            _write(target, file, objects, key, done)
     except READ_ERRORS as error:
         target.unlink(missing_ok=True)
         raise UndecodableFile("the HDF5 file is damaged: a part of it cannot be read", "file", HINT) from error
@@ -79,7 +79,7 @@ def _account(file: Any, objects: Objects, account: Redaction) -> None:
         account.flagged.append(f"{len(objects.invalid)} spans that the file calls invalid are gaps")
 
 
-def _write(target: Path, file: Any, objects: Objects, account: Redaction) -> None:
+def _write(target: Path, file: Any, objects: Objects, key: bytes, account: Redaction) -> None:
     """Write the fresh file."""
     import h5py
 
@@ -103,7 +103,9 @@ def _write(target: Path, file: Any, objects: Objects, account: Redaction) -> Non
             account.removed.append(f"names of series and electrodes with words that are not on the lists ({unnamed}×)")
         intervals = sink.create_group("intervals")
         rows = [
-            (m.t_s, m.t_s + m.duration_s if m.duration_s else np.nan, label) for m in objects.moments for label in labels_of(m.cells, {})
+            (m.t_s, m.t_s + m.duration_s if m.duration_s else np.nan, label)
+            for m in objects.moments
+            for label in labels_of(m.cells, {}, key)
         ]
         if rows:
             account.removed.append(f"words of events: amplitude, rate, pulse width, side, on and off, and numbers stay ({len(rows)} rows)")

@@ -46,6 +46,10 @@ _SHARE = re.compile(r"^(percent|fraction|share)|(percent|pct|fraction|share)$")
 WANTED = ", ".join(TREMOR_CLASSES)
 
 
+MEASURED = "minutes of tremor"
+"""Measurements of a `TremorLog`, in words."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TremorLog(OutcomeLog):
     """Minutes of tremor in time order, in UTC.
@@ -109,7 +113,7 @@ def decode_strivepd(path: Source, options: DecodeOptions | None = None, name: st
     report.removed.extend(removed_columns(header for i, header in enumerate(table.headers) if i not in used))
     if minutes.start_unix_s.size == 0:
         raise UndecodableFile("the table holds no minute of tremor", "after line 1", "Upload the export as StrivePD wrote it.")
-    report.understood.append(f"{minutes.start_unix_s.size} minutes of tremor")
+    report.understood.append(f"{minutes.start_unix_s.size} {MEASURED}")
     return DecodedFile((), (report,), outcomes=(minutes,))
 
 
@@ -315,7 +319,7 @@ def _mapped_cells(
 WATCH_EXPORTS = OutcomeTable(
     kind="tremor",
     name="tremor export",
-    holds="minutes of tremor",
+    holds=MEASURED,
     log=TremorLog,
     roles=(*SHARE_ROLES, CLASS_ROLE),
     recognises=looks_like_tremor,

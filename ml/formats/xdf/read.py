@@ -16,6 +16,7 @@ import numpy as np
 from ml.formats.labs.build import recordings_of
 from ml.formats.labs.content import Channel, Content, Course, Floats
 from ml.formats.labs.marks import Mark
+from ml.formats.labs.motion import outcomes_of
 from ml.formats.labs.names import channel_name
 from ml.formats.labs.timing import of_stamps
 from ml.formats.options import DecodeOptions
@@ -33,7 +34,8 @@ def decode_xdf(path: Path, options: DecodeOptions, name: str | None = None) -> D
     """
     report = FileReport(name or path.name)
     content = read_xdf(path, report)
-    return DecodedFile(recordings_of(content, options, report), (report,))
+    recordings = recordings_of(content, options, report)
+    return DecodedFile(recordings, (report,), outcomes_of(content, options.meanings, report))
 
 
 def read_xdf(path: Path, report: FileReport) -> Content:

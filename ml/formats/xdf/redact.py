@@ -76,7 +76,7 @@ def redact_xdf(source: Source, target: Path, key: bytes, limits: ArchiveLimits |
             if chunk.damaged:
                 _mark_loss(sink, streams)
             try:
-                _write(sink, chunk, streams, counts)
+                _write(sink, chunk, streams, counts, key)
             except ValueError:
                 damage.skipped += 1
                 _mark_loss(sink, streams)
@@ -100,7 +100,7 @@ def redact_xdf(source: Source, target: Path, key: bytes, limits: ArchiveLimits |
     return done
 
 
-def _write(sink: BinaryIO, chunk: Chunk, streams: dict[int, _Stream], counts: Counter[str]) -> None:
+def _write(sink: BinaryIO, chunk: Chunk, streams: dict[int, _Stream], counts: Counter[str], key: bytes) -> None:
     """Write one chunk, cleaned. Raises ValueError where it contradicts itself or its stream."""
     if chunk.tag == FILE_HEADER:
         date = text_of(tree_of(chunk.content), "datetime")
@@ -116,7 +116,7 @@ def _write(sink: BinaryIO, chunk: Chunk, streams: dict[int, _Stream], counts: Co
     elif chunk.stream not in streams:
         raise ValueError("a stream without a head")
     elif chunk.tag == SAMPLES:
-        sink.write(pack_chunk(SAMPLES, _samples(chunk.content, streams[chunk.stream], counts), chunk.stream))
+        sink.write(pack_chunk(SAMPLES, _samples(chunk.content, streams[chunk.stream], counts, key), chunk.stream))
     elif chunk.tag == CLOCK_OFFSET:
         if len(chunk.content) != 16 or not all(map(math.isfinite, struct.unpack("<dd", chunk.content))):
             raise ValueError("no clock offset")
@@ -151,7 +151,7 @@ def _head(tree: ElementTree.Element, number: int, counts: Counter[str]) -> tuple
     return f'<?xml version="1.0"?><info>{said}<channel_format>{form}</channel_format>{described}</info>', _Stream(count, form)
 
 
-def _samples(content: bytes, stream: _Stream, counts: Counter[str]) -> bytes:
+def _samples(content: bytes, stream: _Stream, counts: Counter[str], key: bytes) -> bytes:
     """Check the samples of a chunk, and clean those that are text. Raises ValueError where they are not whole."""
     count, at = read_length(content, 0)
     if stream.form != "string":
@@ -170,7 +170,7 @@ def _samples(content: bytes, stream: _Stream, counts: Counter[str]) -> bytes:
                 raise ValueError("cut")
             text = content[at : at + length].decode("utf-8", "replace")
             at += length
-            kept = clean_text(text)
+            kept = clean_text(text, key)
             counts["mark"] += kept != text
             out.append(struct.pack("<BI", 4, len(kept.encode())) + kept.encode())
     return b"".join(out)

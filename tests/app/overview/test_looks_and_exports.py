@@ -40,6 +40,7 @@ SHOWS_NO_RESULTS = {
     "/participants/{code}/data-queries", "/api/v1/participants/{code}/data-queries",
     # outcomes of a session without what ran, and what it ran under without outcomes
     "/api/v1/sessions/{session_id}/qoc", "/api/v1/sessions/{session_id}/outcomes", "/api/v1/sessions/{session_id}/conditions",
+    "/sessions/{session_id}/markers", "/api/v1/sessions/{session_id}/markers",
     # files that came in, and sessions that nobody has confirmed
     "/participants/{code}/upload", "/participants/{code}/upload/progress", "/uploads/{upload_id}", "/api/v1/uploads/{upload_id}",
     "/participants/{code}/proposals", "/api/v1/participants/{code}/proposals", "/proposals/{session_id}", "/api/v1/proposals/{session_id}",

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from app.ingest.proposals.thumbnail import thumbnail
+from app.ingest.proposals.forms import thumbnail
 from app.study.sessions.usable_steps import SessionData
 
 

@@ -63,7 +63,7 @@ def test_not_a_byte_of_what_names_a_person_is_stored(tmp_path: Path) -> None:
         )
     assert NAME not in str(found) + str(done)
     assert "participants.tsv" in " ".join(done.removed)
-    assert [e.label for e in found.recordings[0].events] == ["note stim 2 mA", "marker"]
+    assert [e.label for e in found.recordings[0].events] == ["note stim 2 mA", "marker …"]
 
 
 def test_events_state_the_amplitude_for_their_duration_and_in_the_unit_of_the_sidecar(tmp_path: Path) -> None:
