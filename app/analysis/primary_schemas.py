@@ -16,7 +16,7 @@ from app.analysis.primary_results import LEVEL, Comparison, ControllerResult
 from app.analysis.primary_verdict import LockedMargins, VerdictResult
 from app.platform.web.csv_files import download
 from app.platform.web.schemas import Model
-from app.study.outcomes.fields import VersionOfMargins
+from app.study.outcome_fields import VersionOfMargins
 from app.tables.sessions import Controller
 from ml.outcomes import BY_KEY
 from ml.statistics.effects import Saving

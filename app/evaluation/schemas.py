@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field
 from app.evaluation.methods import Methods
 from app.learning.schemas import PolicyIds, Preset
 from app.platform.web.schemas import Int, Model
-from app.study.outcomes.fields import fields_model
+from app.study.outcome_fields import fields_model
 from ml.outcomes import FIELDS
 
 

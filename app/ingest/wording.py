@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from app.ingest.proposals.evidence import Evidence, Reason, Source, stored_courses
+from app.ingest.evidence import Evidence, Reason, Source, stored_courses
 from app.platform.errors import BetaloopError, DatabaseAway, GivenUp, StorageFull
 from app.platform.numbers import stated
 from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern

@@ -18,7 +18,7 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.platform.web.schemas import Int, Model, Number, Text
 from app.study import access
-from app.study.outcomes.fields import StatedMargins
+from app.study.outcome_fields import StatedMargins
 from app.study.settings_types import Bound, published
 from app.tables.audit import Signature
 from app.tables.participants import MarginsLock, MarginsVersion, Participant

@@ -23,8 +23,7 @@ from app.platform.web.schemas import Bool, Model, Text
 from app.study import repository
 from app.study.access import WITHDRAWN, refuse_ended, require
 from app.study.margins import MarginsFields
-from app.study.outcomes.fields import SURE
-from app.study.outcomes.values import require_sure
+from app.study.outcome_fields import SURE, require_sure
 from app.study.schemas import Code
 from app.study.settings import add_settings
 from app.study.settings_types import SettingsIn

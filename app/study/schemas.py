@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from app.platform.audit.signatures import SignatureOut, SignatureState, Signing
 from app.platform.web.schemas import Bool, Day, Int, Model, Number, Text
-from app.study.outcomes.fields import SURE, DerivedField, EnteredOutcomes, OutcomeField, StoredOutcomes
+from app.study.outcome_fields import SURE, DerivedField, EnteredOutcomes, OutcomeField, StoredOutcomes
 from app.study.settings_types import CDBS_MA, SettingsOut
 from app.tables.participants import Hemisphere
 from app.tables.sessions import Activity, Controller

@@ -17,7 +17,7 @@ from app.platform.errors import Conflict, Invalid
 from app.platform.numbers import number
 from app.study import blinding, repository
 from app.study.access import require
-from app.study.outcomes import values as values_rules
+from app.study.outcome_fields import require_sure
 from app.study.settings_types import SettingsIn
 from app.study.traces import laid_out, traces_of
 from app.tables.participants import Participant, SettingsVersion
@@ -43,7 +43,7 @@ def change_settings(
     values = {name: getattr(current, name) for name in SettingsIn.model_fields} | change.model_dump(exclude_unset=True)
     if all(getattr(current, name) == value for name, value in values.items()):
         return current
-    values_rules.require_sure(change.model_dump(exclude_unset=True), sure, current)
+    require_sure(change.model_dump(exclude_unset=True), sure, current)
     return add_settings(db, participant, values, caller, reason)
 
 

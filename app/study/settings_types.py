@@ -10,7 +10,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_va
 from pydantic_core import PydanticCustomError
 
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
-from app.study.outcomes.fields import SURE
+from app.study.outcome_fields import SURE
 from ml.outcomes import END_WEIGHTS
 
 

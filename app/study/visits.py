@@ -25,8 +25,7 @@ from app.platform.web.templates import render
 from app.study import repository
 from app.study.access import may, require
 from app.study.blinding import Arm, stated_arm, visible_arms
-from app.study.outcomes import values
-from app.study.outcomes.fields import Question, question
+from app.study.outcome_fields import Question, question, refuse
 from app.study.schemas import CdbsAmplitudeModel, VisitChange, VisitIn
 from app.study.traces import sources
 from app.tables.audit import Signature
@@ -249,7 +248,7 @@ def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Cal
     if repository.visit_by_number(db, participant.id, draft.number):
         raise Conflict(f"Participant {participant.code} already has a visit {draft.number}.", "Choose the next number.", field="number")
     _each_once(draft.cdbs_amplitudes)
-    values.refuse(q for a in draft.cdbs_amplitudes if (q := _asked(a)))
+    refuse(q for a in draft.cdbs_amplitudes if (q := _asked(a)))
     visit = Visit(participant_id=participant.id, number=draft.number, date=draft.date, note=draft.note)
     visit.cdbs_amplitudes = [CdbsAmplitude(**a.model_dump(exclude={"sure"})) for a in draft.cdbs_amplitudes]
     db.add(visit)
@@ -271,7 +270,7 @@ def change_visit(db: Session, visit: Visit, change: VisitChange, caller: Caller)
         wanted = change.cdbs_amplitudes or []
         _each_once(wanted)
         standing = {(a.hemisphere, a.program, a.amplitude_ma) for a in visit.cdbs_amplitudes}
-        values.refuse(q for a in wanted if (a.hemisphere, a.program, a.amplitude_ma) not in standing and (q := _asked(a)))
+        refuse(q for a in wanted if (a.hemisphere, a.program, a.amplitude_ma) not in standing and (q := _asked(a)))
         stated = {(a.hemisphere, a.program): a.amplitude_ma for a in wanted}
         for row in list(visit.cdbs_amplitudes):
             amplitude = stated.pop((row.hemisphere, row.program), None)

@@ -161,7 +161,7 @@ class SignalMeaning(Base):
 class SessionProposal(Base):
     """Evidence for a session that an upload proposes, and the number of its changes. The row stays after the session is confirmed.
 
-    `evidence` has an `app.ingest.proposals.evidence.Evidence` per field (`visit`, `controller`, …), in old rows a sentence. Where
+    `evidence` has an `app.ingest.evidence.Evidence` per field (`visit`, `controller`, …), in old rows a sentence. Where
     `visit_open`, the visit is a place to store the proposal in and no guess. `version` lets no tab overwrite another's correction.
     """
 

@@ -82,7 +82,7 @@ export function countGrasps(keep) {
   });
 }
 
-const USUAL_HZ = [0.3, 6]; // app/study/outcomes/fields.py
+const USUAL_HZ = [0.3, 6]; // app/study/outcome_fields.py
 export function typeGrasp(keep) {
   openDialog("Grasp frequency", (dialog, close) => {
     const field = el("input", { type: "number", inputmode: "decimal", min: "0", max: "19.9", step: "0.01", "aria-label": "Grasp frequency in Hz", autofocus: true });

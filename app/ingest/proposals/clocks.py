@@ -12,7 +12,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
-from app.ingest import copies, repository
+from app.ingest import repository
+from app.ingest.proposals import copies
 from app.ingest.proposals import service as proposals
 from app.ingest.proposals.parts import placement_of
 from app.ingest.sessions import TOGETHER, set_segments

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.ingest import channels
-from app.ingest.proposals.evidence import Evidence, Reason, Source
+from app.ingest.evidence import Evidence, Reason, Source
 from app.study import repository as study
 from app.study.sessions import changes
 from app.study.sessions.contradictions import control_recording

@@ -8,8 +8,8 @@ from typing import NamedTuple
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.ingest.evidence import Evidence, Reason, Source, VisitGuess, guess_controller
 from app.ingest.proposals import control_channel
-from app.ingest.proposals.evidence import Evidence, Reason, Source, VisitGuess, guess_controller
 from app.ingest.sessions import StatedSession
 from app.platform.errors import Invalid
 from app.study import blinding

@@ -9,8 +9,8 @@ from datetime import timedelta
 from sqlalchemy.orm import Session
 
 from app.ingest import repository, sessions, wording
+from app.ingest.evidence import BY_UPLOAD, Evidence, Reason, Source, guess_visit
 from app.ingest.proposals import control_channel, guesses
-from app.ingest.proposals.evidence import BY_UPLOAD, Evidence, Reason, Source, guess_visit
 from app.ingest.proposals.guesses import differs_from_slot, visit_of_slot
 from app.ingest.proposals.parts import placement_of
 from app.ingest.proposals.service import renew

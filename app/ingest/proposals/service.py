@@ -10,8 +10,8 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
 from app.ingest import repository, sessions, wording
+from app.ingest.evidence import BY_CUT, Evidence, Reason, Source
 from app.ingest.proposals import control_channel, guesses
-from app.ingest.proposals.evidence import BY_CUT, Evidence, Reason, Source
 from app.ingest.proposals.parts import choose_part, choose_side, on_grid, placement_of
 from app.ingest.schemas import PartIn, ProposalChange
 from app.ingest.sessions import add_session

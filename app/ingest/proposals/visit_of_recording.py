@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.ingest import repository
-from app.ingest.proposals.evidence import Evidence, Reason, Source
+from app.ingest.evidence import Evidence, Reason, Source
 from app.ingest.proposals.service import locked, renew
 from app.platform.errors import Conflict, Invalid
 from app.study import access

@@ -10,7 +10,8 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from app.ingest import copies, repository, wording
+from app.ingest import repository, wording
+from app.ingest.proposals import copies
 from app.platform.web.schemas import sensible_time
 from app.settings import get_settings
 from app.study import repository as study

@@ -12,8 +12,8 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import blinding, repository
 from app.study.access import require
+from app.study.outcome_fields import require_sure
 from app.study.outcomes import service as outcomes
-from app.study.outcomes import values as values_rules
 from app.study.schemas import DerivedChoice, QocIn, SessionChange
 from app.study.sessions import designs
 from app.study.sessions.repository import other_values
@@ -44,7 +44,7 @@ def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller
     if known is None and all(value is None for value in merged.values()):
         raise Invalid("No outcome was given.", f"Enter at least one of {enumerated([o.label.lower() for o in OUTCOMES])}.")
     others = {o.field: other_values(db, session, o) for o in OUTCOMES if o.far is not None}
-    values_rules.require_sure(given, values.sure, known, others)
+    require_sure(given, values.sure, known, others)
     same = {name for name, value in merged.items() if value == getattr(known, name, None)}
     kept = [name for name in (known.derived if known else ()) if name in same]
     followed = [name for name in (known.from_day if known else ()) if name in same]

@@ -17,7 +17,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.ingest.copies import Relation, Rows, relation
+from app.ingest.proposals.copies import Relation, Rows, relation
 from app.learning.snapshots import take_snapshot
 from app.study.repository import participant_by_code
 from app.tables.recordings import Recording

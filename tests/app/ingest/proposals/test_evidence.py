@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from app.ingest import wording
-from app.ingest.proposals.evidence import BY_CUT, BY_UPLOAD, Evidence, Reason, Source, guess_controller, guess_visit
+from app.ingest.evidence import BY_CUT, BY_UPLOAD, Evidence, Reason, Source, guess_controller, guess_visit
 from app.study.sessions.stimulation import Delivered
 from app.study.traces import StepTable
 from app.tables.sessions import Controller

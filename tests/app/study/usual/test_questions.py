@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from app.study.outcomes import fields
-from app.study.outcomes.fields import Question, Why, question
+from app.study import outcome_fields
+from app.study.outcome_fields import Question, Why, question
 from tests.app.pages.conftest import browser, password_hash, sign_in  # noqa: F401
 from tests.app.pages.test_stale_forms import Tab
 
@@ -52,8 +52,8 @@ def test_a_rating_is_asked_about_where_it_is_far_from_every_other_one_of_its_vis
 
 def test_every_question_has_its_sentence_and_no_decision_rests_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
     for code in Why:
-        assert "?" in fields.unusual(Question("grasp_hz", code, 0.5, "Hz", 0.3, 6))
-    monkeypatch.setattr(fields, "unusual", lambda q: "other words")
+        assert "?" in outcome_fields.unusual(Question("grasp_hz", code, 0.5, "Hz", 0.3, 6))
+    monkeypatch.setattr(outcome_fields, "unusual", lambda q: "other words")
     found = question("grasp_hz", 7)
     assert found is not None
     assert found.code is Why.ABOVE
