@@ -27,11 +27,13 @@ from app.platform.audit import record
 from app.platform.errors import BetaloopError
 from app.study import access, blinding
 from app.study import repository as study
+from app.study.adverse_events import events_of_participant, policy_of
 from app.study.characteristics import CharacteristicsOut
 from app.study.doses import hours_since_dose, levodopa_equivalent_mg
 from app.study.sessions.repository import policy_shares
 from app.study.sessions.usable_steps import session_data
 from app.study.settings_types import SettingsOut
+from app.tables.adverse_events import AdverseEvent
 from app.tables.learning import Policy
 from app.tables.participants import Participant
 from app.tables.visits import Drug
@@ -72,6 +74,7 @@ def export_participant(db: Session, participant: Participant, caller: Caller) ->
         "estimates": _estimate_rows(db, participant),
         "coverage": _coverage_rows(db, participant),
         "margins": _margin_rows(participant, day),
+        "adverse_events": [_event_row(e, caller, day) for e in events_of_participant(db, participant.id)],
         "doses": _dose_rows(participant, day),
         "primary": [row[1:] for row in csv_rows(found)],
         "noninferiority": _noninferiority_rows(found, day),
@@ -142,6 +145,13 @@ def _outcome_rows() -> list[tuple[Any, ...]]:
 def _share(outcome: Outcome, margins: Margins) -> float | None:
     """Return the margin of an outcome as a share of the value under cDBS; None where it is none."""
     return margins.of(outcome) if outcome.margin.kind == "share" else None
+
+
+def _event_row(event: AdverseEvent, caller: Caller, day: Days) -> tuple[Any, ...]:
+    now, visit = event.now, event.visit
+    known = now.kind, now.severity, now.serious, day.of(event.occurred_at), day.of(now.ended_at), now.relation, now.action, now.outcome
+    number = visit.number if visit is not None else None
+    return (event.id, now.revision, number, event.session_id, policy_of(event, caller), *known, now.cleared_reason is not None)
 
 
 def _dose_rows(participant: Participant, day: Days) -> list[tuple[Any, ...]]:

@@ -48,6 +48,7 @@ TITLES = {
     "estimates": "every estimate of a return, with its interval",
     "coverage": "what the data could say about each policy, checked before it was estimated",
     "outcomes": "what outcomes are called, which way is better, and how they are compared",
+    "adverse_events": "every adverse event as it is known now",
     "doses": "medication taken at each visit; times since a dose count those of drugs whose effect comes and goes within hours",
     "margins": "versions of the non-inferiority margins, and when they were locked",
     "primary": "controllers and policies against the same visit's cDBS; recompute.py checks those of controllers",
@@ -84,6 +85,22 @@ FIELDS: dict[str, tuple[Field, ...]] = {
         {_VALUES}
         qoc_revision integer Revision of these QoCs.
         problem string Why it has no steps; such a session counts in no analysis.
+    """),
+    "adverse_events": _fields("""
+        event_id integer Number of the event.
+        revision integer Revision of what is known.
+        visit integer Number of the visit; empty apart from visits.
+        session_id integer Session, if it happened in one.
+        policy_id integer Policy that ran, in policies.csv; empty where it is hidden or none did.
+        kind string What happened; empty where nothing was found.
+        severity string none, mild, moderate, severe or not_stated.
+        serious boolean Whether it is serious (ISO 14155).
+        began_day number Days since enrolment.
+        ended_day number Days since enrolment; empty where it has not ended, or that is not known.
+        relation string To what was tested; empty: not judged.
+        action string Taken because of it; empty: not stated.
+        outcome string Its outcome; empty: not known.
+        cleared boolean Whether a clinician cleared it; what ran then counts as safe again.
     """),
     "steps": _fields("""
         session_id integer Number of the session.

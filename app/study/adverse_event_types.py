@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from app.platform.web.schemas import Bool, Int, Model, Moment, Text
-from app.tables.adverse_events import EventKind, Severity
+from app.tables.adverse_events import Action, EventKind, EventOutcome, Relation, Severity
 
 # Words of adverse events.
 
@@ -31,7 +31,37 @@ EVENT_KINDS = {
 }
 
 
-EVENT_SEVERITIES = {Severity.NONE: "none", Severity.MILD: "mild", Severity.SEVERE: "severe", Severity.NOT_STATED: "not stated"}
+EVENT_SEVERITIES = {
+    Severity.NONE: "none",
+    Severity.MILD: "mild",
+    Severity.MODERATE: "moderate",
+    Severity.SEVERE: "severe",
+    Severity.NOT_STATED: "not stated",
+}
+RELATIONS = {
+    Relation.NOT_RELATED: "not related",
+    Relation.POSSIBLE: "possible",
+    Relation.PROBABLE: "probable",
+    Relation.CAUSAL: "causal",
+}
+ACTIONS = {
+    Action.NONE: "none",
+    Action.STIMULATION_CHANGED: "stimulation changed",
+    Action.SESSION_STOPPED: "session stopped",
+    Action.MEDICATION: "medication",
+    Action.OTHER: "other",
+}
+EVENT_OUTCOMES = {
+    EventOutcome.RECOVERED: "recovered",
+    EventOutcome.RECOVERING: "recovering",
+    EventOutcome.NOT_RECOVERED: "not recovered",
+    EventOutcome.LASTING_HARM: "lasting harm",
+    EventOutcome.FATAL: "fatal",
+}
+CHOICES = {"relation": ("Relation to the test", RELATIONS), "action": ("Action taken", ACTIONS), "outcome": ("Outcome", EVENT_OUTCOMES)}
+"""Label and words of each further choice, by its field; all may stay open."""
+HARM = (EventOutcome.LASTING_HARM, EventOutcome.FATAL)
+"""Outcomes that make an event serious (ISO 14155)."""
 
 
 # API types of adverse events.
@@ -48,6 +78,10 @@ class AdverseEventFields(Model):
         "Until a clinician clears it, what ran counts as unsafe.",
     )
     note: Text = Field("", max_length=2000, description="Without names or dates. Needed for the kind `other`.")
+    relation: Relation | None = Field(None, description="To what was tested (ISO 14155); null: not judged.")
+    ended_at: Moment | None = Field(None, description="Null: not ended, or not known. Without an offset it is UTC.")
+    action: Action | None = Field(None, description="Taken because of it; null: not stated.")
+    outcome: EventOutcome | None = Field(None, description="Null: not known. `lasting_harm` and `fatal` are serious.")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -55,6 +89,8 @@ class AdverseEventFields(Model):
             if self.serious:
                 raise PydanticCustomError("serious", "an event of severity 'none' cannot be serious")
             return self
+        if self.outcome in HARM and not self.serious:
+            raise PydanticCustomError("serious", "an event with lasting harm or a fatal one is serious")
         if self.kind is None:
             raise PydanticCustomError("kind", "say what happened: `kind` is missing")
         if self.kind is EventKind.OTHER and not self.note.strip():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from datetime import datetime
 
 from sqlalchemy import Select, String, cast, select
 from sqlalchemy.exc import IntegrityError
@@ -37,6 +38,13 @@ def event(db: Session, event_id: int, caller: Caller) -> AdverseEvent:
 def events_of_participant(db: Session, participant_id: int) -> Sequence[AdverseEvent]:
     """A participant's events in the order in which they were entered."""
     return db.scalars(_events().where(AdverseEvent.participant_id == participant_id).order_by(AdverseEvent.id)).all()
+
+
+def events_of_all(db: Session, caller: Caller, limit: int, offset: int) -> tuple[Sequence[AdverseEvent], int]:
+    """Load a page of the events of all participants that the caller may read, the newest first, and count them."""
+    query = _events().join(AdverseEvent.participant).join(Participant.site).where(in_scope(caller))
+    total = study_repository.count(db, query)
+    return db.scalars(query.order_by(AdverseEvent.id.desc()).limit(limit).offset(offset)).all(), total
 
 
 def with_blocking_events(db: Session) -> Sequence[Participant]:
@@ -96,7 +104,7 @@ Events = Mapping[int, tuple[AdverseEvent, ...]]
 """Serious adverse events and stops that no clinician has cleared, by policy."""
 
 _BELONGS = ("session_id", "visit_id", "policy_id", "occurred_at")
-_KNOWN = ("kind", "severity", "serious", "note")
+_KNOWN = tuple(AdverseEventFields.model_fields)
 
 
 def add_adverse_event(db: Session, participant: Participant, draft: AdverseEventIn, caller: Caller) -> AdverseEvent:
@@ -115,6 +123,7 @@ def add_adverse_event(db: Session, participant: Participant, draft: AdverseEvent
     if draft.entry_key is not None and (known := event_by_key(db, participant.id, draft.entry_key)):
         return _same(known, draft)
     visit_id = _checked_visit(db, participant, draft, caller)
+    _require_order(draft.occurred_at, draft)
     if draft.policy_id is not None and not study_repository.has_policy(db, participant.id, draft.policy_id):
         raise Invalid(f"Participant {participant.code} has no policy {draft.policy_id}.", "Name one of this participant's policies.")
     row = AdverseEvent(
@@ -142,6 +151,7 @@ def change_adverse_event(db: Session, event: AdverseEvent, change: AdverseEventC
         Forbidden: the caller may not correct the study's data. Conflict: somebody else changed it. Invalid: no reason.
     """
     access.require(caller, can.WRITE_STUDY, event.participant)
+    _require_order(event.occurred_at, change)
     return _follow(db, event, change.revision, change.reason, caller, change, None)
 
 
@@ -199,6 +209,12 @@ def blocking_events(events: Iterable[AdverseEvent], caller: Caller) -> dict[int,
 def blocked_policies(events: Iterable[AdverseEvent], caller: Caller) -> frozenset[int]:
     """Return the policies with serious events or stops that no clinician has cleared."""
     return frozenset(blocking_events(events, caller))
+
+
+def _require_order(began: datetime | None, fields: AdverseEventFields) -> None:
+    """Raise Invalid for an event that ended before it began."""
+    if began is not None and fields.ended_at is not None and fields.ended_at < began:
+        raise Invalid("The event ended before it began.", "Correct the end, or leave it empty.", field="ended_at")
 
 
 def _checked_visit(db: Session, participant: Participant, draft: AdverseEventIn, caller: Caller) -> int | None:
@@ -265,12 +281,7 @@ def _follow(
 
 def _revision(number: int, values: AdverseEventFields | AdverseEventRevision, caller: Caller) -> AdverseEventRevision:
     return AdverseEventRevision(
-        revision=number,
-        kind=values.kind,
-        severity=values.severity,
-        serious=values.serious,
-        note=values.note.strip(),
-        entered_by=caller.label,
+        revision=number, entered_by=caller.label, **{n: getattr(values, n) for n in _KNOWN} | {"note": values.note.strip()}
     )
 
 
@@ -288,10 +299,7 @@ def event_out(event: AdverseEvent, caller: Caller) -> AdverseEventOut:
         policy_id=policy_of(event, caller),
         occurred_at=event.occurred_at,
         revision=now.revision,
-        kind=now.kind,
-        severity=now.severity,
-        serious=now.serious,
-        note=now.note,
+        **{name: getattr(now, name) for name in _KNOWN},
         cleared_reason=now.cleared_reason,
         blocks=event.blocks,
         entered_by=now.entered_by,

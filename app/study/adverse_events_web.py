@@ -14,12 +14,20 @@ from app.accounts.permissions import Caller
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues, field_notes, parse
-from app.platform.web.schemas import RowId, problems
+from app.platform.web.schemas import PagingQuery, RowId, problems
 from app.platform.web.templates import render
 from app.study import adverse_events as adverse_events_rules
 from app.study import repository as study_repository
 from app.study.access import may
-from app.study.adverse_event_types import EVENT_KINDS, EVENT_SEVERITIES, AdverseEventChange, AdverseEventIn, AdverseEventOut, ClearanceIn
+from app.study.adverse_event_types import (
+    CHOICES,
+    EVENT_KINDS,
+    EVENT_SEVERITIES,
+    AdverseEventChange,
+    AdverseEventIn,
+    AdverseEventOut,
+    ClearanceIn,
+)
 from app.study.adverse_events import event_out
 from app.study.deps import CurrentParticipant, ResultsViewed
 from app.tables.adverse_events import AdverseEvent
@@ -72,8 +80,25 @@ pages = APIRouter()
 
 _LABELS = {
     "kind": "What happened", "severity": "How bad", "serious": "Serious", "note": "Note", "session_id": "Session", "visit_id": "Visit",
-    "reason": "Reason",
+    "reason": "Reason", "occurred_at": "Began", "ended_at": "Ended", **{name: label for name, (label, _) in CHOICES.items()},
 }  # fmt: skip
+
+
+@pages.get("/adverse-events", dependencies=[ResultsViewed])
+def all_adverse_events(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
+    """Show the events of all participants, the newest first."""
+    rows, total = adverse_events_rules.events_of_all(db, caller, paging.limit, paging.offset)
+    page = render(
+        request,
+        "study/all_adverse_events.html",
+        events=rows,
+        total=total,
+        paging=paging,
+        kinds=EVENT_KINDS,
+        severities=EVENT_SEVERITIES,
+        choices=CHOICES,
+    )
+    return HTMLResponse(page)
 
 
 @pages.get("/participants/{code}/adverse-events", dependencies=[ResultsViewed])
@@ -147,6 +172,7 @@ def _page(
         visits=visits,
         kinds=EVENT_KINDS,
         severities=EVENT_SEVERITIES,
+        choices=CHOICES,
         typed=typed,
         sent=form,
         remarks=field_notes(error, typed),

@@ -19,6 +19,7 @@ from app.platform.web.schemas import CodeOf, Int, Model, Text
 from app.study import access
 from app.study import adverse_events as events
 from app.study import repository as study_repository
+from app.study.adverse_event_types import CHOICES
 from app.study.characteristics import CharacteristicsFields, fields_of
 from app.study.repository import in_scope
 from app.study.settings_form import LABELS as SETTING_LABELS
@@ -53,6 +54,8 @@ QUERIED_FIELDS = {
     "severity": "Severity",
     "serious": "Whether it is serious",
     "occurred_at": "When it happened",
+    "ended_at": "When it ended",
+    **{name: label for name, (label, _) in CHOICES.items()},
     "leads": "Leads",
     "symptoms": "Symptoms",
     "hand": "Hand of the grasp test",
@@ -76,7 +79,7 @@ FIELDS: Mapping[Subject, tuple[str, ...]] = {
     Subject.UPLOAD: ("file", OTHER),
     Subject.VISIT: ("date", "cdbs_left", "cdbs_right", "note", OTHER),
     Subject.DOSE: ("drug", "mg", "taken_at", OTHER),
-    Subject.EVENT: ("kind", "severity", "serious", "occurred_at", "note", OTHER),
+    Subject.EVENT: ("kind", "severity", "serious", "occurred_at", "ended_at", *CHOICES, "note", OTHER),
     Subject.SETTINGS: (*SettingsFields.model_fields, OTHER),
     Subject.CHARACTERISTICS: (*CharacteristicsFields.model_fields, OTHER),
 }

@@ -46,8 +46,38 @@ class Severity(StrEnum):
 
     NONE = "none"
     MILD = "mild"
+    MODERATE = "moderate"
     SEVERE = "severe"
     NOT_STATED = "not_stated"
+
+
+class Relation(StrEnum):
+    """Relation of an event to what was tested, in the steps of ISO 14155."""
+
+    NOT_RELATED = "not_related"
+    POSSIBLE = "possible"
+    PROBABLE = "probable"
+    CAUSAL = "causal"
+
+
+class Action(StrEnum):
+    """Action taken because of an event."""
+
+    NONE = "none"
+    STIMULATION_CHANGED = "stimulation_changed"
+    SESSION_STOPPED = "session_stopped"
+    MEDICATION = "medication"
+    OTHER = "other"
+
+
+class EventOutcome(StrEnum):
+    """Outcome of an event, as far as it is known."""
+
+    RECOVERED = "recovered"
+    RECOVERING = "recovering"
+    NOT_RECOVERED = "not_recovered"
+    LASTING_HARM = "lasting_harm"
+    FATAL = "fatal"
 
 
 class AdverseEvent(Base):
@@ -95,7 +125,10 @@ class AdverseEventRevision(Base):
     __tablename__ = "adverse_event_revision"
     __table_args__ = (
         UniqueConstraint("event_id", "revision"),
-        CheckConstraint("severity in ('none', 'mild', 'severe', 'not_stated')", name="severity"),
+        CheckConstraint("severity in ('none', 'mild', 'moderate', 'severe', 'not_stated')", name="severity"),
+        CheckConstraint("relation in ('not_related', 'possible', 'probable', 'causal')", name="relation"),
+        CheckConstraint("action in ('none', 'stimulation_changed', 'session_stopped', 'medication', 'other')", name="action"),
+        CheckConstraint("outcome in ('recovered', 'recovering', 'not_recovered', 'lasting_harm', 'fatal')", name="outcome"),
         CheckConstraint("severity = 'none' or kind is not null", name="kind_stated"),
         CheckConstraint("severity <> 'none' or not serious", name="serious"),
         CheckConstraint("kind <> 'other' or severity = 'none' or note <> ''", name="other_described"),
@@ -109,6 +142,10 @@ class AdverseEventRevision(Base):
     severity: Mapped[Severity] = mapped_column(String(10))
     serious: Mapped[bool]
     note: Mapped[str] = mapped_column(Text, server_default="")
+    relation: Mapped[Relation | None] = mapped_column(String(20))
+    ended_at: Mapped[datetime | None]
+    action: Mapped[Action | None] = mapped_column(String(20))
+    outcome: Mapped[EventOutcome | None] = mapped_column(String(20))
     cleared_reason: Mapped[str | None] = mapped_column(Text)
     """A clinician's reason why the event does not count against the policy that ran; None if no clinician has cleared it."""
     entered_by: Mapped[str] = mapped_column(String(254))

@@ -6,7 +6,7 @@ import sqlalchemy as sa
 from alembic import op
 from sqlalchemy.dialects import postgresql
 
-revision = "first_4aed51d5"
+revision = "first_ae8a34b9"
 down_revision = None
 branch_labels = None
 depends_on = None
@@ -1236,6 +1236,10 @@ def upgrade() -> None:
         sa.Column("severity", sa.String(length=10), nullable=False),
         sa.Column("serious", sa.Boolean(), nullable=False),
         sa.Column("note", sa.Text(), server_default="", nullable=False),
+        sa.Column("relation", sa.String(length=20), nullable=True),
+        sa.Column("ended_at", sa.DateTime(timezone=True), nullable=True),
+        sa.Column("action", sa.String(length=20), nullable=True),
+        sa.Column("outcome", sa.String(length=20), nullable=True),
         sa.Column("cleared_reason", sa.Text(), nullable=True),
         sa.Column("entered_by", sa.String(length=254), nullable=False),
         sa.Column("reason", sa.Text(), nullable=True),
@@ -1244,7 +1248,20 @@ def upgrade() -> None:
         sa.CheckConstraint("kind <> 'other' or severity = 'none' or note <> ''", name=op.f("ck_adverse_event_revision_other_described")),
         sa.CheckConstraint("severity <> 'none' or not serious", name=op.f("ck_adverse_event_revision_serious")),
         sa.CheckConstraint("severity = 'none' or kind is not null", name=op.f("ck_adverse_event_revision_kind_stated")),
-        sa.CheckConstraint("severity in ('none', 'mild', 'severe', 'not_stated')", name=op.f("ck_adverse_event_revision_severity")),
+        sa.CheckConstraint(
+            "severity in ('none', 'mild', 'moderate', 'severe', 'not_stated')", name=op.f("ck_adverse_event_revision_severity")
+        ),
+        sa.CheckConstraint(
+            "relation in ('not_related', 'possible', 'probable', 'causal')", name=op.f("ck_adverse_event_revision_relation")
+        ),
+        sa.CheckConstraint(
+            "action in ('none', 'stimulation_changed', 'session_stopped', 'medication', 'other')",
+            name=op.f("ck_adverse_event_revision_action"),
+        ),
+        sa.CheckConstraint(
+            "outcome in ('recovered', 'recovering', 'not_recovered', 'lasting_harm', 'fatal')",
+            name=op.f("ck_adverse_event_revision_outcome"),
+        ),
         sa.ForeignKeyConstraint(["event_id"], ["adverse_event.id"], name=op.f("fk_adverse_event_revision_event_id_adverse_event")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_adverse_event_revision")),
         sa.UniqueConstraint("event_id", "revision", name=op.f("uq_adverse_event_revision_event_id_revision")),

@@ -118,7 +118,7 @@ export function adverseEvent(app, where, kinds, rules) {
       return askText("What happened?", rules, (text, noNames) => enter(kind, severity, serious, text, noNames));
     };
     const rows = kinds.map(([kind, name]) => el("div", { class: "day-event", role: "group", "aria-label": name }, el("span", { text: name }),
-      [["mild", false, "Mild"], ["severe", false, "Severe"], ["severe", true, "Serious"]].map(([severity, serious, text]) =>
+      [["mild", false, "Mild"], ["moderate", false, "Moderate"], ["severe", false, "Severe"], ["severe", true, "Serious"]].map(([severity, serious, text]) =>
         button(text, severity === "severe" ? "danger" : "", pick(kind, severity, serious), { "data-act": `event-${kind}-${text.toLowerCase()}` }))));
     return [el("p", {}, el("b", { text: "First stop the controller on its tablet (Ctrl-C): it returns to clinical settings at once." }),
       " Nothing that is entered on this page, Stop included, reaches the controller."),

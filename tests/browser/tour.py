@@ -17,6 +17,7 @@ PAGES = {
     "/": "study/today",
     "/energy-saved": "study/energy-saved",
     "/search": "study/search",
+    "/adverse-events": "study/all-adverse-events",
     "/analyses": "study/all-analyses",
     "/trial-time": "study/trial-time",
     "/jobs": "study/all-jobs",

@@ -50,7 +50,7 @@ class AdverseEventPayload(Model):
     """Something that happened to the participant; it is stored among the adverse events as soon as it arrives."""
 
     kind: EventKind
-    severity: Literal["mild", "severe"] = Field(description="`severe` is a stop rule.")
+    severity: Literal["mild", "moderate", "severe"] = Field(description="`severe` is a stop rule.")
     serious: Bool = Field(False, description="Death, danger to life, hospital, lasting harm, or what a clinician holds equal (ISO 14155).")
     note: Annotated[Text, Field(max_length=1000)] = Field("", description="Needed for the kind `other`; screened as notes are.")
     no_names: NoNames = Field(default_factory=list, description="As in a note.")

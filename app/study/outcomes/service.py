@@ -385,6 +385,7 @@ def follow_stop(db: Session, session: StudySession, previous: str | None, reason
 def _stop_revision(event: AdverseEvent, severity: Severity, note: str, reason: str | None, caller: Caller) -> AdverseEventRevision:
     serious = bool(event.revisions) and event.now.serious and severity is not Severity.NONE
     number = len(event.revisions) + 1
-    return AdverseEventRevision(
-        revision=number, kind=EventKind.STOPPED, severity=severity, serious=serious, note=note, reason=reason, entered_by=caller.label
-    )
+    details = ("relation", "ended_at", "action", "outcome") if event.revisions else ()
+    kept: dict[str, Any] = {name: getattr(event.now, name) for name in details}
+    kept |= {"revision": number, "serious": serious, "note": note, "reason": reason, "entered_by": caller.label}
+    return AdverseEventRevision(kind=EventKind.STOPPED, severity=severity, **kept)

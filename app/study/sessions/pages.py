@@ -19,7 +19,7 @@ from app.platform.numbers import typed
 from app.platform.web.forms import FormValues, confirmed, field_notes, parse
 from app.platform.web.templates import render
 from app.study import access, repository
-from app.study.adverse_event_types import EVENT_KINDS, EVENT_SEVERITIES
+from app.study.adverse_event_types import CHOICES, EVENT_KINDS, EVENT_SEVERITIES
 from app.study.adverse_events import events_of_session
 from app.study.blinding import CONTROLLER_NAMES, arm, may_know, require_known
 from app.study.data_queries import not_closed_of_session
@@ -325,6 +325,7 @@ def _page(
         events=events_of_session(db, session.id),
         event_kinds=EVENT_KINDS,
         event_severities=EVENT_SEVERITIES,
+        event_choices=CHOICES,
         drawn=_drawn(db, session, data, caller),
         ran_on=history.of_recording(control_recording(session)),
         least_share=LEAST_SHARE,
@@ -361,6 +362,7 @@ def _sealed_page(
         events=events_of_session(db, session.id),
         event_kinds=EVENT_KINDS,
         event_severities=EVENT_SEVERITIES,
+        event_choices=CHOICES,
         may_write=caller.may(can.WRITE_STUDY, participant.site.study_id, participant.site_id),
         problem=error.problem(request.url.path) if error else None,
         remarks=field_notes(error, typed or {}),

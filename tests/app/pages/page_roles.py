@@ -81,6 +81,7 @@ PAGES = {
     "/": can.READ,
     "/account": can.READ,
     "/accounts": can.MANAGE_ACCOUNTS,
+    "/adverse-events": can.READ,
     "/analyses": can.READ,
     "/analyses/figure": can.READ,
     "/analyses/results.csv": can.READ,

@@ -20,8 +20,9 @@ from tests.app.pages import page_roles as roles
 from tests.app.pages.every_page import ELSEWHERE, addresses, routes
 from tests.app.pages.page_calls import NEW, browser, calls, posts
 
-SHARED = {"/", "/account", "/glossary", "/api-reference", "/styleguide", "/search", "/jobs", "/analyses", "/analyses/figure",
-          "/analyses/results.csv", "/analyses/results.svg", "/trial-time", "/energy-saved", "/studies", "/accounts", "/audit",
+SHARED = {"/", "/account", "/glossary", "/api-reference", "/styleguide", "/search", "/jobs", "/analyses",
+          "/adverse-events", "/analyses/figure", "/analyses/results.csv", "/analyses/results.svg", "/trial-time", "/energy-saved",
+          "/studies", "/accounts", "/audit",
           "/audit.csv",
           "/participants/new", "/visit-day/key", *roles.WITHOUT_SIGN_IN}  # fmt: skip
 """Pages without an object in their address: whoever opens one sees what they may of what there is."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import zipfile
 from collections.abc import Callable
 from typing import Any
 
@@ -137,3 +140,45 @@ def test_the_page_writes_clears_and_keeps_what_was_refused(client: TestClient, u
     form = {"revision": "1", "reason": "passed within a minute"}
     assert client.post(f"/adverse-events/{event['id']}/clearance", data=form, follow_redirects=False).status_code == 303
     assert "serious, cleared" in client.get(page).text
+
+
+DETAILS = {"relation": "probable", "action": "stimulation_changed", "outcome": "recovering", "ended_at": "2026-03-02T11:00:00Z"}
+
+
+def test_what_a_clinical_standard_asks_is_kept_corrected_and_exported(client: TestClient, upload: Upload) -> None:
+    session = upload("random")
+    began = {"occurred_at": "2026-03-02T10:00:00Z", "session_id": session}
+    event = add(client, kind="gait", severity="moderate", serious=False, **began, **DETAILS)
+    assert {name: event[name] for name in DETAILS} == DETAILS
+    fields = {name: event[name] for name in ("kind", "severity", "serious", "note", *DETAILS)}
+    change = fields | {"outcome": "recovered", "revision": 1, "reason": "seen again"}
+    changed = client.put(f"/api/v1/adverse-events/{event['id']}", json=change).json()
+    assert (changed["outcome"], changed["relation"], changed["revision"]) == ("recovered", "probable", 2)
+    for path in ("/adverse-events", "/participants/P1/adverse-events"):
+        page = client.get(path).text
+        assert all(word in page for word in ("moderate", "probable", "stimulation changed", "recovered")), path
+    with zipfile.ZipFile(io.BytesIO(client.get("/participants/P1/export.zip").content)) as package:
+        (row,) = csv.DictReader(io.StringIO(package.read("P1/adverse_events.csv").decode()))
+    known = {name: row[name] for name in ("severity", "serious", "relation", "action", "outcome", "session_id", "cleared")}
+    assert known == {
+        "severity": "moderate", "serious": "false", "relation": "probable", "action": "stimulation_changed", "outcome": "recovered",
+        "session_id": str(session), "cleared": "false",
+    }  # fmt: skip
+    assert float(row["ended_day"]) - float(row["began_day"]) == pytest.approx(1 / 24, abs=1e-4)
+
+
+def test_lasting_harm_is_serious_and_no_event_ends_before_it_began(client: TestClient, participant_code: str) -> None:
+    for wrong, field in (({"outcome": "fatal", "serious": False}, "serious"), (DETAILS | {"occurred_at": "2026-03-02T12:00:00Z"}, "ended")):
+        answer = client.post(PATH, json=FALL | wrong)
+        assert answer.status_code == 422
+        assert field in answer.text
+    event = add(client, outcome="lasting_harm")
+    assert clear(client, event).json()["outcome"] == "lasting_harm", "a clearance changes nothing that is known"
+
+
+def test_the_list_of_all_events_has_those_alone_that_the_reader_may_see(
+    client: TestClient, client_as: Clients, participant_code: str
+) -> None:
+    add(client)
+    assert "broke a wrist" in client_as("monitor").get("/adverse-events").text
+    assert client_as("blinded_assessor").get("/adverse-events").status_code == 403
