@@ -24,6 +24,9 @@ SAME_TIME_S = 1.0
 UNTOLD = 0.02
 """Shares of a minute that miss 1 by this much are rounded, not incomplete."""
 
+ROUNDING = 1e-6
+"""Shares are stored as float32: together they may exceed the whole by this share of it."""
+
 _COUNTED_COLUMNS = [TREMOR_CLASSES.index(name) for name in COUNTED]
 
 
@@ -111,7 +114,7 @@ def tremor_percent(class_seconds: dict[str, float], session_s: float) -> float:
     if session_s <= 0:
         raise ValueError(f"a session must be longer than 0 s, not {session_s}")
     tremor_s = sum(class_seconds.get(name, 0.0) for name in COUNTED)
-    if tremor_s > session_s * (1 + 1e-9):
+    if tremor_s > session_s * (1 + ROUNDING):
         raise ValueError(f"{tremor_s:.1f} s of tremor do not fit into a session of {session_s:.1f} s")
     return min(100.0, 100.0 * tremor_s / session_s)
 

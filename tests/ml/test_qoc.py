@@ -132,3 +132,11 @@ def test_both_readings_agree_with_a_sum_over_the_minutes(shares, begin, length):
 def test_minutes_of_one_class_each_read_the_same_both_ways():
     rows = np.eye(6)
     np.testing.assert_array_equal(tremor_by_class(rows), tremor_by_duration(rows))
+
+
+def test_a_session_of_tremor_alone_is_100_per_cent_although_its_shares_were_rounded() -> None:
+    shares = np.zeros((3, 6), dtype=np.float32)
+    shares[:, 3:] = np.array([0.1, 0.2, 0.7], dtype=np.float32)
+    shares[:, 5] = np.nextafter(shares[:, 5], np.float32(1))
+    found = read_tremor(60.0 * np.arange(3), np.full(3, 60.0), shares.astype(np.float64), 10.0, 150.0)
+    assert found.duration_weighted == 100.0
