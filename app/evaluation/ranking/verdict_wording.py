@@ -143,12 +143,12 @@ def dose_words(row: Row, cdbs_ma: float | None) -> str:
 
     found, adapts, adds = [], row.adapts, row.adds
     if adapts is not None:
-        how = "same as" if adapts.fixed else "follows beta around"
+        how = "same as" if adapts.fixed else "adapts to beta around"
         found.append(f"{how} {dose(adapts.mean)}{' all the time' if adapts.fixed else ''}: {dose(adapts.low)} to {dose(adapts.high)}")
     if adds is not None:
         points = f"{signed(adds.value)} points of the return ({signed(adds.low)} to {signed(adds.high)})"
         open_yet = "" if adds.low > 0 or adds.high < 0 else ", so that it may be nothing"
-        found.append(f"following beta adds {points} to {dose(adds.amplitude)} all the time{open_yet}")
+        found.append(f"adapting to beta adds {points} to {dose(adds.amplitude)} all the time{open_yet}")
     return "; ".join(found)
 
 

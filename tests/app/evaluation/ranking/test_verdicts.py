@@ -110,17 +110,17 @@ def test_each_policy_says_how_far_it_follows_beta_and_what_that_adds(
     coverage["map"] = replace(BehaviourMap.from_json(coverage["map"]), policies=curves).to_json()  # type: ignore[arg-type]
     judge({a: judged(50.0), b: judged(49.0)}, coverage=coverage)
     words = first_screen(client)
-    assert "never run so far. Dose: follows beta around 2.19 mA: 1.56 mA to 2.82 mA." in words, (
+    assert "never run so far. Dose: adapts to beta around 2.19 mA: 1.56 mA to 2.82 mA." in words, (
         "what it adds is not known without constants"
     )
     held = {float(p.config["amplitude"]): p.id for p in db.scalars(select(Policy).where(Policy.algorithm == "constant"))}
     levels = sorted(level for level in held if level < 1.0)
     posterior = {held[level]: judged(45.0) for level in levels}
     judge({a: judged(50.0), b: judged(45.5)} | posterior, cdbs(value=45.0).to_json(), coverage=coverage, candidates=[a, b])
-    adds = f"following beta adds +5.0 points of the return (+5.0 to +5.0) to {3 * 0.6**0.5:.2f} mA all the time"
-    assert f"follows beta around 2.19 mA: 1.56 mA to 2.82 mA; {adds}" in first_screen(client), "its energy is 0.6 of that of cDBS"
+    adds = f"adapting to beta adds +5.0 points of the return (+5.0 to +5.0) to {3 * 0.6**0.5:.2f} mA all the time"
+    assert f"adapts to beta around 2.19 mA: 1.56 mA to 2.82 mA; {adds}" in first_screen(client), "its energy is 0.6 of that of cDBS"
     page = flat(client.get(f"/participants/P1/policies/{b}").text)
-    assert "same as 2.4 mA all the time: 2.34 mA to 2.46 mA; following beta adds +0.5 points" in page
+    assert "same as 2.4 mA all the time: 2.34 mA to 2.46 mA; adapting to beta adds +0.5 points" in page
 
 
 def test_a_change_of_margins_changes_the_verdict_at_once(client: TestClient, policies: list[int], judge: Judge) -> None:
