@@ -69,7 +69,7 @@ PROMISES = [
     ),
     *_of(
         "overview/package",
-        ("exports are in the trail", 'record(db, "export"', '(lambda *_: None)(db, "export"',
+        ("exports are in the trail", 'record(db, "export", "participant", participant.id)\n    found', '(lambda *_: None)()\n    found',
          f"{CHAIN}::test_what_leaves_and_who_looked_is_in_the_trail"),
     ),
     *_of(
