@@ -17,9 +17,9 @@ from app.planning.grounds import events_against, unanswered
 from app.planning.plans import wording
 from app.planning.plans.designs import Planned, seed_of
 from app.planning.plans.limits import device_limits
-from app.planning.plans.repository import today
 from app.planning.plans.sign_off import common_limits
 from app.planning.plans.view import PlanLine, PlanView, read_plan, refuse_running, shown
+from app.planning.plans.visits import today
 from app.planning.sheet.content import BUNDLE, card_of
 from app.platform import files
 from app.platform.errors import Conflict, Invalid, NotFound

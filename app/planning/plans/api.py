@@ -11,7 +11,7 @@ from app.accounts.deps import CurrentCaller
 from app.evaluation.wording import estimate_out
 from app.planning.bundles.ports import lines_of
 from app.planning.bundles.repository import releases_of_slots
-from app.planning.plans import repository, service, sign_off, wording
+from app.planning.plans import service, sign_off, visits, wording
 from app.planning.plans.schemas import (
     Approval,
     KeyOpening,
@@ -109,7 +109,7 @@ def open_key(visit: CurrentVisit, opening: KeyOpening, db: Db, caller: CurrentCa
 @router.post("/visits/{visit_id}/removal", status_code=204, responses=problems(409))
 def remove_visit(visit: CurrentVisit, removal: Removal, db: Db, caller: CurrentCaller) -> None:
     """Remove a visit in which nothing was done, with its drafts."""
-    repository.remove_visit(db, visit, removal.reason, caller)
+    visits.remove_visit(db, visit, removal.reason, caller)
 
 
 def plan_out(view: PlanView) -> PlanOut:

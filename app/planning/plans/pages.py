@@ -17,10 +17,10 @@ from app.evaluation import wording as evaluation_wording
 from app.evaluation.ranking import verdict_wording
 from app.evaluation.wording import method_name, sentence
 from app.planning.plans import draft_form, repository, service, sign_off, wording
-from app.planning.plans.repository import remove_visit, today, visit_for_draft
 from app.planning.plans.schemas import Id, Move
 from app.planning.plans.sign_off import MEANING
 from app.planning.plans.view import PlanView, read_plan, shown, standings_of
+from app.planning.plans.visits import remove_visit, today, visit_for_draft
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, NotFound
 from app.platform.web.forms import FormValues, field_notes, parse, renamed

@@ -18,7 +18,7 @@ from app.evaluation.ranking.judged import Judged
 from app.evaluation.repository import PolicyHead
 from app.planning.plans import repository
 from app.planning.plans.designs import offered
-from app.planning.plans.repository import today
+from app.planning.plans.visits import today
 from app.planning.protocol.schedule import Rules, cdbs_sessions, most_policies, total_minutes
 from app.platform.numbers import counted
 from app.study.access import may

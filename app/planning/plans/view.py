@@ -21,8 +21,8 @@ from app.planning.notices import Code, PlanWarning, without_policies
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of
 from app.planning.plans.limits import require_limits
-from app.planning.plans.repository import today
 from app.planning.plans.sign_off import CommonLimits, common_limits, sealed, signature_of
+from app.planning.plans.visits import today
 from app.planning.plans.wording import ANSWER_EVENT, happened
 from app.planning.protocol.medication import due_before
 from app.platform.audit.signatures import SignatureState

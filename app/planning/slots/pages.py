@@ -12,7 +12,7 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.planning.plans import repository as plans
-from app.planning.plans.repository import today
+from app.planning.plans.visits import today
 from app.planning.slots import service
 from app.planning.slots.matching import DEVIATIONS, slots_summary
 from app.planning.slots.serializers import comparison_out
