@@ -15,10 +15,11 @@ from app.analysis import evidence
 from app.analysis.evidence import Evidence
 from app.analysis.facts import METRICS, BetaKind, Facts, choose, comparable_beta, of_controller, with_comparable_beta
 from app.analysis.primary_results import ControllerResult, results
-from app.analysis.primary_verdict import LockedMargins, VerdictResult, earlier_verdicts, policy_verdicts, verdicts
+from app.analysis.primary_verdict import LockedMargins, VerdictResult, confirmed_policies, earlier_verdicts, policy_verdicts, verdicts
 from app.platform.errors import NotFound
 from app.platform.kept import kept
-from app.study.margins import margins_of
+from app.study.margins import declarations, margins_of
+from app.study.sessions.usable_steps import CONTROLLER_OF_KIND
 from app.tables.learning import Policy
 from app.tables.participants import Participant
 from app.tables.plans import Plan, PlanItem
@@ -93,7 +94,9 @@ def primary(db: Session, participant: Participant, caller: Caller) -> Primary:
 def of_all(db: Session, participants: Sequence[Participant], held: Sequence[Evidence]) -> list[Primary]:
     """Primary results of several participants, whose evidence is `held`."""
     ids = [p.id for p in participants]
-    names, picked = find_policy_names(db, ids), last_picked(db, ids)
+    names, picked, declared = find_policy_names(db, ids), last_picked(db, ids), declared_margins(db, ids)
+    for i, of_participant in declared.items():  # a declared confirmation counts whatever is planned afterwards
+        picked[i] |= {policy: margins.declared_at for policy, margins in of_participant.items() if margins.declared_at is not None}
     return [_of(h, locked_margins(p), names[p.id], picked[p.id]) for p, h in zip(participants, held, strict=True)]
 
 
@@ -120,6 +123,40 @@ def verdicts_on(facts: Evidence, participant: Participant) -> tuple[VerdictResul
     return _verdicts(facts, locked_margins(participant)[-1])
 
 
+def declared_margins(db: Session, participant_ids: Collection[int]) -> dict[int, dict[int, LockedMargins]]:
+    """Return the margins of every declared confirmation, by participant and policy."""
+    return {
+        participant_id: {
+            row.policy_id: LockedMargins(
+                margins_of(row.lock.margins),
+                row.lock.margins.version,
+                row.lock.created_at,
+                row.lock.created_by,
+                row.lock.reason,
+                declared_at=row.created_at,
+                declared_by=row.created_by,
+            )
+            for row in rows
+        }
+        for participant_id, rows in declarations(db, participant_ids).items()
+    }
+
+
+def confirmed_policies_of(db: Session, facts: Evidence) -> dict[int, VerdictResult]:
+    """Return by policy the verdict on the sessions after its confirmation was declared."""
+    declared = declared_margins(db, [facts.participant_id])[facts.participant_id]
+    if not declared:
+        return {}
+    kinds = db.execute(select(Policy.id, Policy.kind).where(Policy.id.in_(declared)))
+    controllers = {i: CONTROLLER_OF_KIND.get(kind, Controller.RL) for i, kind in kinds}
+
+    def compute() -> dict[int, VerdictResult]:
+        sessions = with_comparable_beta(facts.sessions, comparable_beta(facts.sessions, facts.beta_unit, facts.beta_source))
+        return confirmed_policies(sessions, controllers, declared, facts.failed)
+
+    return kept(("confirmed policies", facts.key, tuple(declared.items())), compute)
+
+
 def policy_verdicts_of(facts: Evidence, participant: Participant) -> dict[int, VerdictResult]:
     """Return by policy the verdict on its own sessions, by the margins in force."""
     locked = locked_margins(participant)[-1]
@@ -129,6 +166,23 @@ def policy_verdicts_of(facts: Evidence, participant: Participant) -> dict[int, V
         return policy_verdicts(sessions, locked, facts.failed)
 
     return kept(("policy verdicts", facts.key, locked), compute)
+
+
+@dataclass(frozen=True)
+class PolicyVerdict:
+    """The verdict on one policy by itself."""
+
+    policy_id: int
+    name: str
+    result: VerdictResult
+
+
+def policies_judged(db: Session, facts: Evidence, participant: Participant) -> list[PolicyVerdict]:
+    """Return the verdicts on each policy by itself: the confirmatory one where it was declared, then the exploratory one."""
+    names = policy_names(db, participant)
+    confirmed, explored = confirmed_policies_of(db, facts), policy_verdicts_of(facts, participant)
+    judged = sorted(confirmed.keys() | explored.keys())
+    return [PolicyVerdict(i, names[i], found[i]) for i in judged for found in (confirmed, explored) if i in found]
 
 
 def _verdicts(held: Evidence, locked: LockedMargins) -> tuple[VerdictResult, ...]:

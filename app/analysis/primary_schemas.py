@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime
 
@@ -11,7 +11,7 @@ from pydantic import Field
 
 from app.analysis import primary_words
 from app.analysis.figures import csv_of
-from app.analysis.primary import Primary
+from app.analysis.primary import PolicyVerdict, Primary
 from app.analysis.primary_results import LEVEL, Comparison, ControllerResult
 from app.analysis.primary_verdict import LockedMargins, VerdictResult
 from app.platform.web.csv_files import download
@@ -116,6 +116,8 @@ class VerdictOut(Model):
     """The verdict on one controller."""
 
     controller: Controller
+    policy_id: int | None = Field(description="Null for all policies of the controller.")
+    declared_at: datetime | None = Field(description="When the confirmation of the policy was declared; null where it was not.")
     confirmatory: bool
     verdict: str = Field(description="non_inferior_and_saving, inferior, inconclusive or not_available.")
     sentence: str
@@ -146,6 +148,9 @@ class PrimaryOut(Model):
     family: str
     margins: MarginsLockedOut
     verdicts: list[VerdictOut]
+    policy_verdicts: list[VerdictOut] = Field(
+        description="Of each policy by itself: the confirmatory one where its confirmation was declared, then the exploratory one."
+    )
     earlier_verdicts: list[VerdictOut] = Field(
         description="Under locks that a newer one followed, oldest first: of the visits that began between the two."
     )
@@ -163,7 +168,7 @@ CSV_COLUMNS = (
 VERDICT_NAMES = {NonInferiorAndSaving: "non_inferior_and_saving", Inferior: "inferior", Inconclusive: "inconclusive"}
 
 
-def primary_out(found: Primary, synthetic: bool, standings: Mapping[int, str]) -> PrimaryOut:
+def primary_out(found: Primary, synthetic: bool, policies: Sequence[PolicyVerdict], standings: Mapping[int, str]) -> PrimaryOut:
     """Convert the results of one participant; `standings` has a sentence by policy."""
     return PrimaryOut(
         participant=found.evidence.participant,
@@ -172,6 +177,7 @@ def primary_out(found: Primary, synthetic: bool, standings: Mapping[int, str]) -
         family=primary_words.FAMILY,
         margins=margins_out(found.locked),
         verdicts=[verdict_out(v) for v in found.verdicts],
+        policy_verdicts=[verdict_out(v.result, v.policy_id, v.name) for v in policies],
         earlier_verdicts=[verdict_out(v) for v in found.earlier],
         results=[_tested(r, found) for r in found.results],
         standings=[StandingOut(policy_id=i, sentence=text) for i, text in standings.items()],
@@ -230,8 +236,8 @@ def saving_out(found: Saving | Unavailable) -> AverageOut:
     )
 
 
-def verdict_out(result: VerdictResult) -> VerdictOut:
-    """A verdict with what is behind it."""
+def verdict_out(result: VerdictResult, policy_id: int | None = None, name: str = "") -> VerdictOut:
+    """Convert a verdict; `name` and `policy_id` where it is on one policy."""
     a = result.assessment
     outcomes = []
     for o in a.outcomes if a else ():
@@ -253,9 +259,11 @@ def verdict_out(result: VerdictResult) -> VerdictOut:
         )
     return VerdictOut(
         controller=result.controller,
+        policy_id=policy_id,
+        declared_at=result.locked.declared_at,
         confirmatory=result.confirmatory,
         verdict=VERDICT_NAMES[type(a.verdict)] if a else "not_available",
-        sentence=primary_words.verdict(result),
+        sentence=primary_words.verdict(result, name),
         basis=primary_words.verdict_kind(result),
         margins=margins_out(result.locked),
         visits=list(result.visits),

@@ -9,7 +9,7 @@ its margin, a value must win at least half of the pairs with the same visit's cD
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import StrEnum
@@ -39,6 +39,7 @@ class LockedMargins:
 
     Attributes:
         reason: of the lock. until: when a newer lock followed; None of the lock in force.
+        declared_at, declared_by: of a policy's confirmation by these margins; None of an arm's.
     """
 
     margins: Margins
@@ -47,6 +48,8 @@ class LockedMargins:
     locked_by: str | None
     reason: str | None = None
     until: datetime | None = None
+    declared_at: datetime | None = None
+    declared_by: str | None = None
 
 
 @dataclass(frozen=True)
@@ -100,8 +103,30 @@ def verdicts(sessions: Sequence[Facts], controllers: Sequence[Controller], locke
     return found
 
 
+def confirmed_policies(
+    sessions: Sequence[Facts], controllers: Mapping[int, Controller], by_policy: Mapping[int, LockedMargins], failure: Qoc
+) -> dict[int, VerdictResult]:
+    """Return by policy the verdict on all sessions after its confirmation was declared, by the margins that were locked then.
+
+    Args:
+        sessions: that count. controllers: that run the declared policies. by_policy: margins and moment of each declaration.
+        failure: what a stopped session of the participant counts as.
+    """
+    return {
+        i: _judge(
+            [s for s in sessions if s.controller is Controller.CDBS or s.arm.policy_id == i],
+            [s for s in _begun_after(sessions, margins.declared_at) if s.controller is Controller.CDBS or s.arm.policy_id == i],
+            controllers[i],
+            margins,
+            failure,
+            confirmatory=True,
+        )
+        for i, margins in by_policy.items()
+    }
+
+
 def policy_verdicts(sessions: Sequence[Facts], margins: LockedMargins, failure: Qoc) -> dict[int, VerdictResult]:
-    """Return by policy the verdict on its own sessions, by the margins in force, without planning.
+    """Return by policy the verdict on all of its own sessions, by the margins in force, without planning.
 
     None confirms: earlier sessions decided which policies ran on. Arguments as of `verdicts`, whose `locked` and `failed` these are.
     """
@@ -143,6 +168,12 @@ def _after(sessions: Sequence[Facts], moment: datetime | None) -> list[Facts]:
     if moment is None:
         return []
     early = {s.visit for s in sessions if opened_at(s) <= moment}
+    return [s for s in sessions if s.visit not in early]
+
+
+def _begun_after(sessions: Sequence[Facts], moment: datetime | None) -> list[Facts]:
+    """Return the sessions of the visits that are known to have begun after a moment, by starts or else by the visit's day."""
+    early = {s.visit for s in sessions if moment is None or not s.began_after(moment)}
     return [s for s in sessions if s.visit not in early]
 
 

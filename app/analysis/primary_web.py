@@ -86,7 +86,9 @@ def read_primary(
     """Each controller and policy against the same visit's cDBS, with the visit as the unit of evidence, and the verdicts on the margins."""
     found = primary.primary(db, participant, caller)
     standings = make_part(Part.STANDINGS, db, participant, caller)
-    return primary_csv(found, standings) if format == "csv" else primary_out(found, participant.synthetic, standings)
+    if format == "csv":
+        return primary_csv(found, standings)
+    return primary_out(found, participant.synthetic, primary.policies_judged(db, found.evidence, participant), standings)
 
 
 pages = APIRouter()
@@ -101,6 +103,7 @@ def primary_page(request: Request, participant: CurrentParticipant, db: Db, call
         "analysis/primary.html",
         participant=participant,
         found=found,
+        policies=primary.policies_judged(db, found.evidence, participant),
         standings=make_part(Part.TESTED_STANDINGS, db, participant, caller),
         wording=primary_words,
         units=_units(found),

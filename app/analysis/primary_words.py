@@ -43,9 +43,10 @@ FAMILY = (
 )
 STRATEGY = (
     "A controller counts with every session of it, whichever policy ran, so that nothing is selected by its outcome. A single policy is "
-    "judged by the sessions that began after it was last put on an approved plan; what was known before may have picked it, and does "
-    "not count."
+    "judged by the sessions that began after its confirmation was declared. Without a declaration these are the sessions after it was last "
+    "put on an approved plan; what was known before may have picked it, and does not count."
 )
+SEVERAL_DECLARED = "Each declared confirmation is tested at 5 % by itself; nothing is adjusted for their number."
 ADJUSTMENTS = {
     Adjustment.NONE: "Not adjusted",
     Adjustment.ORDER: "Freed from a linear drift over the visit",
@@ -123,7 +124,8 @@ def verdict(result: VerdictResult, name: str = "") -> str:
         if result.no_verdict is NoVerdict.NO_VISIT_AFTER_LOCK and result.locked.until is not None:
             return f"No verdict on {name}: no visit began while these margins were locked."
         if result.no_verdict is NoVerdict.NO_VISIT_AFTER_LOCK:
-            return f"No verdict on {name} yet: no visit was recorded after the margins were locked."
+            since = "its confirmation was declared" if result.locked.declared_at else "the margins were locked"
+            return f"No verdict on {name} yet: no visit was recorded after {since}."
         return f"No verdict on {name}: no cDBS session has a {_SHARED} above 0, of which the margin would be a share."
     sentence = verdict_sentence(name, result.assessment.verdict, len(result.visits), planned=result.locked.until is None)
     return f"{sentence} {late_stops(result.late_stops)}".rstrip()
@@ -243,13 +245,23 @@ def verdict_ground(result: VerdictResult) -> str:
     """Why a verdict confirms, or does not, to stand behind that word."""
     locked = result.locked
     if result.confirmatory:
-        left = f" Visits before the lock ({_numbers(result.left_to_exploration)}) are left out." if result.left_to_exploration else ""
+        before = "declaration" if locked.declared_at else "lock"
+        left = f" Visits before the {before} ({_numbers(result.left_to_exploration)}) are left out." if result.left_to_exploration else ""
+        if locked.declared_at is not None:
+            return (
+                f"its confirmation was declared on {locked.declared_at:%Y-%m-%d %H:%M} UTC by {locked.declared_by}, by the margins "
+                f"(version {locked.version}) that were locked then. All of its sessions in visits that began later count, whatever was "
+                f"planned.{left}"
+            )
         return (
             f"the margins (version {locked.version}) were locked on {locked.locked_at:%Y-%m-%d %H:%M} UTC by "
             f"{locked.locked_by}, before every session that counts here.{_superseded(locked)}{left}"
         )
     if locked.locked_at is None:
-        return "nobody has locked the margins, so that they could still be chosen by the data."
+        return (
+            "nobody has locked the margins, so that they could still be chosen by the data. Visits that begin before a lock can never "
+            "confirm."
+        )
     return "this takes in visits from before the margins were locked; it does not confirm."
 
 

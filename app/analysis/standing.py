@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.analysis import primary_words
 from app.analysis.evidence import evidence
-from app.analysis.primary import policy_names, policy_verdicts_of, verdicts_of
+from app.analysis.primary import confirmed_policies_of, policy_names, policy_verdicts_of, verdicts_of
 from app.analysis.primary_verdict import VerdictResult
 from app.evaluation import repository as evaluations
 from app.evaluation.ranking import verdict_wording
@@ -27,7 +27,8 @@ class Standing:
 
     Attributes:
         harms: serious adverse events and stops that no clinician has cleared. sessions: its own sessions that count.
-        measured: verdict on these sessions; None without any. predicted: verdict of the newest ranking; None where it has none.
+        measured: verdict on these sessions; None without any. confirmed: on those after its confirmation was declared.
+        predicted: verdict of the newest ranking; None where it has none.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Standing:
     sessions: int
     measured: VerdictResult | None
     predicted: Decided | None
+    confirmed: VerdictResult | None = None
 
     @property
     def sentence(self) -> str:
@@ -45,16 +47,19 @@ class Standing:
         return f"Held back: {verdict_wording.plainly(self.harms)}." if self.harms else ""
 
     def _measurement(self) -> str:
+        confirmed = "" if self.confirmed is None else f"Declared confirmation: {primary_words.verdict(self.confirmed, self.name)}"
+        if self.confirmed is not None and not primary_words.is_open(self.confirmed):
+            return confirmed
         if self.measured is None:
-            return "Not tested."
-        return f"Measured, exploratory: {primary_words.verdict(self.measured, self.name)}"
+            return f"{confirmed} Not tested.".strip()
+        return f"{confirmed} Measured, exploratory: {primary_words.verdict(self.measured, self.name)}".strip()
 
     def _prediction(self) -> str:
         if self.predicted is None:
             return "Not ranked."
         why = verdict_wording.plainly(self.predicted.hazards or self.predicted.reasons)
         code = verdict_wording.STANDING_NAMES[self.predicted.standing]
-        settled = self.measured is not None and self.measured.assessment is not None and not primary_words.is_open(self.measured)
+        settled = any(v is not None and not primary_words.is_open(v) for v in (self.confirmed, self.measured))
         return f"Predicted: {code}{f' ({why})' if why else ''}.{' The measurement counts before the prediction.' if settled else ''}"
 
 
@@ -63,7 +68,7 @@ def standings(db: Session, participant: Participant, caller: Caller) -> dict[int
     if caller.is_blinded:
         return {}
     held = evidence(db, participant, caller)
-    measured = policy_verdicts_of(held, participant)
+    measured, confirmed = policy_verdicts_of(held, participant), confirmed_policies_of(db, held)
     newest = evaluations.newest_evaluation(db, participant.id)
     ranked = judged(db, participant, newest).assessment.candidates if newest is not None else []
     predicted = {a.policy.id: a.decided for a in ranked}
@@ -71,8 +76,8 @@ def standings(db: Session, participant: Participant, caller: Caller) -> dict[int
     names = policy_names(db, participant)
     counts = [s.arm.policy_id for s in held.sessions]
     return {
-        i: Standing(names[i], harms.get(i, ()), counts.count(i), measured.get(i), predicted.get(i))
-        for i in sorted(measured.keys() | predicted.keys() | harms.keys())
+        i: Standing(names[i], harms.get(i, ()), counts.count(i), measured.get(i), predicted.get(i), confirmed.get(i))
+        for i in sorted(confirmed.keys() | measured.keys() | predicted.keys() | harms.keys())
         if i in names
     }
 

@@ -308,6 +308,8 @@ def _signature(_before: Row, after: Row, names: Names) -> str:
         what = f"the lock of {names.visit(names.locks.get(number))}"
     elif kind == "margins_lock":
         what = f"the margins of {names.participant(names.margins_locks.get(number))}"
+    elif kind == "declared_confirmation":
+        what = f"the confirmation of {names.policy(names.confirmations.get(number, 0))}"
     else:
         what = f"{kind.replace('_', ' ')} {number}"
     return f"signed {what}: {after['meaning']}"
@@ -323,6 +325,7 @@ SAID: dict[str, Callable[[Row, Row, Names], str]] = {
     "plan": _plan,
     "visit_lock": lambda b, a, n: f"{'locked' if a.get('locked') else 'unlocked'} {n.visit(a['visit_id'])}",
     "margins_lock": lambda b, a, n: f"locked the margins of {n.participant(a['participant_id'])}",
+    "declared_confirmation": lambda b, a, n: f"declared the confirmation of {n.policy(a['policy_id'])}",
     "bundle_release": lambda b, a, n: (
         f"took the bundle of {n.policy(a['policy_id'])}" if a["policy_id"] is not None else "took the bundle of a session without a policy"
     ),

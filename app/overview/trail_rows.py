@@ -30,7 +30,8 @@ class Names:
     Attributes:
         participants: code. visits: number and participant. sessions: ordinal and visit. plans: visit. policies: name and participant.
         items: position and plan. events: participant and visit. queries: participant and what is asked about, in words. locks: visit.
-        margins_locks: participant. people: address. studies: code. sites: code. sweeps: name and participant. snapshots: participant.
+        margins_locks: participant. confirmations: policy. people: address. studies: code. sites: code. sweeps: name and participant.
+        snapshots: participant.
     """
 
     participants: Mapping[int, str] = field(default_factory=dict)
@@ -43,6 +44,7 @@ class Names:
     queries: Mapping[int, Row] = field(default_factory=dict)
     locks: Mapping[int, int] = field(default_factory=dict)
     margins_locks: Mapping[int, int] = field(default_factory=dict)
+    confirmations: Mapping[int, int] = field(default_factory=dict)
     people: Mapping[int, str] = field(default_factory=dict)
     studies: Mapping[int, str] = field(default_factory=dict)
     sites: Mapping[int, str] = field(default_factory=dict)
@@ -168,6 +170,8 @@ def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
     snapshots = read("buffer_snapshot", numbers("buffer_snapshot", "snapshot_id"), "participant_id")
     sweeps = read("sweep", numbers("sweep", "sweep_id"), "name", "participant_id")
     paths = [e.entity_id.split("/policies/")[1].split("/")[0] for e in events if e.entity == "results" and "/policies/" in e.entity_id]
+    declared = read("declared_confirmation", numbers("declared_confirmation"), "policy_id")
+    paths += [str(i) for (i,) in declared.values()]
     policies = read("policy", numbers("policy", "policy_id") | {int(n) for n in paths if n.isdecimal()}, "name", "participant_id")
     of_visits = {v for _, v in sessions.values()} | {v for (v,) in (*plans.values(), *locks.values())}
     of_visits |= {v for _, v in events_.values() if v is not None} | {q["visit_id"] for q in asked.values() if q["visit_id"]}
@@ -189,6 +193,7 @@ def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
         queries=asked,
         locks=_first(locks),
         margins_locks=_first(margins),
+        confirmations=_first(declared),
         people=_first(read("app_user", numbers("app_user", "user_id"), "email")),
         studies=_first(studies),
         sites=_first(sites),

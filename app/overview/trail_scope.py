@@ -85,7 +85,7 @@ MOST_WORDS = 8
 # Which rows of the audit trail are of a reader's studies and sites, or of a participant: by the foreign keys of what they tell of.
 
 _ROOTS = ("participant", "site", "study")
-_SIGNED = ("plan", "policy", "visit_lock", "margins_lock")
+_SIGNED = ("plan", "policy", "visit_lock", "margins_lock", "declared_confirmation")
 """Tables whose rows are signed; a signature names them by kind."""
 _REMOVED = ("visit", "session", "plan")
 """Tables with rows below them of which the service removes some: empty visits, discarded proposals, drafts."""

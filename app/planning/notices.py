@@ -24,6 +24,7 @@ class Code(StrEnum):
     VISIT_HELD = "visit_held"
     DATE_PAST = "date_past"
     ONE_POLICY = "one_policy"
+    MARGINS_NOT_LOCKED = "margins_not_locked"
     KEY_REASON_MISSING = "key_reason_missing"
     ADVERSE_EVENT = "adverse_event"
     """A serious one that no clinician has cleared, and that the plan's reason for its policy does not answer: the plan may not run."""

@@ -1,11 +1,13 @@
-"""Margins of a participant: by how much an outcome may be worse than under cDBS; and the levels of verdicts. Versioned."""
+"""Margins of a participant: by how much an outcome may be worse than under cDBS; levels of verdicts; and what is confirmed by them."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from datetime import datetime
 from typing import Any, Final
 
 from pydantic import ConfigDict, Field, ValidationInfo, field_validator
+from sqlalchemy import select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -15,13 +17,14 @@ from app.accounts.permissions import Caller
 from app.platform.audit import signatures
 from app.platform.audit.signatures import SignatureOut, SignatureState, Signing, state_of
 from app.platform.database import set_reason
-from app.platform.errors import Conflict, Invalid
+from app.platform.errors import Conflict, Invalid, NotFound
 from app.platform.web.schemas import Int, Model, Number, Text
 from app.study import access
 from app.study.outcome_fields import StatedMargins
 from app.study.settings_types import Bound, published
 from app.tables.audit import Signature
-from app.tables.participants import MarginsLock, MarginsVersion, Participant
+from app.tables.learning import Policy
+from app.tables.participants import DeclaredConfirmation, MarginsLock, MarginsVersion, Participant
 from ml.outcomes import OUTCOMES
 from ml.qoc import Margins
 
@@ -210,3 +213,128 @@ def lock_rows(db: Session, participant: Participant) -> list[MarginsLockOut]:
         )
         for lock in participant.margins_locks
     ]
+
+
+# Declared confirmations: signed once, all later sessions of a policy are judged by the margins of then, whatever is planned.
+
+CONFIRMATION: Final = "declared_confirmation"
+CONFIRMED: Final = "confirmation declared before the sessions that it counts"
+
+
+class ConfirmationFields(Model):
+    """Policy whose later sessions are to confirm, and why it was chosen."""
+
+    policy_id: Int = Field(ge=1)
+    reason: Text = Field(max_length=1000, description="Why this policy; kept with the declaration and in the audit trail.")
+
+
+class ConfirmationIn(ConfirmationFields, Signing):
+    """Confirmation to declare, and who signs."""
+
+
+class ConfirmationOut(Model):
+    """A declared confirmation."""
+
+    policy_id: int
+    policy: str
+    margins_version: int
+    reason: str
+    created_at: datetime
+    created_by: str
+    signature: SignatureOut | None
+    signature_state: SignatureState = Field(description="`broken`: a value was changed since.")
+
+
+def declarations(db: Session, participant_ids: Collection[int]) -> dict[int, list[DeclaredConfirmation]]:
+    """Return the declared confirmations of participants, oldest first, by participant."""
+    found: dict[int, list[DeclaredConfirmation]] = {i: [] for i in participant_ids}
+    query = select(DeclaredConfirmation).where(DeclaredConfirmation.participant_id.in_(found)).order_by(DeclaredConfirmation.id)
+    for row in db.scalars(query):
+        found[row.participant_id].append(row)
+    return found
+
+
+def policies_of(db: Session, participant: Participant) -> Sequence[Policy]:
+    """Return the participant's policies that can still be declared: learned or made elsewhere, not retired, not declared before."""
+    declared = select(DeclaredConfirmation.policy_id).where(DeclaredConfirmation.participant_id == participant.id)
+    open_ = select(Policy).where(Policy.participant_id == participant.id, Policy.kind != "baseline", Policy.retired_reason.is_(None))
+    return db.scalars(open_.where(Policy.id.not_in(declared)).order_by(Policy.name)).all()
+
+
+def declare(
+    db: Session, participant: Participant, choice: ConfirmationFields, caller: Caller, password: str, code: str = ""
+) -> DeclaredConfirmation:
+    """Sign that all later sessions of a policy confirm, by the margins that are locked now. The caller commits.
+
+    Args:
+        password: of the caller, asked for again; empty where a fresh sign-on replaces it. code: of the second factor.
+
+    Raises:
+        Forbidden: the caller sets no margins of this participant, or as `app.accounts.sign_on`, as TooMany is. Invalid: no reason.
+        Conflict: no margins are locked, a newer version waits for its lock, the policy is retired, or was declared before.
+        NotFound: the participant has no such policy.
+    """
+    access.require(caller, can.SET_MARGINS, participant)
+    lock, policy = participant.margins_lock, db.get(Policy, choice.policy_id)
+    if policy is None or policy.participant_id != participant.id:
+        raise NotFound(f"Participant {participant.code} has no policy {choice.policy_id}.", "Choose one of its policies.")
+    if lock is None or lock.margins_version_id != participant.current_margins.id:
+        raise Conflict("The present margins are not locked.", "Lock them first: a confirmation is judged by them for good.")
+    if policy.retired_reason:
+        raise Conflict(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", "Choose another policy.")
+    if not choice.reason.strip():
+        raise Invalid("A declaration needs a reason.", "Say in a sentence why this policy is to be confirmed.", field="reason")
+    row = DeclaredConfirmation(
+        participant_id=participant.id,
+        policy_id=policy.id,
+        margins_lock_id=lock.id,
+        reason=choice.reason.strip(),
+        created_by=caller.label,
+    )
+    row.lock = lock
+    set_reason(db, row.reason)
+    db.add(row)
+    try:
+        db.flush()
+    except IntegrityError as error:
+        db.rollback()
+        raise Conflict(f"The confirmation of policy '{policy.name}' was declared before.", "One declaration counts for good.") from error
+    content = declared_content(participant, row, policy)
+    sign_on.sign(db, caller, password, kind=CONFIRMATION, subject_id=row.id, meaning=CONFIRMED, content=content, code=code)
+    return row
+
+
+def declared_content(participant: Participant, row: DeclaredConfirmation, policy: Policy) -> dict[str, Any]:
+    """Return all that a signature under a declaration covers: whose policy, its bytes, the lock of the margins, and why."""
+    return {
+        "participant": participant.code,
+        "policy": policy.id,
+        "policy_name": policy.name,
+        "onnx_sha256": policy.onnx_sha256,
+        "margins_version": row.lock.margins.version,
+        "margins_lock": row.margins_lock_id,
+        "declared_by": row.created_by,
+        "reason": row.reason,
+    }
+
+
+def confirmation_rows(db: Session, participant: Participant) -> list[ConfirmationOut]:
+    """Return the declared confirmations of a participant as API types, oldest first, each with what became of its signature."""
+    rows = declarations(db, [participant.id])[participant.id]
+    found = signatures.newest_of_each(db, CONFIRMATION, [row.id for row in rows])
+    result = []
+    for row in rows:
+        policy, signature = db.get_one(Policy, row.policy_id), found.get(row.id)
+        result.append(
+            ConfirmationOut(
+                policy_id=policy.id,
+                policy=policy.name,
+                margins_version=row.lock.margins.version,
+                reason=row.reason,
+                created_at=row.created_at,
+                created_by=row.created_by,
+                signature=SignatureOut.model_validate(signature) if signature else None,
+                signature_state=state_of(signature, declared_content(participant, row, policy)),
+            )
+        )
+    return result

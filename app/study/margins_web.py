@@ -17,7 +17,19 @@ from app.platform.web.templates import render
 from app.study import margins as margins_rules
 from app.study.access import may
 from app.study.deps import CurrentParticipant
-from app.study.margins import MarginsChange, MarginsIn, MarginsLockFields, MarginsLockIn, MarginsLockOut, MarginsOut, lock_rows
+from app.study.margins import (
+    ConfirmationFields,
+    ConfirmationIn,
+    ConfirmationOut,
+    MarginsChange,
+    MarginsIn,
+    MarginsLockFields,
+    MarginsLockIn,
+    MarginsLockOut,
+    MarginsOut,
+    confirmation_rows,
+    lock_rows,
+)
 from app.study.settings_form import SettingField, SettingGroup, Shown, history, own_changes, reason_of, texts
 from app.tables.participants import Participant
 from ml.outcomes import OUTCOMES
@@ -53,6 +65,19 @@ def lock_margins(participant: CurrentParticipant, wanted: MarginsLockIn, db: Db,
     return lock_rows(db, participant)[-1]
 
 
+@api.get("/participants/{code}/confirmations")
+def list_confirmations(participant: CurrentParticipant, db: Db) -> list[ConfirmationOut]:
+    """List declared confirmations, oldest first: all later sessions of their policies confirm, whatever is planned."""
+    return confirmation_rows(db, participant)
+
+
+@api.post("/participants/{code}/confirmations", status_code=201, responses=problems(409, 429))
+def declare_confirmation(participant: CurrentParticipant, body: ConfirmationIn, db: Db, caller: CurrentCaller) -> ConfirmationOut:
+    """Declare the confirmation of a policy by the locked margins, signed once. Those who approve plans alone."""
+    margins_rules.declare(db, participant, body, caller, body.password, body.code)
+    return confirmation_rows(db, participant)[-1]
+
+
 pages = APIRouter()
 
 GROUPS = (
@@ -76,6 +101,7 @@ GROUPS = (
     ),
 )
 LABELS = {f.name: f.label for group in GROUPS for f in group.fields}
+_CONFIRMATION_FIELDS = {"policy_id": "policy_id", "reason": "confirmation_reason"}
 _LOCK_FIELDS = {"version": "version", "reason": "lock_reason"}
 
 
@@ -120,6 +146,20 @@ def lock_margins_by_form(request: Request, participant: CurrentParticipant, db: 
     return RedirectResponse(f"/participants/{participant.code}/margins?done=locked", 303)
 
 
+@pages.post("/participants/{code}/margins/confirmations")
+def declare_by_form(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
+    """Declare the confirmation of a policy, signed."""
+    typed = {name: str(values.get(field, "")) for name, field in _CONFIRMATION_FIELDS.items()}
+    try:
+        wanted = parse(ConfirmationFields, typed, {"policy_id": "Policy", "reason": "Why this policy"})
+        margins_rules.declare(db, participant, wanted, caller, str(values.get("password", "")), str(values.get("code", "")))
+    except BetaloopError as error:
+        db.rollback()
+        shown = texts(participant.current_margins, LABELS)
+        return _page(request, db, participant, caller, shown, renamed(error, _CONFIRMATION_FIELDS), confirmation=typed)
+    return RedirectResponse(f"/participants/{participant.code}/margins?done=declared", 303)
+
+
 def _page(
     request: Request,
     db: Session,
@@ -129,7 +169,9 @@ def _page(
     error: BetaloopError | None = None,
     reason: str | None = None,
     lock_reason: str = "",
+    confirmation: dict[str, str] | None = None,
 ) -> HTMLResponse:
+    confirmation = confirmation or dict.fromkeys(_CONFIRMATION_FIELDS, "")
     page = render(
         request,
         "study/margins.html",
@@ -143,7 +185,11 @@ def _page(
         lock_meaning=margins_rules.MEANING,
         lock_signatures=margins_rules.signatures_of_locks(db, participant),
         may_write=may(caller, can.SET_MARGINS, participant),
-        remarks=field_notes(error, values | {"lock_reason": lock_reason}),
+        declared=confirmation_rows(db, participant),
+        declarable=margins_rules.policies_of(db, participant),
+        confirmation=confirmation,
+        confirmation_meaning=margins_rules.CONFIRMED,
+        remarks=field_notes(error, values | {"lock_reason": lock_reason, "confirmation_reason": confirmation["reason"]}),
         problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

@@ -132,6 +132,22 @@ class MarginsLock(Base):
     margins: Mapped[MarginsVersion] = relationship()
 
 
+class DeclaredConfirmation(Base):
+    """A policy whose later sessions all confirm, by the margins locked then, whatever is planned. Signed once, never changed."""
+
+    __tablename__ = "declared_confirmation"
+    __table_args__ = (CheckConstraint("reason <> ''", name="reason"), UniqueConstraint("policy_id"))
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    policy_id: Mapped[int] = mapped_column(ForeignKey("policy.id"))
+    margins_lock_id: Mapped[int] = mapped_column(ForeignKey("margins_lock.id"))
+    reason: Mapped[str] = mapped_column(Text)
+    created_at: Mapped[datetime] = mapped_column(server_default=func.clock_timestamp())
+    created_by: Mapped[str] = mapped_column(String(254))
+    lock: Mapped[MarginsLock] = relationship(lazy="joined")
+
+
 class Participant(Base):
     """A person in the study, known by code only, or a simulation of one."""
 

@@ -160,6 +160,7 @@ AUDITED = (
     ("data_query", "id", ""),
     ("data_query_entry", "id", ""),
     ("day_entry", "id", ""),
+    ("declared_confirmation", "id", ""),
     ("device", "id", ""),
     ("dose", "id", ""),
     ("estimate", "id", "details"),
@@ -214,6 +215,7 @@ NEVER_CHANGED = (
     "data_query",
     "data_query_entry",
     "day_entry",
+    "declared_confirmation",
     "estimate",
     "margins_lock",
     "margins_version",
@@ -930,6 +932,25 @@ def upgrade() -> None:
     op.create_index(op.f("ix_policy_job_id"), "policy", ["job_id"], unique=False)
     op.create_index(op.f("ix_policy_participant_id"), "policy", ["participant_id"], unique=False)
     op.create_index(op.f("ix_policy_sweep_id"), "policy", ["sweep_id"], unique=False)
+    op.create_table(
+        "declared_confirmation",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("participant_id", sa.Integer(), nullable=False),
+        sa.Column("policy_id", sa.Integer(), nullable=False),
+        sa.Column("margins_lock_id", sa.Integer(), nullable=False),
+        sa.Column("reason", sa.Text(), nullable=False),
+        sa.Column("created_at", sa.DateTime(timezone=True), server_default=sa.text("clock_timestamp()"), nullable=False),
+        sa.Column("created_by", sa.String(length=254), nullable=False),
+        sa.CheckConstraint("reason <> ''", name=op.f("ck_declared_confirmation_reason")),
+        sa.ForeignKeyConstraint(
+            ["margins_lock_id"], ["margins_lock.id"], name=op.f("fk_declared_confirmation_margins_lock_id_margins_lock")
+        ),
+        sa.ForeignKeyConstraint(["participant_id"], ["participant.id"], name=op.f("fk_declared_confirmation_participant_id_participant")),
+        sa.ForeignKeyConstraint(["policy_id"], ["policy.id"], name=op.f("fk_declared_confirmation_policy_id_policy")),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_declared_confirmation")),
+        sa.UniqueConstraint("policy_id", name=op.f("uq_declared_confirmation_policy_id")),
+    )
+    op.create_index(op.f("ix_declared_confirmation_participant_id"), "declared_confirmation", ["participant_id"], unique=False)
     op.create_table(
         "estimate",
         sa.Column("id", sa.Integer(), nullable=False),

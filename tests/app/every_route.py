@@ -102,6 +102,8 @@ class World:
         self.send(f"/visits/{blinded}/plan", json=two | {"blinded": True})
         signing = self.calling(token_of("clinician", name="signer"))
         assert signing.post(f"/api/v1/visits/{blinded}/plan/approve", json={"password": PASSWORD}).status_code == 200
+        for code in ("P2", "P4"):
+            self.send(f"/participants/{code}/margins/locks", json={"version": 1, "reason": "protocol", "password": PASSWORD})
         jobs = self.read("/participants/P4/jobs")["items"]
         small = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "distilled")
         retired = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "trained")
@@ -147,6 +149,10 @@ class World:
             ("post", "/visits/{visit_id}/lock"): {"json": {"reason": "complete", "password": PASSWORD}},
             ("post", "/visits/{visit_id}/unlock"): {"json": {"reason": "rating misread"}},
             ("post", "/participants/{code}/margins/locks"): {"json": {"version": 2, "reason": "protocol", "password": PASSWORD}},
+            ("post", "/participants/{code}/confirmations"): {
+                "code": "P4",
+                "json": {"policy_id": elsewhere, "reason": "protocol", "password": PASSWORD},
+            },
             ("put", "/participants/{code}/margins"): {"json": {"margins": {"tremor_points": 5}, "reason": "she fears tremor most"}},
             ("get", "/participants/{code}/replay"): {"params": self.replayed(small)},
             ("get", "/participants/{code}/analyses/battery"): {"params": dict.fromkeys(ImplantIn.model_fields, "1")},

@@ -145,7 +145,7 @@ def is_query(call: tuple[bool, str]) -> bool:
 
 RULES_WITH_QUERIES = """
 accounts/sign_on accounts/studies analysis/evaluations analysis/evidence analysis/pooled analysis/primary overview/trail_rows
-overview/trail_scope study/adverse_events study/characteristics study/data_queries study/doses study/outcomes/values
+overview/trail_scope study/adverse_events study/characteristics study/data_queries study/doses study/margins study/outcomes/values
 study/recordings/facts
 """.split()  # noqa: SIM905
 """Small features that keep their rules and their queries in one file."""

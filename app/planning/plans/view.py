@@ -248,6 +248,8 @@ def _warnings(
         warnings += _of_policy(line, found)
     if len({line.policy.id for line in lines if line.policy}) == 1:
         warnings.append(PlanWarning(Code.ONE_POLICY))
+    if names and visit.participant.margins_lock is None:
+        warnings.append(PlanWarning(Code.MARGINS_NOT_LOCKED))
     if plan.status == "draft":
         try:
             require_limits(visit, plan.items)

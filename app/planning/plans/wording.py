@@ -48,6 +48,8 @@ _ABOUT: dict[Code, str] = {
     Code.CANNOT_BE_SIGNED: "The plan cannot be signed: {why}",
     Code.DATE_PAST: "The visit's date, {date}, is past.",
     Code.ONE_POLICY: "The visit tests a single policy; the protocol tests 2 to 4, each against the others and cDBS of the same day.",
+    Code.MARGINS_NOT_LOCKED: "Nobody has locked the margins: sessions of this plan can never confirm a policy. Lock them on the page of "
+    "the margins before the plan is signed.",
     Code.KEY_REASON_MISSING: "The key was opened in an emergency by {by}; the reason is still missing.",
     Code.OTHER_MEDICATION: "The participant's medication schedule was changed after this plan was drafted: what is due before its "
     "sessions is that of the draft. Draft it anew for the present one.",

@@ -29,6 +29,7 @@ AUDITED: dict[str, tuple[str, ...]] = {
     "settings_version": (),
     "margins_version": (),
     "margins_lock": (),
+    "declared_confirmation": (),
     "cdbs_amplitude": (),
     "device": (),
     "visit": (),

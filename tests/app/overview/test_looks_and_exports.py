@@ -33,6 +33,7 @@ SHOWS_NO_RESULTS = {
     "/", "/api/v1/participants", "/api/v1/participants/{code}", "/participants/new", "/participants/{code}/visits/new",
     "/participants/{code}/settings", "/api/v1/participants/{code}/settings", "/participants/{code}/margins",
     "/api/v1/participants/{code}/margins", "/api/v1/participants/{code}/margins/locks",
+    "/api/v1/participants/{code}/confirmations",
     "/participants/{code}/characteristics", "/api/v1/participants/{code}/characteristics",
     # days, doses, devices and questions, which name no controller
     "/api/v1/participants/{code}/visits", "/api/v1/visits/{visit_id}", "/api/v1/visits/{visit_id}/locks", "/api/v1/visits/{visit_id}/doses",

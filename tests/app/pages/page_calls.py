@@ -72,12 +72,17 @@ def _of_participants(world: World) -> dict[str, Call]:
     speech = SPEECH | {"serious": "yes"}
     event = {method: of_api(world, "put" if method == "correction" else "post", path) for method, path in (
         ("correction", "/adverse-events/{event_id}"), ("clearance", "/adverse-events/{event_id}/clearance"))}  # fmt: skip
+    ranked = world.read("/participants/P2/ranking")["policies"][0]["policy_id"]
     version = world.read("/participants/P3")["settings"]["version"]
     return {
         "/participants": {"data": {"code": "Q2", "site": "main"}},
         "/participants/{code}/settings": {"code": "P3", "data": {"version": str(version), "gamma": "0.9", "reason": "agreed"}},
         "/participants/{code}/margins": {"data": {"version": "1", "tremor_points": "5", "reason": "she fears tremor most"}},
         "/participants/{code}/margins/lock": {"data": {"version": "2", "lock_reason": "protocol", "password": PASSWORD}},
+        "/participants/{code}/margins/confirmations": {
+            "code": "P2",
+            "data": {"policy_id": str(ranked), "confirmation_reason": "protocol", "password": PASSWORD},
+        },
         "/participants/{code}/characteristics": {"data": {"version": "0", "hand": "left", "reason": "asked"}},
         "/participants/{code}/adverse-events": {"data": speech},
         "/adverse-events/{event_id}/correction": event["correction"] | {"data": speech | {"revision": "1", "reason": "misread"}},

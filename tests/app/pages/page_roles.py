@@ -18,6 +18,7 @@ FORMS = {
     "/participants/{code}/settings": can.WRITE_SETTINGS,
     "/participants/{code}/margins": can.SET_MARGINS,
     "/participants/{code}/margins/lock": can.SET_MARGINS,
+    "/participants/{code}/margins/confirmations": can.SET_MARGINS,
     "/participants/{code}/characteristics": can.WRITE_STUDY,
     "/participants/{code}/adverse-events": can.WRITE_STUDY,
     "/adverse-events/{event_id}/correction": can.WRITE_STUDY,
