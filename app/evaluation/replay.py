@@ -19,6 +19,7 @@ from app.learning.policies import onnx_of
 from app.platform import files
 from app.platform.errors import Invalid, NotFound
 from app.platform.kept import kept
+from app.platform.numbers import ma
 from app.platform.web.schemas import Model
 from app.study import access
 from app.study import repository as study_repository
@@ -306,8 +307,8 @@ def amplitude(found: ReplayOut, fraction: float | None) -> str:
     """An amplitude in mA; as a share of cDBS where that is not known in mA."""
     if fraction is None:
         return "—"
-    ma = found.cdbs_amplitude_ma
-    return f"{fraction * ma:.2f} mA" if ma is not None else f"{100 * fraction:.0f} % of cDBS"
+    cdbs = found.cdbs_amplitude_ma
+    return f"{ma(fraction * cdbs)} mA" if cdbs is not None else f"{100 * fraction:.0f} % of cDBS"
 
 
 def differences(found: ReplayOut) -> list[str]:

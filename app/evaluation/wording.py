@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from app.evaluation.schemas import EstimateSummary, FlagOut, ReasonOut
-from app.platform.numbers import counted
+from app.platform.numbers import counted, ma
 from ml.ope import Estimate, Flag, shown
 from ml.outcomes import ALL, ANY, OUTCOMES
 
@@ -29,9 +29,9 @@ def count_stops(flag: Flag) -> str:
     return f"{counted(int(number(flag)), 'session')} stopped for the participant's sake"
 
 
-def amplitude(fraction: float, ma: float | None) -> str:
-    """Format an amplitude in mA, to hundredths so that it contradicts no limit; as a share of cDBS where that is not known in mA."""
-    return f"{f'{ma:.2f}'.removesuffix('0')} mA" if ma is not None else f"{percent(fraction)} of the cDBS amplitude"
+def amplitude(fraction: float, value_ma: float | None) -> str:
+    """Format an amplitude in mA; as a share of cDBS where that is not known in mA."""
+    return f"{ma(value_ma)} mA" if value_ma is not None else f"{percent(fraction)} of the cDBS amplitude"
 
 
 def chance(share: float) -> str:
@@ -246,7 +246,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "visits_needed": lambda f: f"on {counted(int(number(f)), 'visit')}",
     "not_settled_by_sessions": lambda f: "more sessions held near what it does would not settle it",
     "sessions_needed": lambda f: counted(int(number(f)), "session"),
-    "near_amplitude": lambda f: f"held near {f.value:.1f} mA" if f.unit == "mA" else f"held near {percent(f.value)} of the cDBS amplitude",
+    "near_amplitude": lambda f: f"held near {ma(f.value)} mA" if f.unit == "mA" else f"held near {percent(f.value)} of the cDBS amplitude",
     # of a ranking that the study has left behind
     "settings_changed": lambda f: f"settings version {number(f):.0f} is in force; this ranking used version {f.limit:.0f}",
     "sessions_changed": _sessions_changed,

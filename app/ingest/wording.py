@@ -7,7 +7,7 @@ from typing import Any
 
 from app.ingest.evidence import Evidence, Reason, Source, stored_courses
 from app.platform.errors import BetaloopError, DatabaseAway, GivenUp, StorageFull
-from app.platform.numbers import stated
+from app.platform.numbers import ma
 from app.study.sessions.stimulation import CDBS_TOLERANCE, Course, Pattern
 from app.tables.recordings import Recording
 from app.tables.uploads import ColumnMapping
@@ -156,9 +156,9 @@ def _ran(program: Mapping[str, Any]) -> str:
     """What a program stimulated with."""
     match program["how"]:
         case "moved":
-            return f"{stated(program['low'], 3)} to {stated(program['high'], 3)} mA"
+            return f"{ma(program['low'])} to {ma(program['high'])} mA"
         case "constant":
-            return f"constant at {stated(program['high'], 3)} mA"
+            return f"constant at {ma(program['high'])} mA"
         case how:
             return {"off": "off", "unknown": "not known"}[how]
 
@@ -168,7 +168,7 @@ _NO_AMPLITUDE = "the file states no amplitude"
 
 def _course(c: Course) -> str:
     """How the amplitude of one side ran."""
-    level = f"{stated(c.median, 3)} {c.unit}" if c.median is not None else ""
+    level = f"{ma(c.median)} {c.unit}" if c.median is not None else ""
     match c.pattern:
         case Pattern.UNKNOWN:
             return _NO_AMPLITUDE
@@ -177,10 +177,10 @@ def _course(c: Course) -> str:
         case Pattern.OFF:
             return f"the amplitude is 0 in all {c.known} steps where it is known"
         case Pattern.AT_CDBS:
-            against = f" of {stated(c.cdbs_ma, 3)} mA" if c.cdbs_ma else ""
+            against = f" of {ma(c.cdbs_ma)} mA" if c.cdbs_ma else ""
             return f"about {level} throughout, within {100 * CDBS_TOLERANCE:.0f} % of the cDBS amplitude{against}"
         case Pattern.VARIES:
-            return f"the amplitude varies between {stated(c.low, 3)} and {stated(c.high, 3)} {c.unit}: say which controller it was"
+            return f"the amplitude varies between {ma(c.low)} and {ma(c.high)} {c.unit}: say which controller it was"
         case Pattern.CONSTANT_WITHOUT_CDBS:
             return f"the amplitude is constant at {level}, but no cDBS amplitude is stated to hold it against"
         case Pattern.CONSTANT:

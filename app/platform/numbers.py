@@ -43,6 +43,17 @@ def stated(value: float | None, digits: int = 6) -> str:
     return (f"{shown}\u00d710\u207b{power.lstrip('-0').translate(_RAISED)}" if power else shown).replace("-", "\u2212")
 
 
+def ma(value: float | None) -> str:
+    """Format an amplitude in mA for people: as it was stated, to four decimals; what was computed to hundredths.
+
+    So a limit is printed in full, and no amplitude that keeps a limit of whole hundredths is printed beyond it.
+    """
+    if value is None or math.isnan(value):
+        return "\u2014"
+    exact = round(value, 4)
+    return stated(exact if abs(exact - value) < 1e-9 else round(value, 2))
+
+
 def whole(value: float) -> int:
     """Round to the nearest whole number, to count with."""
     return round(value)

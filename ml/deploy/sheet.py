@@ -85,7 +85,7 @@ amplitude of <b>{manifest.cdbs_ma:g}&nbsp;mA</b> when beta has not come when it 
 is not a number, negative, {_implausible(manifest)}or of another unit or source, when the window is not
 whole, or when the network fails. A window has {manifest.window} beta amplitudes in a row
 ({manifest.window * manifest.period_s:g} s){_imputation(manifest)}.
-From cDBS the amplitude moves at most {manifest.ramp_ma_per_s * manifest.period_s:.3g} mA per period.</p>
+From cDBS the amplitude moves at most {manifest.ramp_ma_per_s * manifest.period_s:.4g} mA per period.</p>
 {_before_use(code)}
 <h2>Where it comes from</h2><table class="wide">{_rows(_origin(manifest, model_sha256))}</table>
 {_SIGNED_BY}
@@ -275,7 +275,7 @@ def _expectations(m: BundleManifest) -> list[tuple[str, str]]:
     asked = f"{m.asked_mean * m.cdbs_ma:.2f} mA on average over {m.test_windows} recorded windows ({m.test_windows_from})"
     below = f"below {m.min_ma:g} mA (lowest) in {100 * (m.asked_below_minimum or 0):.0f} %"
     if m.logged_bound_ma is not None and m.asked_below_bound is not None:
-        below += f", below {m.logged_bound_ma:.3g} mA (B, lowest tried at random) in {100 * m.asked_below_bound:.0f} %"
+        below += f", below {m.logged_bound_ma:.4g} mA (B, lowest tried at random) in {100 * m.asked_below_bound:.0f} %"
     if m.card is not None:  # the card has the prediction of the session, so no second number of it here
         return [("Asked for", f"{asked}; {below}. On logged beta: in closed loop beta answers to the amplitude.")]
     return [

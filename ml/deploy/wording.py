@@ -17,7 +17,7 @@ def _sentence(warning: BundleWarning, m: BundleManifest) -> str:
         return "Nobody knows what this policy asks for on this participant's beta: no recorded beta of its window was there to try it on."
     share = f"{100 * warning.value:.0f} % of {m.test_windows} recorded windows"
     if warning.code == WarningCode.BELOW_LOGGED:
-        bound = f"B = {warning.limit / m.cdbs_ma:g} of cDBS, {warning.limit:.3g} mA"
+        bound = f"B = {warning.limit / m.cdbs_ma:g} of cDBS, {warning.limit:.4g} mA"
         return f"Asks for less than was tried at random ({bound}) in {share}: no data there."
     return f"Asks for less than the lowest amplitude ({warning.limit:g} mA) in {share}: there the limit decides."
 

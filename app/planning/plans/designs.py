@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.platform.errors import Invalid
+from app.platform.numbers import ma
 from app.study.cdbs_amplitude import held_settings, plausible
 from app.tables.participants import SettingsVersion
 from app.tables.plans import PlanItem
@@ -167,7 +168,7 @@ def near_sessions(
 
 
 def _amplitude(fraction: float, cdbs_ma: float | None) -> str:
-    return f"{fraction:.2f} of the cDBS amplitude" if cdbs_ma is None else f"{fraction * cdbs_ma:.2f} mA"
+    return f"{fraction:.2f} of the cDBS amplitude" if cdbs_ma is None else f"{ma(fraction * cdbs_ma)} mA"
 
 
 def seed_of(code: str, number: int) -> int:

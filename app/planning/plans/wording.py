@@ -10,7 +10,7 @@ from app.planning.notices import OF_METHODS, Code, PlanWarning
 from app.planning.plans.designs import NEAR, Planned, SideBound, delivered_ma, is_held
 from app.planning.plans.suggested import Held
 from app.planning.protocol.session_order import Order
-from app.platform.numbers import counted, elapsed_time
+from app.platform.numbers import counted, elapsed_time, ma
 from app.study.blinding import CONTROLLER_NAMES
 from app.tables.adverse_events import AdverseEvent
 from app.tables.plans import Plan, PlanItem
@@ -184,7 +184,7 @@ def design_words(planned: Planned) -> str:
 def _near(planned: Planned) -> str:
     """Format the amplitude near which a session stays: milliamperes by side where they are known, and the share of cDBS."""
     share = f"{planned.level:.2f} of cDBS"
-    given = ", ".join(_side(b, f"{(planned.level or 0.0) * b.cdbs_ma:.1f} mA") for b in planned.bounds)
+    given = ", ".join(_side(b, f"{ma((planned.level or 0.0) * b.cdbs_ma)} mA") for b in planned.bounds)
     return f"{given} ({share})" if given else share
 
 
@@ -192,10 +192,10 @@ def bound_words(planned: Planned, bounds: tuple[SideBound, ...]) -> str:
     """Describe what a random session never does, in milliamperes where the cDBS amplitude is known."""
     if not bounds:
         return f"never below {planned.bound:g} of cDBS; its cDBS amplitude is not known, so that no bound in mA can be given"
-    lowest = ", ".join(_side(b, f"{b.lowest_ma:g} mA") for b in bounds)
+    lowest = ", ".join(_side(b, f"{ma(b.lowest_ma)} mA") for b in bounds)
     words = f"never below {lowest} ({planned.bound:g} of cDBS)"
     if planned.low_seconds:
-        low = ", ".join(_side(b, f"{b.low_ma:g} mA") for b in bounds)
+        low = ", ".join(_side(b, f"{ma(b.low_ma)} mA") for b in bounds)
         words += f"; below {low} ({LOW_AMPLITUDE:g}) for {planned.low_seconds / 60:.1f} of at most {LOW_SECONDS / 60:g} min"
         words += "" if planned.design == "ladder" else ", at the end"
     return words
@@ -247,7 +247,7 @@ def limits_ma(item: PlanItem) -> str:
 
 
 def _given(fraction: float, bounds: tuple[SideBound, ...]) -> str:
-    return "/".join(f"{delivered_ma(fraction, b):.1f}" for b in bounds) or f"{fraction:.2f}"
+    return "/".join(ma(delivered_ma(fraction, b)) for b in bounds) or f"{fraction:.2f}"
 
 
 def _side(bound: SideBound, words: str) -> str:

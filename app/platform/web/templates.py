@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from app.platform.database import now
 from app.platform.jobs.titles import state_in_words
-from app.platform.numbers import counted, fixed, minutes, number, p_text, place, rate, size, stated, time_left, typed, when, whole
+from app.platform.numbers import counted, fixed, ma, minutes, number, p_text, place, rate, size, stated, time_left, typed, when, whole
 from app.platform.web.charts import written
 from app.settings import get_settings
 from ml.outcomes import ALL, ANY, OUTCOMES, Outcome
@@ -91,6 +91,7 @@ _environment.filters.update(
     fixed=fixed,
     stated=stated,
     whole=whole,
+    ma=ma,
     rate=rate,
     place=place,
     typed=typed,

@@ -17,7 +17,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
-from app.platform.numbers import stated
+from app.platform.numbers import ma, stated
 from app.platform.web.schemas import Model, Text
 from app.study import blinding
 from app.study.access import require
@@ -197,7 +197,7 @@ def _in_words(levels_of: Mapping[str, Sequence[Sequence[float]]]) -> str:
     """Describe what one source states, such as `program 0: 1.5 mA`; levels in their order."""
     told = []
     for channel, pieces in levels_of.items():
-        levels = list(dict.fromkeys(f"{stated(v, 3)} mA" for _, _, v in pieces))
+        levels = list(dict.fromkeys(f"{ma(v)} mA" for _, _, v in pieces))
         more = f" and {len(levels) - MOST_LEVELS} more" if len(levels) > MOST_LEVELS else ""
         told.append(f"{channel}: {', '.join(levels[:MOST_LEVELS]) or 'unknown'}{more}")
     return "; ".join(told) or "unknown"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.platform.numbers import counted, hover, number, stated
+from app.platform.numbers import counted, hover, ma, number, stated
 from app.platform.web.charts import ACCENT, BAD, GRID, MUTED, TEXT, WARN, Cell, Chart, axis, figure, horizontal
 from app.study.recordings.charts import TIME
 from app.study.sessions.usable_steps import SessionData
@@ -201,7 +201,7 @@ def control_chart(data: SessionData) -> Chart:
         held, _ = horizontal(table.cdbs_ma, "", MUTED, "dot", "y2")
         layout["shapes"].append(held)
         # in the legend too: a controller often asks for just that amplitude, and its line would lie under a label
-        label = f"cDBS {stated(table.cdbs_ma, 3)} mA"
+        label = f"cDBS {ma(table.cdbs_ma)} mA"
         traces.append({"type": "scatter", "mode": "lines", "name": label, "x": [None], "y": [None], "line": held["line"]})
         highest = 1.15 * max(table.cdbs_ma, float(np.nanmax(table.amplitude_ma)))
         layout["yaxis2"] |= {"range": [0, highest]}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from app.platform.numbers import stated
+from app.platform.numbers import ma, stated
 from app.study.sessions.contradictions import Contradiction, Kind
 from app.study.sessions.designs import Drawn
 from app.tables.sessions import Activity, Controller
@@ -70,7 +70,7 @@ def _above_cdbs(f: Mapping[str, Any]) -> str:
 
 def _amplitude(f: Mapping[str, Any]) -> str:
     of = f" on the {f['side']}" if f["side"] else ""
-    share = f"{100 * f['mean_fraction']:.0f} % of the cDBS amplitude" if f["mean_fraction"] is not None else f"{stated(f['mean'], 3)} mA"
+    share = f"{100 * f['mean_fraction']:.0f} % of the cDBS amplitude" if f["mean_fraction"] is not None else f"{ma(f['mean'])} mA"
     return f"{_SAID[f['controller']]}, but its mean amplitude{of} is {share}. Correct one of them."
 
 

@@ -60,7 +60,7 @@ def compare_amplitudes(milliamps: NDArray[np.float64], fraction: NDArray[np.floa
     ratio = milliamps[both] / fraction[both]
     if ratio.max() > (1 + RATIO_SPREAD) * ratio.min():
         differ[both] = np.abs(ratio - np.median(ratio)) > RATIO_SPREAD * np.median(ratio)
-        runs = f"runs from {ratio.min():.3g} to {ratio.max():.3g} mA"
+        runs = f"runs from {ratio.min():.4g} to {ratio.max():.4g} mA"
         unknown = f"{int(differ.sum())} rows are unknown until a person chooses"
         report.flagged.append(f"amplitude_ma and amplitude_fraction disagree: their ratio, the cDBS amplitude, {runs}; {unknown}")
     return differ
