@@ -46,7 +46,9 @@ def test_a_confirmation_needs_locked_margins_a_signature_and_is_declared_once(
 ) -> None:
     early = declare(client, policies[0])
     assert (early.status_code, early.json()["detail"]) == (409, "The present margins are not locked.")
+    assert "Lock the present margins first" in client.get("/participants/P1/margins").text
     lock(client)
+    assert "Declare the confirmation" in client.get("/participants/P1/margins").text
     assert declare(client, policies[0], password="wrong").status_code == 403
     assert declare(client, 999).status_code == 404
     assert declare(client_as("viewer"), policies[0]).status_code == 403
