@@ -358,7 +358,7 @@ def _amplitude(db: Session, session: StudySession, row: SheetRow) -> list[str]:
     known = values[np.isfinite(values)]
     if not known.size or abs(np.median(known) - row.amplitude_ma) <= AMPLITUDE_DIFFERS * max(row.amplitude_ma, 0.1):
         return []
-    return [f"look at this: the sheet says {row.amplitude_ma:g} mA, and the recording {float(np.median(known)):.3g} mA"]
+    return [f"look at this: the sheet says {row.amplitude_ma:g} mA, and the recording {float(np.median(known)):g} mA"]
 
 
 def sheet_of(db: Session, participant: Participant, caller: Caller) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ import pytest
 
 from app.platform.numbers import ma
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 COARSE = re.compile(
     # f-strings and calls of Python, filters of templates, and the macro that shows a number with its unit
     r""":\.(?:[01]f|[1-3]g)\}(?: to \{[^{}]*\})?[ \w]{0,3}\bmA\b"""
