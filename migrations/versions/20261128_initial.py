@@ -6,7 +6,7 @@ import sqlalchemy as sa
 from alembic import op
 from sqlalchemy.dialects import postgresql
 
-revision = "first_ae8a34b9"
+revision = "first_18b7440f"
 down_revision = None
 branch_labels = None
 depends_on = None
