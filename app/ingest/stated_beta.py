@@ -1,12 +1,16 @@
-"""Stated beta of a table: its unit and its source, which the file itself cannot show."""
+"""Stated beta of a table: its unit and its source, which the file itself cannot show; and the choices of decoders that rest on them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from typing import cast
 
-from app.tables.participants import SettingsVersion
-from ml.formats import DecodedFile, TraceLog, TraceSource
+from sqlalchemy.orm import Session
+
+from app.ingest import repository
+from app.tables.participants import Participant, SettingsVersion
+from app.tables.uploads import Upload, UploadFile
+from ml.formats import BetaMeasure, DecodedFile, DecodeOptions, TraceLog, TraceSource
 from ml.formats.tables.cells.numbers import unit_name
 
 
@@ -53,3 +57,29 @@ def _stated_by(by_upload: str | None, by_settings: str | None) -> str:
     if by_upload:
         return "as stated with the upload"
     return "as the participant's settings say" if by_settings else "because nobody stated one"
+
+
+def decode_options(db: Session, participant: Participant, beta: BetaStated) -> DecodeOptions:
+    """Combine the participant's choices for decoders with what the sender stated of a table, and the study of markers."""
+    settings = participant.current_settings
+    return DecodeOptions(
+        period_s=settings.period_s,
+        beta_low_hz=settings.beta_low_hz,
+        beta_high_hz=settings.beta_high_hz,
+        beta_measure=cast(BetaMeasure, settings.beta_measure),
+        min_valid_fraction=settings.min_valid_fraction,
+        table_beta_unit=beta.unit or settings.beta_unit or "unstated",
+        table_lfp_unit=beta.lfp_unit,
+        meanings=repository.meanings_in_force(db, participant.site.study_id),
+    )
+
+
+def options_of_file(db: Session, file: UploadFile, participant: Participant) -> DecodeOptions:
+    """Build the options for a stored file, with what its sender had stated of it."""
+    return decode_options(db, participant, stated_beta(db, file))
+
+
+def stated_beta(db: Session, file: UploadFile) -> BetaStated:
+    """Read what the sender of a stored file had stated of its beta."""
+    said = db.get_one(Upload, file.upload_id).stated
+    return BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))

@@ -20,6 +20,7 @@ from app.ingest import repository
 from app.ingest.proposals import service as proposals
 from app.ingest.schemas import PartIn, ProposalChange
 from app.ingest.sessions import StatedSession
+from app.ingest.stated_beta import BetaStated, decode_options
 from app.ingest.uploads import reading, service
 from app.ingest.uploads.incoming import Incoming, arrange
 from app.ingest.uploads.reports import known_recordings
@@ -214,7 +215,7 @@ def _of_session(db: Session, number: int, participant: Participant, name: str, s
 
 def _dry(db: Session, one: Incoming, participant: Participant, name: str, sha256: str, offset: int) -> Iterator[Candidate]:
     """Read a file without storing anything; one candidate per run of its recordings, with negative keys."""
-    options = service.decode_options(db, participant, service.BetaStated())
+    options = decode_options(db, participant, BetaStated())
     clean = files.draft_path()
     try:
         with raw_bytes.received(one.stream, get_settings().upload_limit_mb * 1024 * 1024) as (raw, _, _):

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.ingest.repository import file_of_recording
-from app.ingest.uploads.service import options_of_file
+from app.ingest.stated_beta import options_of_file
 from app.overview.package_dictionary import Days
 from app.platform import files
 from app.platform.audit import record

@@ -11,10 +11,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.settings import get_settings
+from tests.app.evaluations import behaviour, judged, made_elsewhere, predicted
 from tests.app.evaluations import judge as judge
-from tests.app.evaluations import judged
 from tests.browser import tour
-from tests.browser.rankings import behaviour, made_elsewhere, predicted
 from tests.ml.ope.posterior.draws import constructed
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

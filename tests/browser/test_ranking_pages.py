@@ -10,9 +10,8 @@ import pytest
 from fastapi.testclient import TestClient
 from playwright.sync_api import expect
 
+from tests.app.evaluations import behaviour, judged, made_elsewhere, predicted
 from tests.app.evaluations import judge as judge
-from tests.app.evaluations import judged
-from tests.browser.rankings import behaviour, made_elsewhere, predicted
 from tests.ml.ope.posterior.draws import constructed
 
 pytestmark = pytest.mark.browser

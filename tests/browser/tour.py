@@ -44,6 +44,7 @@ PAGES = {
     "/uploads/{upload_id}": "collect/report",
     "/participants/{code}/proposals": "collect/proposals",
     "/proposals/{session_id}": "collect/proposal",
+    "/sessions/{session_id}/markers": "collect/markers",
     "/participants/{code}/quarantine": "collect/quarantine",
     "/uploaded-files/{file_id}/mapping": "collect/mapping",
     "/studies/{study_code}/column-mappings": "collect/column-mappings",

@@ -224,9 +224,13 @@ def markers_page(request: Request, session: CurrentSession, db: Db, caller: Curr
 @pages.post("/sessions/{session_id}/markers")
 def explain(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """State what the form says; where it is refused the form comes back with the reason."""
+    require(caller, can.UPLOAD, session.visit.participant)
     typed = {str(name): str(value).strip() for name, value in values.items()}
     try:
-        given = _read_answers(questions_of(db, session, caller), typed)
+        questions = questions_of(db, session, caller)
+        if not questions:
+            raise Invalid("No recording of this session has a marker or a channel to explain.", "Nothing was changed.")
+        given = _read_answers(questions, typed)
         state_meanings(db, session, given, typed.get("reason", "")[:1000], caller)
     except BetaloopError as error:
         db.rollback()

@@ -18,7 +18,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.ingest import encryption, repository
 from app.ingest.mappings import repository as mappings
-from app.ingest.stated_beta import BetaStated
+from app.ingest.stated_beta import BetaStated, decode_options
 from app.ingest.uploads import reading, service
 from app.ingest.uploads.receiving import Receiver, StoredContent
 from app.ingest.uploads.reports import ASIDE
@@ -71,7 +71,7 @@ def read_held(db: Session, file: UploadFile, participant: Participant, reason: s
     upload = repository.upload(db, file.upload_id, caller)[0]
     said = upload.stated
     beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
-    options = service.decode_options(db, participant, beta)
+    options = decode_options(db, participant, beta)
     clean = files.draft_path()
     known_mappings = mappings.present(db, participant.site.study_id)
     ways = [m.as_mapping for m in known_mappings]

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.ingest import wording
 from app.ingest.sessions import StatedSession
-from app.ingest.stated_beta import BetaStated
+from app.ingest.stated_beta import BetaStated, decode_options
 from app.ingest.uploads import service
 from app.ingest.uploads.in_progress import in_progress, interrupted
 from app.ingest.uploads.receiving import Receiver
@@ -95,7 +95,7 @@ def _resume(db: Session, upload_id: int) -> ResumedUpload:
     if why := why_left(participant):
         return ResumedUpload(upload_id, wording.left(why), False, left=True)
     beta = BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
-    receiver = Receiver(db, participant, upload, service.decode_options(db, participant, beta), beta)
+    receiver = Receiver(db, participant, upload, decode_options(db, participant, beta), beta)
     outcome = UploadOutcome(upload, participant, [receiver.resume(row) for row in list(upload.files)])
     try:
         stated = service.as_stated(db, participant, said)

@@ -19,12 +19,11 @@ from app.ingest import repository
 from app.ingest.proposals import clocks
 from app.ingest.proposals.clocks import MOVED_S
 from app.ingest.sessions import in_milliamperes
-from app.ingest.stated_beta import name_beta
+from app.ingest.stated_beta import name_beta, options_of_file, stated_beta
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading, recordings
 from app.ingest.uploads.reading import ReaderFault
 from app.ingest.uploads.receiving import TABLES
-from app.ingest.uploads.service import options_of_file, stated_beta
 from app.platform import files
 from app.platform.database import transaction
 from app.platform.errors import Conflict, NotFound

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
-from typing import Any, cast
+from typing import Any
 
 import structlog
 from sqlalchemy.orm import Session
@@ -15,7 +15,7 @@ from app.accounts.permissions import Caller
 from app.ingest import repository, sessions, wording
 from app.ingest.proposals import making
 from app.ingest.sessions import StatedSession
-from app.ingest.stated_beta import BetaStated
+from app.ingest.stated_beta import BetaStated, decode_options
 from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading
 from app.ingest.uploads.in_progress import in_progress, not_counted, place, tell_file
@@ -32,7 +32,7 @@ from app.study.visits import require_unlocked
 from app.tables.participants import Hemisphere, Participant
 from app.tables.sessions import Controller, StudySession
 from app.tables.uploads import Upload, UploadFile
-from ml.formats import BetaMeasure, DecodeOptions, FileReport, GraspLog, Problem, UndecodableFile
+from ml.formats import DecodeOptions, FileReport, GraspLog, Problem, UndecodableFile
 
 __all__ = ["BetaStated", "FileOutcome", "Incoming", "UploadOutcome", "receive", "state_session", "stored_reports", "unreadable_members"]
 
@@ -373,32 +373,6 @@ def attach_grasps(db: Session, file: UploadFile, session: StudySession) -> list[
     except UndecodableFile as error:
         raise Invalid(f"File {file.id} cannot be read any more: {error.what} ({error.where}).", error.hint) from error
     return outcomes_intake.take_of_session(db, file, decoded.outcomes, session)
-
-
-def decode_options(db: Session, participant: Participant, beta: BetaStated) -> DecodeOptions:
-    """Combine the participant's choices for decoders with what the sender stated of a table, and the study of markers."""
-    settings = participant.current_settings
-    return DecodeOptions(
-        period_s=settings.period_s,
-        beta_low_hz=settings.beta_low_hz,
-        beta_high_hz=settings.beta_high_hz,
-        beta_measure=cast(BetaMeasure, settings.beta_measure),
-        min_valid_fraction=settings.min_valid_fraction,
-        table_beta_unit=beta.unit or settings.beta_unit or "unstated",
-        table_lfp_unit=beta.lfp_unit,
-        meanings=repository.meanings_in_force(db, participant.site.study_id),
-    )
-
-
-def options_of_file(db: Session, file: UploadFile, participant: Participant) -> DecodeOptions:
-    """Build the options for a stored file, with what its sender had stated of it."""
-    return decode_options(db, participant, stated_beta(db, file))
-
-
-def stated_beta(db: Session, file: UploadFile) -> BetaStated:
-    """Read what the sender of a stored file had stated of its beta."""
-    said = db.get_one(Upload, file.upload_id).stated
-    return BetaStated(said.get("unit"), said.get("source"), said.get("lfp_unit"))
 
 
 def stored_outcomes(db: Session, upload: Upload) -> list[FileOutcome]:

@@ -106,6 +106,7 @@ def _of_visits(world: World) -> dict[str, Call]:
         "/sessions/{session_id}/qoc": {"data": {"rating": "5", "reason": "misread"}},
         "/sessions/{session_id}/clock": of_api(world, "put", "/sessions/{session_id}/clock")
         | {"data": {"ahead_s": "60", "uncertainty_s": "5", "clock_reason": "compared on the day"}},
+        "/sessions/{session_id}/markers": {"data": {"reason": "asked at the lab"}},
         "/sessions/{session_id}/correction": {"data": {"hemisphere": "left", "reason": "protocol sheet"}},
         "/sessions/{session_id}/conditions": {
             "data": {"revision": str(revision), "lower_bound": "0.2", "conditions_reason": "protocol sheet"}

@@ -26,8 +26,8 @@ SHARED = {"/", "/account", "/glossary", "/api-reference", "/styleguide", "/searc
           "/audit.csv",
           "/participants/new", "/visit-day/key", *roles.WITHOUT_SIGN_IN}  # fmt: skip
 """Pages without an object in their address: whoever opens one sees what they may of what there is."""
-IDLE = {"/participants/{code}/next-generation"}
-"""Forms that have nothing to do in this study, where no policy can be trained further: who may send them is told so."""
+IDLE = {"/participants/{code}/next-generation", "/sessions/{session_id}/markers"}
+"""Forms with nothing to do in this study, without a policy to train further and without markers: they refuse with that reason."""
 
 
 @pytest.fixture(autouse=True)
