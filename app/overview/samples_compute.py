@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,7 @@ class Signal:
         t_s: seconds from the session's start, [n]: of a sample, or the end of a trace's row.
         values: float32, [n]; NaN where a trace's row is invalid.
         rates_hz: rates of the samples; empty for traces.
+        stretches: gap-free pieces of the samples, (first, end, rate in Hz) each; empty for traces.
     """
 
     recording: int
@@ -43,6 +45,7 @@ class Signal:
     t_s: NDArray[np.float64]
     values: NDArray[np.float32]
     rates_hz: tuple[float, ...] = ()
+    stretches: tuple[tuple[int, int, float], ...] = ()
 
 
 # A session's signals as one Parquet table: a row per sample, a row group per channel.
@@ -88,7 +91,8 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 def write_nwb(target: Path, signals: Sequence[Signal], about: Mapping[str, Any]) -> None:
     """Write the file: samples as electrical series, traces as time series in the processing module `steps`.
 
-    NWB wants a start time: it is the session's day since enrolment, counted from 1970-01-01, for no date leaves.
+    Sex and age of the subject are stated as unknown: `U`, and `P0D/`, which is any age. NWB wants a start time: it is the session's day
+    since enrolment, counted from 1970-01-01, for no date leaves.
     """
     from pynwb import NWBHDF5IO, NWBFile  # an optional package, and half a second of imports: only where it is asked for
     from pynwb.file import Subject
@@ -101,7 +105,7 @@ def write_nwb(target: Path, signals: Sequence[Signal], about: Mapping[str, Any])
         session_start_time=EPOCH + timedelta(days=days or 0.0),
         session_id=str(about["session"]),
         notes=json.dumps(about),
-        subject=Subject(subject_id=about["participant"], species="Homo sapiens"),
+        subject=Subject(subject_id=about["participant"], species="Homo sapiens", sex="U", age="P0D/"),
     )
     _samples(content, [s for s in signals if s.stream == "lfp"])
     _traces(content, [s for s in signals if s.stream != "lfp"])
@@ -110,26 +114,45 @@ def write_nwb(target: Path, signals: Sequence[Signal], about: Mapping[str, Any])
 
 
 def _samples(content: NWBFile, signals: Sequence[Signal]) -> None:
+    """Add each gap-free stretch as a series with its start and rate; times without samples are invalid times.
+
+    Readers divide samples by the span for the rate, so that a gap within a series would move every frequency. Each stretch is a plain
+    series too, since some readers take no electrical one.
+    """
+    from pynwb import TimeSeries
     from pynwb.ecephys import ElectricalSeries
 
     if not signals:
         return
-    device = content.create_device(name="implanted neurostimulator")
+    device = content.create_device(name="implanted neurostimulator", description="the device that recorded")
     groups = {
         side: content.create_electrode_group(
             name=f"{side} lead", description=f"contacts of the {side} side", location=f"{side} side; target not stated", device=device
         )
         for side in dict.fromkeys(s.hemisphere or "unknown" for s in signals)
     }
-    for i, s in enumerate(signals):
+    plain = content.create_processing_module("lfp", "The samples of acquisition as plain time series, for readers without electrical ones.")
+    for s in signals:
         group = groups[s.hemisphere or "unknown"]
         content.add_electrode(location=group.location, group=group, reference=f"bipolar: {s.channel}")
+    for i, s in enumerate(signals):
         region = content.create_electrode_table_region([i], f"contacts of {s.channel}")
-        said = f"recording {s.recording}, {s.channel}, sampled at {' and '.join(f'{r:g}' for r in s.rates_hz)} Hz; lost samples are absent"
-        series = ElectricalSeries(
-            name=_name(s), data=_stored(s.values), electrodes=region, timestamps=_stored(s.t_s), conversion=1e-6, description=said
-        )
-        content.add_acquisition(series)
+        for number, (first, end, rate_hz) in enumerate(s.stretches, start=1):
+            values, name = s.values[first:end], f"{_name(s)} stretch {number}"
+            about = f"recording {s.recording}, {s.channel}: no sample is lost within this stretch"
+            times = {"starting_time": float(s.t_s[first]), "rate": rate_hz, "conversion": 1e-6, "description": about}
+            content.add_acquisition(ElectricalSeries(name=name, data=_stored(values[:, None]), electrodes=region, **times))
+            plain.add(TimeSeries(name=name, data=_stored(values), unit="volts", **times))
+    for begin_s, end_s in sorted({span for s in signals for span in _gaps(s)}):
+        content.add_invalid_time_interval(start_time=begin_s, stop_time=end_s)
+
+
+def _gaps(signal: Signal) -> Iterator[tuple[float, float]]:
+    """Yield the times between stretches in which samples are lost, s."""
+    for (_, end, rate_hz), (first, _, _) in pairwise(signal.stretches):
+        begin_s = round(float(signal.t_s[end - 1]) + 1.0 / rate_hz, 6)
+        if (end_s := round(float(signal.t_s[first]), 6)) - begin_s >= 0.5 / rate_hz:
+            yield begin_s, end_s
 
 
 def _traces(content: NWBFile, signals: Sequence[Signal]) -> None:
@@ -141,9 +164,15 @@ def _traces(content: NWBFile, signals: Sequence[Signal]) -> None:
     for s in signals:
         unit, factor = UNITS.get(s.unit, (s.unit, 1.0))
         said = f"recording {s.recording}, {s.stream} in {s.unit}"
-        steps.add(
-            TimeSeries(name=_name(s), data=_stored(s.values), unit=unit, conversion=factor, timestamps=_stored(s.t_s), description=said)
-        )
+        steps.add(TimeSeries(name=_name(s), data=_stored(s.values), unit=unit, conversion=factor, description=said, **_times(s)))
+
+
+def _times(trace: Signal) -> dict[str, Any]:
+    """State the times of a trace: start and rate where its rows are even, else each time."""
+    steps = np.diff(trace.t_s)
+    if steps.size and float(np.ptp(steps)) < 1e-6 and steps[0] > 0:
+        return {"starting_time": float(trace.t_s[0]), "rate": 1.0 / float(steps[0])}
+    return {"timestamps": _stored(trace.t_s)}
 
 
 def _stored(values: np.ndarray[Any, Any]) -> Any:
@@ -196,8 +225,15 @@ def _samples_of(file: Mapping[str, Any]) -> tuple[list[Signal], list[int]]:
     """The samples of a file's recordings within the session as signals, and which recordings it no longer gives."""
     logs, missing = samples_within(file)
     return [
-        Signal(row["id"], row["hemisphere"], "lfp", log.channel, log.unit, log.t_s, log.values, log.rates_hz) for row, log in logs
+        Signal(row["id"], row["hemisphere"], "lfp", log.channel, log.unit, log.t_s, log.values, log.rates_hz, _pieces(log))
+        for row, log in logs
     ], missing
+
+
+def _pieces(log: SampleLog) -> tuple[tuple[int, int, float], ...]:
+    """List the gap-free pieces of a channel: first sample, end, rate in Hz."""
+    bounds = [*log.starts.tolist(), log.values.size]
+    return tuple((a, b, rate_hz) for (a, b), (_, rate_hz, _) in zip(pairwise(bounds), log.stretches(), strict=True))
 
 
 def samples_within(file: Mapping[str, Any]) -> tuple[list[tuple[Mapping[str, Any], SampleLog]], list[int]]:

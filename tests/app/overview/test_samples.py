@@ -67,9 +67,19 @@ def test_nwb_holds_the_same_in_units_of_its_own_and_no_date(client: TestClient, 
     _, t, x = lfp_table()
     with pynwb.NWBHDF5IO(path, "r") as file:
         content = file.read()
-        (series,) = content.acquisition.values()
-        np.testing.assert_allclose(series.timestamps[:], t, atol=1e-6)
-        np.testing.assert_allclose(series.data[:] * series.conversion * 1e6, x, atol=1e-5)
+        for place in (content.acquisition, content.processing["lfp"].data_interfaces):
+            one, two = place.values()
+            assert (one.rate, two.rate) == (RATE, RATE)
+            times = [series.starting_time + np.arange(series.data.shape[0]) / series.rate for series in (one, two)]
+            np.testing.assert_allclose(np.concatenate(times), t, atol=1e-6)
+            values = np.concatenate([series.data[:].ravel() for series in (one, two)])
+            np.testing.assert_allclose(values * one.conversion * 1e6, x, atol=1e-5)
+            # the rhythm of 20 Hz is where it is: one series with its gap had it at 17.5 Hz by samples over span
+            hz = np.fft.rfftfreq(two.data.shape[0], 1 / two.rate)
+            assert hz[1:][np.argmax(np.abs(np.fft.rfft(two.data[:].ravel()))[1:])] == pytest.approx(20, abs=0.1)
+        invalid = content.invalid_times.to_dataframe()
+        np.testing.assert_allclose(invalid[["start_time", "stop_time"]].to_numpy(), [[8.0 + 1 / RATE, 13.0 + 1 / RATE]], atol=1e-5)
+        assert content.subject.sex == "U"
         assert content.session_start_time.year in (1969, 1970), "a day since enrolment"
         assert {"beta", "amplitude"} <= {name.split()[2] for name in content.processing["steps"].data_interfaces}
 
