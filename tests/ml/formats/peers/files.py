@@ -155,8 +155,9 @@ def write_nwb(path: Path, rng: np.random.Generator, marked: bool = True) -> Writ
     pause = not marked or nwb.add_dose(file, truth, rng, WORDS, begin_s)
     if rng.integers(2):
         # what another sensor recorded meanwhile shows that the recording went on, and so did its marks
+        # but within invalid times nothing counts as recorded
         nwb.add_others(file, truth, begin_s)
-        pause = False
+        pause = pause and file.invalid_times is not None
     nwb.write(path, file)
     target = "" if place == "unknown" else "STN "
     return Written(truth, {n: target + n.replace(" 0", " +0").replace(" 1-", " +1-") for n in truth.channels}, lsb, pause=pause)
