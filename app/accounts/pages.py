@@ -19,9 +19,9 @@ from app.accounts.permissions import Caller
 from app.accounts.repository import normal_address
 from app.platform.database import Db, now, set_actor, transaction
 from app.platform.errors import BetaloopError, Invalid, NotFound, TooMany, about
-from app.platform.web.bounded import Bounded
 from app.platform.web.forms import FormValues, field_notes
 from app.platform.web.schemas import RowId
+from app.platform.web.sources import Bounded
 from app.platform.web.templates import render
 from app.settings import get_settings
 from app.tables.accounts import Role, Scope, User

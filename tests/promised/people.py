@@ -82,7 +82,7 @@ PEOPLE: list[Promise] = [
          f"{ACCOUNTS}::test_padded_and_look_alike_spellings_are_one_address"),
     ),
     *of(
-        "platform/web/bounded",
+        "platform/web/sources",
         ("no more sign-ins wait than may", "        if self._present >= self.most:\n", "        if False:\n",
          f"{MANY}::test_more_than_can_wait_are_asked_to_come_back"),
     ),

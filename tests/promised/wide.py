@@ -14,7 +14,7 @@ RESTORED = "tests/app/platform/upkeep/test_backup.py::test_a_backup_comes_back_i
 
 WIDE: list[Promise] = [
     *of(
-        "platform/web/bounded",
+        "platform/web/sources",
         ("sign-ins hold up nothing else", "            return await to_thread.run_sync(work, *arguments, limiter=self._limiter)\n",
          "            return work(*arguments)\n",
          "tests/app/accounts/test_many_sign_ins.py::test_static_files_do_not_wait_for_passwords"),

@@ -1,4 +1,4 @@
-"""Limits of one source in a span of time: failed sign-ins per network address, bytes of files per address or user.
+"""Limits of one source in a span of time: failed sign-ins per network address, bytes of files per address or user; limits of costly work.
 
 Kept in the memory of one process: several web processes each count for themselves, and a restart forgets.
 """
@@ -10,9 +10,12 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from typing import TypeVar
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import Request
 
+from app.platform.errors import TooMany
 from app.platform.numbers import counted
 
 MOST_SOURCES = 10_000
@@ -90,3 +93,36 @@ def in_words(seconds: int) -> str:
     if seconds < 90:
         return counted(seconds, "second")
     return f"{math.ceil(seconds / 60)} minutes"
+
+
+# Costly work of requests in threads of its own, a few at a time, so that many such requests at once hold up nothing else.
+
+Result = TypeVar("Result")
+
+
+class Bounded:
+    """Runs functions in threads.
+
+    Args:
+        at_once: how many run side by side.
+        most_waiting: how many more may wait for their turn.
+    """
+
+    def __init__(self, at_once: int, most_waiting: int) -> None:
+        self._limiter = CapacityLimiter(at_once)
+        self.most = at_once + most_waiting
+        self._present = 0  # changed by the event loop's thread alone
+
+    async def run(self, work: Callable[..., Result], *arguments: object) -> Result:
+        """Run `work(*arguments)` and return its result.
+
+        Raises:
+            TooMany: as many wait already as may.
+        """
+        if self._present >= self.most:
+            raise TooMany("Too many people ask for this at the same moment.", "Wait a few seconds and try again.")
+        self._present += 1
+        try:
+            return await to_thread.run_sync(work, *arguments, limiter=self._limiter)
+        finally:
+            self._present -= 1
