@@ -213,8 +213,9 @@ def begun_once(server: EmbeddedPostgres, application, tmp_path_factory: pytest.T
 
 @pytest.fixture
 def begun(request: pytest.FixtureRequest) -> Begun | None:
-    """What the test begins with; None where it does not ask for a participant, or only in its course."""
-    return request.getfixturevalue("begun_once") if "participant_code" in request.fixturenames else None
+    """What the test begins with; None where it asks for no participant, only in its course, or for a synthetic one."""
+    ready = "participant_code" in request.fixturenames and request.node.get_closest_marker("synthetic") is None
+    return request.getfixturevalue("begun_once") if ready else None
 
 
 @pytest.fixture
@@ -340,15 +341,19 @@ def sign_plan(service_app, fresh_database: str) -> Callable[..., Response]:  # t
     return sign
 
 
-def _enrol(client: TestClient) -> None:
-    body = {"code": "P1", "settings": {"xi_beta": 1.0, "cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"}}
+def _enrol(client: TestClient, synthetic: bool = False) -> None:
+    body = {
+        "code": "P1",
+        "synthetic": synthetic,
+        "settings": {"xi_beta": 1.0, "cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"},
+    }
     assert client.post("/api/v1/participants", json=body).status_code == 201
     assert client.post("/api/v1/participants/P1/visits", json={"number": 1, "date": "2026-03-02"}).status_code == 201
 
 
 @pytest.fixture
-def participant_code(client: TestClient, begun: Begun | None) -> str:
-    """Code of a participant with a cDBS amplitude and a threshold, and a visit 1."""
+def participant_code(client: TestClient, begun: Begun | None, request: pytest.FixtureRequest) -> str:
+    """Code of a participant with a cDBS amplitude and a threshold, and a visit 1; a synthetic one by the marker of that name."""
     if begun is None:
-        _enrol(client)
+        _enrol(client, request.node.get_closest_marker("synthetic") is not None)
     return "P1"

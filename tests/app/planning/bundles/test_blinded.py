@@ -68,7 +68,7 @@ def bundles(client: TestClient, study_world: Any, plan: dict[str, Any]) -> dict[
     for session in plan["sessions"]:
         answer = client.get(f"/api/v1/visits/{study_world.visit}/plan/sessions/{session['position']}/bundle")
         assert answer.status_code == 200, answer.text
-        assert re.fullmatch(r'attachment; filename="P1-visit-\d+-session-\d+.zip"', answer.headers["content-disposition"])
+        assert re.fullmatch(r'attachment; filename="(?:synthetic-)?P1-visit-\d+-session-\d+.zip"', answer.headers["content-disposition"])
         found[session["position"]] = answer.content
     return found
 
@@ -162,6 +162,7 @@ def packed(files: dict[str, bytes]) -> bytes:
     return sink.getvalue()
 
 
+@pytest.mark.synthetic
 def test_a_blinded_day_runs_without_telling_and_comes_back_by_its_slots(
     client: TestClient, db: Session, study_world: Any, plan: dict[str, Any], bundles: dict[int, bytes], tmp_path: Path
 ) -> None:
