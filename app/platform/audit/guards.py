@@ -156,18 +156,18 @@ where c.relnamespace = 'public'::regnamespace and c.relkind = 'r' and a.attnum >
 # table's own types, so that neither zone nor spelling counts.
 _DIFFERENCES = """
 with told as (
-    select distinct on (key) key, id, after from (
-        select entity_id as key, id, after from audit_event where entity = '{table}' and action in ('insert', 'update', 'delete')
+    select distinct on (row_key) row_key, id, after from (
+        select entity_id as row_key, id, after from audit_event where entity = '{table}' and action in ('insert', 'update', 'delete')
         union all
         select {before_key}, id, null from audit_event where entity = '{table}' and action = 'update' and {before_key} <> entity_id
-    ) entries order by key, id desc
+    ) entries order by row_key, id desc
 ), present as (
-    select {key} as key, {columns} from {table} t
+    select {key} as row_key, {columns} from {table} t
 )
-select coalesce(e.key, r.key), e.id, r.key is not null, array_remove(array[{differing}]::text[], null)
-from (select * from told where after is not null) e full join present r on r.key = e.key
+select coalesce(e.row_key, r.row_key), e.id, r.row_key is not null, array_remove(array[{differing}]::text[], null)
+from (select * from told where after is not null) e full join present r on r.row_key = e.row_key
 left join lateral jsonb_populate_record(null::{table}, e.after) p on true
-where e.key is null or r.key is null or {any_differs} order by e.id, 1 limit {most}
+where e.row_key is null or r.row_key is null or {any_differs} order by e.id, 1 limit {most}
 """
 _GIVEN = "(select (attmissingval::text::text[])[1] from pg_attribute where attrelid = '{table}'::regclass and attname = '{column}')"
 

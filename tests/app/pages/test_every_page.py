@@ -22,8 +22,8 @@ METHODS_EXPLAINED = {"/glossary": "says what the words of the folds mean"}
 WITHOUT_A_READER = {"/sign-in", "/visit-day/shell"}
 """Pages that are shown to nobody in particular."""
 OF_NO_PARTICIPANT = {
-    "/", "/account", "/accounts", "/api-reference", "/audit", "/glossary", "/jobs", "/participants/new", "/search", "/studies",
-    "/studies/{study_code}/column-mappings", "/visit-day/shell",
+    "/", "/account", "/accounts", "/adverse-events", "/api-reference", "/audit", "/glossary", "/jobs", "/participants/new", "/search",
+    "/studies", "/studies/{study_code}/column-mappings", "/visit-day/shell",
 }  # fmt: skip
 """Pages about no participant, or about several participants, whose rows say which are synthetic."""
 STATIC = Path(__file__).resolve().parents[3] / "static"

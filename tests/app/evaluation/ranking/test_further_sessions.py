@@ -58,7 +58,7 @@ def test_where_nothing_is_worth_a_test_the_page_says_what_a_random_session_asks_
     judge({policies[0]: judged(50.0, told=False, **WORSE)}, cdbs(told=False).to_json())
     words = first_screen(client)
     minus = "\N{MINUS SIGN}"
-    assert "the amplitude changes every 10 to 60 s, between 0.9 and 3.0 mA, below 1.8 mA only within the last 5 minutes" in words
+    assert "the amplitude changes every 10 to 60 s, between 0.9 and 3 mA, below 1.8 mA only within the last 5 minutes" in words
     # sessions 1, 2 and 4 were random, 3 was cDBS: 1.8 less 2.2 Hz, 5.3 less 7, 23.3 less 10 %
     assert (
         f"The 3 so far, against cDBS of the same day: grasp {minus}0.4 Hz, rating {minus}1.7 points, tremor +13 percentage points" in words
@@ -70,7 +70,7 @@ def test_where_nothing_is_worth_a_test_the_page_says_what_a_random_session_asks_
     assert "On average that is beyond this participant's margin of tremor : these sessions explore" in first_screen(client)
     assert client.put("/api/v1/participants/P1/settings", json={"settings": {"design": "paper"}}).status_code == 200
     words = first_screen(client)
-    assert "the amplitude changes every 2 s, between 0.9 and 3.0 mA. The 3 so far" in words, "nothing keeps it from being low throughout"
+    assert "the amplitude changes every 2 s, between 0.9 and 3 mA. The 3 so far" in words, "nothing keeps it from being low throughout"
     judge({policies[0]: judged(50.0)})
     assert "asks of the patient" not in first_screen(client), "something is worth a test"
 

@@ -267,7 +267,7 @@ def test_a_ranking_with_nothing_to_test_says_so_why_and_what_to_do(client: TestC
     ) in words
     assert "tremor +25 percentage points" in words, "what it would cost the patient"
     assert "p2 : acts like no stimulation, nearly off more than 80 % of the time" in words
-    assert "To expect under cDBS itself (3.0 mA): grasp 2.0 Hz, rating 7.0 of 10 by the patient (10 is best), tremor 20 % of " in words
+    assert "To expect under cDBS itself (3 mA): grasp 2.0 Hz, rating 7.0 of 10 by the patient (10 is best), tremor 20 % of " in words
     assert "percentage points more (up to 30 % of the time). “Nearly off” is below " in words
     assert "Predicted from 12 recorded sessions." in words
     page = client.get(PAGE).text

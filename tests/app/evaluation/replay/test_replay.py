@@ -55,7 +55,7 @@ def test_the_route_tells_what_each_would_have_asked_and_how_they_differ(
     page = client.get("/participants/P1/compare", params=query | {"at": 30})
     words = above_fold(page.text)
     assert "Would have asked, not would have happened" in words
-    assert "p0 would have asked for 0.60 mA less than p1 on average" in words
+    assert "p0 would have asked for 0.6 mA less than p1 on average" in words
     assert "At 1 min 00 s" in words, "without a script the form moves along the session"
     assert methods_named(words) == []
 

@@ -78,6 +78,7 @@ SAYS_IT_ON_TOP = {
     "accounts/sign_in.html": "which of address, password and code is wrong is not told",
     "base.html": "a search, which is not sent as a form",
     "overview/styleguide.html": "shows the parts of forms, and sends none",
+    "ingest/markers.html": "its fields are cells of a table, and the box on top names marker and column",
     "evaluation/ranking.html": "is sent to the page of policies or of plans, which says at its own fields what is wrong",
 }
 """Templates whose forms take text and say what is wrong in the box on top alone, and why."""
