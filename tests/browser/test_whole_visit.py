@@ -138,6 +138,7 @@ def run_on_the_tablet(bundle: Path, key: str, log: Path, begins: datetime, ledge
     return ran.stdout
 
 
+@pytest.mark.synthetic
 def test_a_clinic_day_from_the_signed_plan_to_the_next_generation(
     people: None,
     window: Callable[..., Watched],
