@@ -22,7 +22,7 @@ from app import __version__
 from app.accounts.deps import METRICS, CurrentCaller, judge, reader_of_figures
 from app.analysis.standing import outlook, standing_sentences
 from app.planning.plans.suggested import suggested_visit
-from app.planning.slots.pages import facts as slots_of_visit
+from app.planning.slots.web import facts as slots_of_visit
 from app.platform import logs
 from app.platform.database import Db, check_connection
 from app.platform.errors import DatabaseAway
@@ -41,11 +41,11 @@ DESCRIPTION = "/api/v1/openapi.json"
 
 API_ROUTERS = (
     "app.accounts.studies_web:api",
-    "app.study.api:router",
-    "app.study.participation_web:api",
+    "app.study.routes.api:router",
+    "app.study.routes.participation:api",
     "app.study.margins_web:api",
-    "app.study.characteristics_web:api",
-    "app.study.doses_web:api",
+    "app.study.routes.characteristics:api",
+    "app.study.routes.doses:api",
     "app.study.adverse_events_web:api",
     "app.study.data_queries_web:api",
     "app.study.recordings.web:api",
@@ -59,13 +59,14 @@ API_ROUTERS = (
     "app.learning.gate_web:api",
     "app.learning.sweeps_web:api",
     "app.evaluation.ranking.web:api",
-    "app.evaluation.replay_web:api",
+    "app.evaluation.policies.replay_web:api",
     "app.pipeline.api:router",
     "app.planning.plans.api:router",
+    "app.planning.bundles.api:of_plans",
     "app.planning.bundles.api:router",
-    "app.planning.releases.api:router",
+    "app.planning.bundles.release_web:api",
     "app.planning.visit_day.api:router",
-    "app.planning.slots.api:router",
+    "app.planning.slots.web:api",
     "app.analysis.primary_web:api",
     "app.analysis.metrics_web:api",
     "app.analysis.pooled_web:api",
@@ -75,21 +76,21 @@ API_ROUTERS = (
     "app.analysis.calibration_web:api",
     "app.overview.signals_web:samples_api",
     "app.overview.signals_web:api",
-    "app.study.participation_web:closing_api",
+    "app.study.routes.participation:closing_api",
 )
 PAGE_ROUTERS = (
     "app.accounts.pages:router",
     "app.accounts.sign_on_web:pages",
     "app.accounts.studies_web:pages",
-    "app.study.participation_web:pages",
+    "app.study.routes.participation:pages",
     "app.study.settings_web:pages",
     "app.study.margins_web:pages",
-    "app.study.characteristics_web:pages",
-    "app.study.doses_web:pages",
+    "app.study.routes.characteristics:pages",
+    "app.study.routes.doses:pages",
     "app.study.adverse_events_web:pages",
     "app.study.data_queries_web:pages",
     "app.study.recordings.web:pages",
-    "app.study.visits_web:pages",
+    "app.study.routes.visits:pages",
     "app.study.sessions.pages:router",
     "app.ingest.uploads.pages:router",
     "app.ingest.proposals.pages:router",
@@ -100,14 +101,14 @@ PAGE_ROUTERS = (
     "app.learning.gate_web:pages",
     "app.learning.sweeps_web:pages",
     "app.evaluation.ranking.web:pages",
-    "app.evaluation.replay_web:pages",
-    "app.evaluation.policies_web:pages",
+    "app.evaluation.policies.replay_web:pages",
+    "app.evaluation.policies.web:pages",
     "app.pipeline.pages:router",
     "app.pipeline.next_generation_web:pages",
     "app.planning.plans.pages:router",
     "app.planning.bundles.pages:router",
     "app.planning.visit_day.pages:router",
-    "app.planning.slots.pages:router",
+    "app.planning.slots.web:pages",
     "app.analysis.primary_web:pages",
     "app.analysis.metrics_web:pages",
     "app.analysis.pooled_web:pages",

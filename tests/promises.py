@@ -273,11 +273,11 @@ PROMISES = [
         ("the bytes of policies are signed", '        "policy_sha256": policy.onnx_sha256 if policy else None,\n', "",
          f"{PLANS}::test_any_change_breaks_the_signature_visibly"),
     ),
+    *_of("planning/releases", ("no plan runs beyond a release", "    if beyond:\n", "    if False:\n", RELEASES)),
     *_of(
-        "planning/releases/service",
+        "planning/bundles/release",
         ("who brought a policy does not release it", "    if brought is not None:\n", "    if False:\n",
          f"{RELEASES}::test_whoever_brought_a_policy_does_not_release_what_was_made_from_it"),
-        ("no plan runs beyond a release", "    if beyond:\n", "    if False:\n", RELEASES),
         ("a retired policy is not released", "    if policy.retired_reason:\n", "    if False:\n",
          f"{RELEASES}::test_a_retired_policy_and_impossible_limits_are_refused"),
     ),

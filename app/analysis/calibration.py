@@ -24,7 +24,7 @@ from app.analysis.calibration_accuracy import (
     mean_interval,
 )
 from app.evaluation import repository
-from app.evaluation.estimates.rows import estimate_of
+from app.evaluation.estimates.service import estimate_of
 from app.evaluation.ranking.assessment import QUANTITIES, Actual, actual
 from app.evaluation.ranking.results import DrivenSession, driven_sessions
 from app.planning.plans import repository as plans

@@ -19,7 +19,7 @@ from app.analysis.primary_verdict import LockedMargins, VerdictResult, confirmed
 from app.platform.errors import NotFound
 from app.platform.kept import kept
 from app.study.margins import declarations, margins_of
-from app.study.sessions.usable_steps import CONTROLLER_OF_KIND
+from app.study.recordings.controller_log import CONTROLLER_OF_KIND
 from app.tables.learning import Policy
 from app.tables.participants import Participant
 from app.tables.plans import Plan, PlanItem

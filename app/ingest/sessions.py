@@ -15,10 +15,11 @@ from app.ingest import channels, repository
 from app.platform.errors import Conflict, Invalid
 from app.study import blinding, cdbs_amplitude
 from app.study import repository as study
+from app.study.recordings.controller_log import simulated
 from app.study.recordings.facts import unknown_clock
 from app.study.sessions import designs
 from app.study.sessions import repository as session_repository
-from app.study.sessions.usable_steps import CONTROL_STREAMS, simulated
+from app.study.sessions.usable_steps import CONTROL_STREAMS
 from app.study.traces import AMPLITUDE_STREAM, pack, unpack
 from app.study.visits import require_unlocked
 from app.tables.participants import Hemisphere, Participant

@@ -37,6 +37,7 @@ from ml.trajectories import ReplayBuffer
 #
 # They are ONNX files like any other policy, so that they are estimated, bundled and tested in the same way.
 
+
 CONSTANTS = (1.0, 0.85, 0.7, 0.55, 0.4)
 """Constant amplitude fractions: cDBS, and a grid from which a ranking names the best."""
 
@@ -154,12 +155,14 @@ def _add(
 # Rules of policies: how they come in, what they are stored with, how they leave is in `bundles.py`. The caller commits.
 
 BUNDLE_TEST_WINDOWS = 64
+FOREIGN = "external"
+"""Kind of a policy that was made elsewhere and uploaded."""
 UPLOAD_LIMIT = MAX_FILE_BYTES
 
 
 def window_of(policy: Policy) -> int:
     """Find the W that a policy takes: what an uploaded one was tried with, else what its file says."""
-    own = policy.config.get("window") if policy.kind == "external" else None
+    own = policy.config.get("window") if policy.kind == FOREIGN else None
     return int(own) if own else OnnxPolicy(onnx_of(policy)).window
 
 
@@ -208,7 +211,7 @@ def add_external(db: Session, participant: Participant, name: str, content: byte
     row = Policy(
         participant_id=participant.id,
         name=name,
-        kind="external",
+        kind=FOREIGN,
         algorithm="external",
         settings_version_id=settings.id,
         config={"window": settings.window},

@@ -19,7 +19,7 @@ from app.analysis.primary_schemas import csv_rows
 from app.analysis.standing import standing_sentences
 from app.evaluation import wording
 from app.evaluation.estimates.coverage import coverage_by_policy
-from app.evaluation.estimates.rows import estimate_of
+from app.evaluation.estimates.service import estimate_of
 from app.ingest.study_import import sheet_of
 from app.overview import repository
 from app.overview.package_dictionary import FIELDS, TITLES, Days, descriptor

@@ -10,10 +10,10 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from app.evaluation import repository, service
-from app.evaluation.estimates import compute, dose_shapes
+from app.evaluation import repository
+from app.evaluation.estimates import compute, dose_shapes, service
+from app.evaluation.policies.tested import replayable, tested
 from app.evaluation.schemas import EvaluateParams
-from app.evaluation.tested import replayable, tested
 from app.learning.policies import ensure_baselines
 from app.learning.trajectories import read_buffer
 from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, acting, participant_of, plan_on_snapshot

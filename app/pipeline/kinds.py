@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from sqlalchemy.orm import Session
 
+from app.evaluation.estimates.service import policies_to_rank
 from app.evaluation.schemas import EvaluateParams
-from app.evaluation.service import policies_to_rank
 from app.learning.schemas import DistilParams, TrainParams
 from app.learning.snapshots import collect
 from app.pipeline.distillation import teachers

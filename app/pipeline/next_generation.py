@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import SYSTEM, Caller
 from app.evaluation import repository as evaluation
-from app.evaluation.estimates.rows import estimate_of
+from app.evaluation.estimates.service import estimate_of
 from app.evaluation.ranking.staleness import stale_reasons
 from app.learning import repository as learning
 from app.learning.policies import window_of

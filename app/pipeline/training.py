@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
-from app.evaluation.tested import tested
+from app.evaluation.policies.tested import tested
 from app.learning import policies, repository, sweeps
 from app.learning.schemas import ALGORITHM_NAMES, TrainParams
 from app.learning.sweeps import Group

@@ -22,7 +22,7 @@ def simulate(
     """Run the whole trial loop on synthetic participants, who are not fitted to patients; started again, it goes on where it was."""
     from app.platform.upkeep.migrate import migrate as bring_up_to_date
     from app.simulation.design import design
-    from app.simulation.report import as_dict, as_table
+    from app.simulation.run import as_dict, as_table
     from app.simulation.run import simulate as run_study
 
     wanted = design(participants.split(","), visits, seed, preset)

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
 from sqlalchemy import text
+from sqlalchemy.orm import Session
 
 from app.accounts import repository
 from app.accounts import service as accounts
 from app.accounts.permissions import SYSTEM, Caller
+from app.analysis.pooled import TrialTime, trial_time
 from app.platform.database import get_engine, new_session, now, transaction
 from app.platform.errors import BetaloopError, Conflict
 from app.platform.jobs.worker import run_worker
@@ -160,3 +164,30 @@ class _Bars:
     def _advance(self, code: str, units: float) -> None:
         self._done[code] += units
         self._progress.update(self._tasks[code], completed=self._done[code])
+
+
+# Report of a simulated study at its end: the paper's table of trial time.
+
+
+def as_table(db: Session, codes: Sequence[str], caller: Caller) -> Table:
+    """Tabulate the minutes per controller and participant, with the number of sessions in brackets."""
+    trial = _trial(db, codes, caller)
+    table = Table(title="Trial time, minutes (sessions)", caption="Synthetic participants, not fitted to patients.")
+    table.add_column("Participant")
+    for label in trial.labels:
+        table.add_column(label, justify="right")
+    for row in trial.rows:
+        table.add_row(row.participant, *(f"{t.minutes:.0f} ({t.sessions})" for t in row.tested))
+    return table
+
+
+def as_dict(db: Session, codes: Sequence[str], caller: Caller) -> dict[str, Any]:
+    """Return minutes and sessions per participant and controller, for a program."""
+    return {
+        row.participant: {t.controller.value: {"minutes": t.minutes, "sessions": t.sessions} for t in row.tested}
+        for row in _trial(db, codes, caller).rows
+    }
+
+
+def _trial(db: Session, codes: Sequence[str], caller: Caller) -> TrialTime:
+    return trial_time(db, [study.participant_by_code(db, code, caller) for code in codes], caller)

@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation.service import store_evaluation
+from app.evaluation.estimates.service import store_evaluation
 from app.learning.policies import constant_onnx, ensure_baselines
 from app.learning.snapshots import collect, take_snapshot
 from app.study.repository import participant_by_code

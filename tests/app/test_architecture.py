@@ -145,8 +145,8 @@ def is_query(call: tuple[bool, str]) -> bool:
 
 RULES_WITH_QUERIES = """
 accounts/sign_on accounts/studies analysis/evaluations analysis/evidence analysis/pooled analysis/primary overview/trail_rows
-overview/trail_scope study/adverse_events study/characteristics study/data_queries study/doses study/margins study/outcomes/values
-study/recordings/facts
+overview/trail_scope study/adverse_events study/data_queries study/doses study/margins study/outcomes/hand study/outcomes/values
+study/recordings/controller_log study/recordings/facts
 """.split()  # noqa: SIM905
 """Small features that keep their rules and their queries in one file."""
 LOCKS = {"app/ingest/uploads/in_progress.py", "app/simulation/run.py"}

@@ -65,7 +65,7 @@ CONTENTS: list[Promise] = [
     Promise("a package recomputes its own tables", "app/overview/recompute.py", "float(np.nanmean(a**2)) if known(a)",
             "float(np.nanmean(a)) if known(a)", PACKAGE, at_start=True),
     *of(
-        "study/visits_web",
+        "study/routes/visits",
         ("a visit's form takes the amplitude of each side",
          "        draft.cdbs_amplitudes = amplitudes({n: typed[n] for n in _FIRST_PROGRAM if n in typed}, confirmed(values, typed))\n",
          "",
@@ -86,7 +86,7 @@ CONTENTS: list[Promise] = [
          "tests/app/planning/plans/test_sign_off.py::test_limits_are_set_with_the_draft_and_signed"),
     ),
     *of(
-        "planning/releases/service",
+        "planning/releases",
         ("a release is signed over the policy's bytes", '        "onnx_sha256": policy.onnx_sha256,\n', "",
          f"{RELEASES}::test_a_clinician_releases_a_policy_over_its_bytes_and_limits"),
         ("a release is signed over the policy's checkpoint", '        "checkpoint_sha256": policy.checkpoint_sha256,\n', "",

@@ -196,7 +196,7 @@ PEOPLE: list[Promise] = [
          f"{MARGINS}::test_any_change_breaks_it_visibly"),
     ),
     *of(
-        "planning/releases/service",
+        "planning/releases",
         ("releases are asked for where the installation says so", "            if get_settings().require_released_policies:\n",
          "            if False:\n", f"{RELEASES}::TestPlans::test_a_plan_is_approved_without_releases_unless_they_are_asked_for"),
     ),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from app.evaluation.estimates.coverage import coverage_by_policy, coverage_failed
-from app.evaluation.estimates.rows import estimate_of
+from app.evaluation.estimates.service import estimate_of
 from app.evaluation.ranking.decisions import Circumstances, Decided, decide, ordering_told, session_noise
 from app.evaluation.repository import PolicyHead
 from app.evaluation.schemas import CoverageOut, TestedBefore

@@ -35,7 +35,7 @@ from app.study import access
 from app.study import repository as study
 from app.study.deps import CurrentParticipant
 from app.study.recordings.amplitude_sources import AmplitudeConflictOut
-from app.study.serializers import session_out, visit_out
+from app.study.routes.serializers import session_out, visit_out
 from app.tables.sessions import StudySession
 
 router = APIRouter(tags=["proposals"], responses=problems(401, 403, 404, 422))

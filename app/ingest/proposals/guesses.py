@@ -13,11 +13,11 @@ from app.ingest.proposals import control_channel
 from app.ingest.sessions import StatedSession
 from app.platform.errors import Invalid
 from app.study import blinding
-from app.study.sessions import usable_steps
+from app.study.recordings import controller_log
+from app.study.recordings.controller_log import LoggedSlot
 from app.study.sessions.changes import POLICY_CONTROLLERS
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.stimulation import delivered
-from app.study.sessions.usable_steps import LoggedSlot
 from app.tables.sessions import Controller, StudySession
 from app.tables.visits import Visit
 
@@ -37,14 +37,14 @@ class Guess(NamedTuple):
 
 def controller(db: Session, session: StudySession) -> Guess:
     """Guess by the controller's own log where it names a session of a signed plan or a policy, else by the amplitudes of all sides."""
-    slot = usable_steps.slot_of_recording(db, control_recording(session))
+    slot = controller_log.slot_of_recording(db, control_recording(session))
     if slot is not None and slot.planned is not None:
         facts = {"visit": slot.visit_number, "position": slot.planned.position}
         if slot.planned.sealed and not session.visit.sealed:
             # in its present visit, everyone would see what its sealed plan hides
             return Guess(None, None, Evidence(Source.RECORDING, Reason.SLOT, facts))
         return Guess(Controller(slot.planned.controller), slot.planned.policy_id, Evidence(Source.RECORDING, Reason.SLOT, facts))
-    ran = usable_steps.of_recording(db, control_recording(session))
+    ran = controller_log.of_recording(db, control_recording(session))
     if ran is not None and ran.policy_id is not None:
         return Guess(ran.controller, ran.policy_id, Evidence(Source.RECORDING, Reason.LOG, {"policy": ran.policy_name}))
     if (survey := control_channel.survey(session)) is not None:
@@ -59,7 +59,7 @@ def controller(db: Session, session: StudySession) -> Guess:
 def policy_by_log(db: Session, session: StudySession) -> None:
     """Name the policy of a session whose controller is stated without one, where its log names it and is of that controller."""
     arm = blinding.stated_arm(session, SYSTEM)
-    ran = usable_steps.of_recording(db, control_recording(session))
+    ran = controller_log.of_recording(db, control_recording(session))
     if ran is not None and ran.policy_id is not None and arm is not None and (arm.controller, arm.policy_id) == (ran.controller, None):
         blinding.assign(session, arm.controller, ran.policy_id)
 

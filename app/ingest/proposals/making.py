@@ -19,8 +19,8 @@ from app.ingest.uploads import outcomes as outcomes_intake
 from app.platform import numbers
 from app.platform.database import now
 from app.study import repository as study
+from app.study.recordings import controller_log
 from app.study.sessions import conditions
-from app.study.sessions import usable_steps as usable_steps_rules
 from app.study.sessions.contradictions import begins_later, contradictions, control_recording, local_day
 from app.study.sessions.usable_steps import sentence, usable_steps
 from app.study.sessions.wording import sentences
@@ -63,9 +63,9 @@ def _make(db: Session, participant: Participant, upload: Upload, group: list[Rec
         # what differs from a session that counts is for a person to look at
         stated = replace(stated, confirm=False)
     day = local_day(placement.control, placement.started_at) if placement.started_at else None
-    slot = usable_steps_rules.slot_of_recording(db, placement.control)
+    slot = controller_log.slot_of_recording(db, placement.control)
     visits = study.visits(db, participant.id, 1000, 0)[0] if stated.visit is None or slot is not None else []
-    if usable_steps_rules.rehearsed(placement.control) or sessions.invented(participant, group) or differs_from_slot(slot, stated):
+    if controller_log.rehearsed(placement.control) or sessions.invented(participant, group) or differs_from_slot(slot, stated):
         # a log of a bench, of a simulation, or of another session than the sender says, is for a person to look at
         stated = replace(stated, confirm=False)
     if begins_later(placement.started_at, now()) and not participant.synthetic:

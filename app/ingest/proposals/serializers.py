@@ -17,7 +17,7 @@ from app.study import repository as study
 from app.study.blinding import may_know
 from app.study.recordings import amplitude_sources
 from app.study.recordings.facts import unknown_clock
-from app.study.serializers import session_out
+from app.study.routes.serializers import session_out
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.usable_steps import on_any, usable_steps
 from app.tables.sessions import StudySession

@@ -20,9 +20,9 @@ from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import access, blinding, data_queries
 from app.study import repository as study
-from app.study.recordings import amplitude_sources
+from app.study.recordings import amplitude_sources, controller_log
 from app.study.recordings.amplitude_sources import AmplitudeChoice, AmplitudeConflictOut
-from app.study.sessions import conditions, usable_steps
+from app.study.sessions import conditions
 from app.study.sessions import wording as session_wording
 from app.study.sessions.changes import POLICY_CONTROLLERS
 from app.study.sessions.contradictions import contradictions, control_recording
@@ -143,10 +143,10 @@ def confirm(db: Session, session: StudySession, wanted: ProposalChange, caller: 
 
 def _exclude_where_not_run(session: StudySession) -> list[str]:
     """Exclude a session in which its policy or schedule decided too seldom. Returns the reason, a sentence, where it did."""
-    share = usable_steps.policy_share(control_recording(session)) if session.segments else None
-    if share is None or share >= usable_steps.LEAST_SHARE or session.excluded_reason is not None:
+    share = controller_log.policy_share(control_recording(session)) if session.segments else None
+    if share is None or share >= controller_log.LEAST_SHARE or session.excluded_reason is not None:
         return []
-    session.excluded_reason = session_wording.seldom_decided(share, usable_steps.LEAST_SHARE)
+    session.excluded_reason = session_wording.seldom_decided(share, controller_log.LEAST_SHARE)
     return [session_wording.excluded_as_seldom_decided(session.id, session.excluded_reason)]
 
 
@@ -250,7 +250,7 @@ def _move_to_visit(db: Session, session: StudySession, proposal: SessionProposal
     visit = study.visit_by_number(db, participant.id, number)
     if visit is None:
         raise Invalid(f"Participant {participant.code} has no visit {number}.", "Add the visit first.", field="visit")
-    slot = usable_steps.slot_of_recording(db, control_recording(session))
+    slot = controller_log.slot_of_recording(db, control_recording(session))
     if slot is not None and slot.planned is not None and slot.planned.sealed and visit.id not in (session.visit_id, slot.planned.visit_id):
         raise Conflict(
             f"Session {session.id} stays at its visit: its log is of a session of visit {slot.visit_number}, whose plan's key is sealed, "

@@ -19,7 +19,7 @@ from app.platform.database import Db
 from app.platform.errors import Invalid
 from app.platform.web.schemas import Moment, RowId, Text, problems
 from app.study import repository as study
-from app.study.serializers import session_out
+from app.study.routes.serializers import session_out
 from app.study.settings_types import BetaSource
 from app.tables.participants import Hemisphere
 from app.tables.sessions import Controller

@@ -1,20 +1,23 @@
-"""REST routes of controller bundles."""
+"""REST routes of controller bundles, and of the printed sheet of a plan, which names them."""
 
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, File, Form, Path, Query, Response, UploadFile
 from fastapi.responses import HTMLResponse, PlainTextResponse
 from pydantic import Field
+from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
 from app.learning.deps import CurrentPolicy
 from app.planning.bundles import ports, slots
 from app.planning.bundles import service as bundles
+from app.planning.bundles.repository import releases_of_slots
+from app.planning.plans.view import PlanView, read_plan, standings_of
 from app.platform.audit import record
-from app.platform.database import Db
+from app.platform.database import Db, now
 from app.platform.web.schemas import Model, RowId, Text, problems
 from app.study.deps import CurrentVisit
 from app.tables.participants import Hemisphere, Participant
@@ -24,6 +27,7 @@ from ml.deploy.ports.report import fault_words, page_pdf
 from ml.deploy.ports.report import page as printed_check
 
 router = APIRouter(tags=["learning"], responses=problems(401, 403, 404, 422))
+of_plans = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 422))
 
 Milliamperes = Annotated[float | None, Query(ge=0, le=25.5, allow_inf_nan=False)]
 
@@ -168,3 +172,25 @@ def read_withdrawals(db: Db, caller: CurrentCaller) -> PlainTextResponse:
 def read_bundle_key(caller: CurrentCaller) -> str:
     """The public key that this installation's bundles are signed with: 64 hexadecimal digits. Give it to a tablet once."""
     return bundles.public_key() + "\n"
+
+
+_PDF: dict[int | str, dict[str, Any]] = {200: {"content": {"application/pdf": {}}, "description": "The sheet."}}
+
+
+@of_plans.get("/visits/{visit_id}/plan.pdf", response_class=Response, responses=_PDF)
+def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
+    """The plan as a sheet to print: sessions in order, estimates, blanks to fill in, signatures. A draft says so across every page."""
+    view = read_plan(db, visit, caller)
+    record(db, "download", "plan", view.plan.id)
+    name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
+    from app.planning.sheet import pdf  # what writes PDF takes long to load: a service that was killed is back sooner without it
+
+    copies = ports.lines_of(db, [line.policy.id for line in view.lines if line.policy is not None])
+    content = pdf.render(view, _bundles(db, view), copies, caller.label, now(), standings_of(db, view, caller))
+    return Response(content, media_type="application/pdf", headers={"Content-Disposition": f'inline; filename="{name}"'})
+
+
+def _bundles(db: Session, view: PlanView) -> dict[int, str]:
+    """The newest bundle that was taken for each session, by the number of its plan item."""
+    newest_last = reversed(releases_of_slots(db, [line.item.id for line in view.lines]))
+    return {row.plan_item_id: row.sha256 for row in newest_last if row.plan_item_id is not None}

@@ -15,13 +15,13 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning.deps import CurrentOwnPolicy
-from app.planning.bundles import ports, repository, slots
+from app.planning import releases
+from app.planning.bundles import ports, release, repository, slots
 from app.planning.bundles import service as bundles
 from app.planning.plans import wording
 from app.planning.plans.limits import device_limits
 from app.planning.plans.sign_off import common_limits
 from app.planning.plans.view import read_plan
-from app.planning.releases import service as releases
 from app.platform import numbers
 from app.platform.database import Db
 from app.platform.errors import BetaloopError, Conflict, Invalid
@@ -103,7 +103,7 @@ def release_policy(
     try:
         limits, hemisphere = _stated(typed)
         password, code = str(values.get("password", "")), str(values.get("code", ""))
-        releases.release(db, participant, policy, limits, hemisphere, caller, password, code)
+        release.release(db, participant, policy, limits, hemisphere, caller, password, code)
     except BetaloopError as error:
         db.rollback()
         return _page(request, participant, policy, db, caller, error, typed, form="release")

@@ -9,8 +9,8 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import foreign
+from app.learning.policies import FOREIGN
 from app.planning.bundles import repository
-from app.planning.bundles.service import FOREIGN
 from app.platform import files
 from app.platform.errors import Conflict, Invalid, NotFound, TooLarge
 from app.study import access

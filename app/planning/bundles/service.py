@@ -20,7 +20,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.learning import foreign
 from app.learning import repository as learning
-from app.learning.policies import onnx_of, probe_windows
+from app.learning.policies import FOREIGN, onnx_of, probe_windows
 from app.learning.trajectories import read_buffer
 from app.planning.bundles import repository
 from app.planning.grounds import events_against, unanswered
@@ -44,8 +44,6 @@ from ml.policies.onnx_policy import PolicyFileError
 KEY = "bundle-signing"
 MAKE = "app.planning.bundles.compute:make"
 """What a child runs."""
-FOREIGN = "external"
-"""The kind of policies that were made elsewhere."""
 
 
 @dataclass(frozen=True)

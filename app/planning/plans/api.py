@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from fastapi import APIRouter, Response
-from sqlalchemy.orm import Session
+from fastapi import APIRouter
 
 from app.accounts.deps import CurrentCaller
 from app.evaluation.wording import estimate_out
-from app.planning.bundles.ports import lines_of
-from app.planning.bundles.repository import releases_of_slots
 from app.planning.plans import service, sign_off, visits, wording
 from app.planning.plans.schemas import (
     Approval,
@@ -26,19 +21,16 @@ from app.planning.plans.schemas import (
     PlanWarningOut,
     Removal,
 )
-from app.planning.plans.view import PlanLine, PlanView, shown, standings_of
+from app.planning.plans.view import PlanLine, PlanView, shown
 from app.planning.plans.view import read_plan as plan_of
-from app.planning.protocol.session_order import Order
-from app.platform.audit import record
+from app.planning.protocol.schedule import Order
 from app.platform.audit.signatures import SignatureOut
-from app.platform.database import Db, now
+from app.platform.database import Db
 from app.platform.web.schemas import problems
 from app.study.deps import CurrentVisit, VisitViewed
 from app.tables.plans import Plan
 
 router = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 422))
-
-_PDF: dict[int | str, dict[str, Any]] = {200: {"content": {"application/pdf": {}}, "description": "The sheet."}}
 
 
 @router.get("/visits/{visit_id}/plan", dependencies=[VisitViewed])
@@ -66,25 +58,6 @@ def approve_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller, approval: A
     """
     view = service.approve_plan(db, visit, caller, approval.password, approval.plan_id, approval.code)
     return plan_out(view)
-
-
-@router.get("/visits/{visit_id}/plan.pdf", response_class=Response, responses=_PDF)
-def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
-    """The plan as a sheet to print: sessions in order, estimates, blanks to fill in, signatures. A draft says so across every page."""
-    view = plan_of(db, visit, caller)
-    record(db, "download", "plan", view.plan.id)
-    name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
-    from app.planning.sheet import pdf  # what writes PDF takes long to load: a service that was killed is back sooner without it
-
-    copies = lines_of(db, [line.policy.id for line in view.lines if line.policy is not None])
-    content = pdf.render(view, _bundles(db, view), copies, caller.label, now(), standings_of(db, view, caller))
-    return Response(content, media_type="application/pdf", headers={"Content-Disposition": f'inline; filename="{name}"'})
-
-
-def _bundles(db: Session, view: PlanView) -> dict[int, str]:
-    """The newest bundle that was taken for each session, by the number of its plan item."""
-    newest_last = reversed(releases_of_slots(db, [line.item.id for line in view.lines]))
-    return {row.plan_item_id: row.sha256 for row in newest_last if row.plan_item_id is not None}
 
 
 @router.post("/visits/{visit_id}/plan/moves", responses=problems(409))

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from app.evaluation.schemas import EstimateSummary
 from app.planning.notices import Code
-from app.planning.protocol.session_order import Order
+from app.planning.protocol.schedule import Order
 from app.platform.audit.signatures import SignatureOut, Signing
 from app.platform.web.schemas import Bool, Int, Model, Number, Text
 from app.tables.participants import Hemisphere

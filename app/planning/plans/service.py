@@ -14,6 +14,7 @@ from app.accounts import permissions as can
 from app.accounts.permissions import Caller
 from app.evaluation import repository as evaluations
 from app.learning import repository as learning
+from app.planning import releases
 from app.planning.grounds import grounds
 from app.planning.plans import repository
 from app.planning.plans.designs import Planned, bounds_of, is_held, near_sessions, planned_sessions, seed_of
@@ -22,14 +23,12 @@ from app.planning.plans.safeguards import Safeguard, refuse_approval, safeguards
 from app.planning.plans.schemas import HeldIn, Move, PlanIn, PlanOptions
 from app.planning.plans.sign_off import label_sessions, sealed, sign_plan
 from app.planning.plans.view import PlanView, medication_due, read_plan, refuse_after_events, refuse_withdrawn, view_of
-from app.planning.protocol.schedule import Candidate, Rules, require_controls, schedule
-from app.planning.protocol.session_order import Order
-from app.planning.releases import service as releases
+from app.planning.protocol.schedule import Candidate, Order, Rules, require_controls, schedule
 from app.platform.audit.signatures import SignatureState
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid, NotFound
 from app.study import access
-from app.study.sessions.usable_steps import CONTROLLER_OF_KIND
+from app.study.recordings.controller_log import CONTROLLER_OF_KIND
 from app.tables.evaluations import Evaluation
 from app.tables.learning import Policy
 from app.tables.participants import Hemisphere, Participant

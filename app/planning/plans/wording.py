@@ -9,7 +9,7 @@ from app.evaluation.wording import amplitude, chance, joined
 from app.planning.notices import OF_METHODS, Code, PlanWarning
 from app.planning.plans.designs import NEAR, Planned, SideBound, delivered_ma, is_held
 from app.planning.plans.suggested import Held
-from app.planning.protocol.session_order import Order
+from app.planning.protocol.schedule import Order
 from app.platform.numbers import counted, elapsed_time, ma
 from app.study.blinding import CONTROLLER_NAMES
 from app.tables.adverse_events import AdverseEvent

@@ -23,7 +23,7 @@ from app.planning.visit_day.session_outcomes import differences, take_outcomes
 from app.platform.errors import BetaloopError, Conflict
 from app.study import access
 from app.study.blinding import require_known, stated_arm
-from app.study.sessions import usable_steps
+from app.study.recordings import controller_log
 from app.study.sessions.contradictions import control_recording
 from app.study.sessions.usable_steps import session_data
 from app.study.visits import require_unlocked
@@ -183,7 +183,7 @@ def _planned(line: PlanLine, times: dict[int, SlotTimes]) -> Planned:
 
 def _done(db: Session, session: StudySession) -> Done:
     recording = control_recording(session)
-    slot = usable_steps.slot_of_recording(db, recording)
+    slot = controller_log.slot_of_recording(db, recording)
     # a number that this participant's plans do not have, or have for another session, may be that of any slot here
     of_log = None if slot is None else slot.slot_id if slot.planned is not None else NO_SLOT
     # while the key is sealed a stated or guessed controller counts for nothing: where it were put to would tell what ran there
@@ -197,8 +197,8 @@ def _done(db: Session, session: StudySession) -> Done:
         session.started_at,
         session.plan_item_id,
         of_log,
-        usable_steps.rehearsed(recording),
-        usable_steps.policy_share(recording) == 0.0,
+        controller_log.rehearsed(recording),
+        controller_log.policy_share(recording) == 0.0,
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from app.study.recordings import facts
-from app.study.sessions.usable_steps import limits_and_policy, policy_share
+from app.study.recordings.controller_log import limits_and_policy, policy_share
 from app.tables.recordings import Recording
 from app.tables.sessions import Controller
 

@@ -13,8 +13,9 @@ from app.accounts.permissions import SYSTEM, Caller
 from app.platform.database import set_reason
 from app.platform.errors import Conflict, Invalid
 from app.study import access, blinding, repository
+from app.study.recordings import controller_log
 from app.study.schemas import ConditionsChange, ConditionsFields
-from app.study.sessions import designs, usable_steps
+from app.study.sessions import designs
 from app.study.traces import StepTable, driving, step_table
 from app.study.visits import require_unlocked
 from app.tables.participants import SettingsVersion
@@ -141,7 +142,7 @@ def _add(db: Session, session: StudySession, values: dict[str, Any], origin: str
 def _limits(db: Session, session: StudySession) -> tuple[float, float] | None:
     """Amplitude limits in force, mA: the controller's by its log, else the device's for the controlled program, else the bundle's."""
     control = next((s.recording for s in session.segments if s.is_control), None)
-    said = usable_steps.limits_and_policy(control) if control is not None else None
+    said = controller_log.limits_and_policy(control) if control is not None else None
     if said is not None:
         return float(said["min_ma"]), float(said["max_ma"])
     found = _device_limits(db, session, control) if control is not None else None

@@ -16,9 +16,9 @@ from app.platform.database import now
 from app.platform.errors import Invalid
 from app.study import blinding
 from app.study.doses import disagreement_h
-from app.study.recordings import amplitude_sources
+from app.study.recordings import amplitude_sources, controller_log
 from app.study.recordings.facts import unknown_clock
-from app.study.sessions import designs, usable_steps
+from app.study.sessions import designs
 from app.study.sessions.stimulation import SILENT_MA, Delivered, contradicts, delivered
 from app.study.traces import step_table
 from app.tables.recordings import Recording
@@ -100,7 +100,7 @@ def contradictions(db: Session, session: StudySession, visit_open: bool = False,
         facts = {"above": table.above_one, "steps": int(np.sum(table.t_s > 0)), "cdbs_ma": table.cdbs_ma}
         found.append(Contradiction(Kind.ABOVE_CDBS, facts))
     arm = blinding.stated_arm(session, SYSTEM)
-    ran = usable_steps.of_recording(db, control_recording(session))
+    ran = controller_log.of_recording(db, control_recording(session))
     if ran is not None:
         found += _of_log(ran, arm, table.cdbs_ma)
     found += _of_programs(sides)
@@ -190,7 +190,7 @@ def _of_dose(session: StudySession) -> Iterator[Contradiction]:
         yield Contradiction(Kind.LAST_DOSE, {"stated": apart[0], "by_doses": apart[1]})
 
 
-def _of_log(ran: usable_steps.Logged, arm: blinding.Arm | None, cdbs_ma: float | None) -> Iterator[Contradiction]:
+def _of_log(ran: controller_log.Logged, arm: blinding.Arm | None, cdbs_ma: float | None) -> Iterator[Contradiction]:
     """Another policy than the one that wrote the log, or another cDBS amplitude than it was bounded by."""
     if ran.policy_id is None or (arm is not None and arm.policy_id != ran.policy_id):
         yield Contradiction(Kind.LOGGED_POLICY, {"logged": ran.policy_name, "number": ran.number})
@@ -201,11 +201,11 @@ def _of_log(ran: usable_steps.Logged, arm: blinding.Arm | None, cdbs_ma: float |
 def _of_slot(db: Session, session: StudySession) -> Iterator[Contradiction]:
     """A log of a session that is planned at another visit, or nowhere any more; or of no session at all."""
     recording = control_recording(session)
-    if usable_steps.rehearsed(recording):
+    if controller_log.rehearsed(recording):
         yield Contradiction(Kind.BENCH)
-    elif usable_steps.simulated(recording) and not session.visit.participant.synthetic:
+    elif controller_log.simulated(recording) and not session.visit.participant.synthetic:
         yield Contradiction(Kind.SIMULATED)
-    slot = usable_steps.slot_of_recording(db, recording)
+    slot = controller_log.slot_of_recording(db, recording)
     if slot is None:
         return
     if slot.planned is None or slot.planned.plan_status != "approved":

@@ -14,8 +14,8 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.platform.errors import Conflict
 from app.study import blinding, repository
+from app.study.recordings import controller_log
 from app.study.sessions import repository as session_rows
-from app.study.sessions import usable_steps
 from app.study.sessions.repository import SameMinutes
 from app.study.traces import StepTable
 from app.tables.participants import Hemisphere
@@ -98,7 +98,7 @@ def planned(db: Session, session: StudySession, table: StepTable, period_s: floa
     Args:
         db: the session. session: whose visit. table: its steps. period_s: of these steps; designs of other steps are left out.
     """
-    if (drawn_by_log := usable_steps.design_of_session(session)) is not None:
+    if (drawn_by_log := controller_log.design_of_session(session)) is not None:
         return drawn_by_log
     fraction = table.fraction[table.t_s > 0]
     best: dict[str, Any] | None = None

@@ -26,6 +26,7 @@ from app.study.data_queries import not_closed_of_session
 from app.study.deps import CurrentSession, SessionViewed
 from app.study.doses import since_last_dose
 from app.study.recordings import history
+from app.study.recordings.controller_log import LEAST_SHARE
 from app.study.recordings.facts import clock_words, unknown_clock
 from app.study.schemas import ConditionsChange, DerivedChoice, QocIn, SessionChange
 from app.study.sessions import changes as study_changes
@@ -34,7 +35,7 @@ from app.study.sessions import view as session_view
 from app.study.sessions.charts import beta_by_amplitude, in_chart_table, notes, operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.stimulation import beside, delivered, has_markers, open_questions
-from app.study.sessions.usable_steps import LEAST_SHARE, SessionData, session_data
+from app.study.sessions.usable_steps import SessionData, session_data
 from app.study.sessions.wording import ACTIVITIES, drawn_words, sentences
 from app.study.settings_form import Shown, own_changes
 from app.study.traces import NO_CONTROL, control_programs, session_offset_s

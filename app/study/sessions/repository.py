@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 from sqlalchemy import (
     ARRAY,
@@ -33,7 +33,6 @@ from app.study.repository import CONFIRMED, sessions_of_participant
 from app.tables.adverse_events import AdverseEvent, AdverseEventRevision
 from app.tables.outcomes import QocRevision
 from app.tables.participants import SettingsVersion
-from app.tables.plans import SEALED, Plan, PlanItem
 from app.tables.recordings import Recording, Trace
 from app.tables.sessions import CountedTime, SessionConditions, SessionSegment, StudySession
 from app.tables.visits import CdbsAmplitude, Dose, Visit
@@ -107,30 +106,6 @@ class ReadOnce:
     def rows(self) -> Sequence[StudySession]:
         """The sessions by visit and order, read anew: what the transaction read before may be older than `fingerprint`."""
         return sessions_of_participant(self.db, self.participant_id, afresh=True)
-
-
-class SlotHead(NamedTuple):
-    """One session of a plan as it stands: where it is, what it runs, and whether its plan is still signed (`plan_status` approved).
-
-    `sealed`: whether the plan was signed blinded, and its key never opened.
-    """
-
-    slot_id: int
-    plan_id: int
-    plan_status: str
-    visit_id: int
-    position: int
-    controller: str
-    policy_id: int | None
-    sealed: bool
-
-
-def slot_head(db: Session, participant_id: int, slot_id: int) -> SlotHead | None:
-    """Find a session of one of the participant's plans."""
-    item = (PlanItem.id, Plan.id, Plan.status, Plan.visit_id, PlanItem.position, PlanItem.controller, PlanItem.policy_id)
-    query = select(*item, SEALED).join_from(PlanItem, Plan, PlanItem.plan_id == Plan.id).join(Visit, Visit.id == Plan.visit_id)
-    row = db.execute(query.where(PlanItem.id == slot_id, Visit.participant_id == participant_id)).first()
-    return None if row is None else SlotHead(*row)
 
 
 def other_values(db: Session, session: StudySession, outcome: Outcome) -> list[float]:

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts import service as accounts
 from app.accounts.permissions import SYSTEM
-from app.evaluation.service import store_evaluation
+from app.evaluation.estimates.service import store_evaluation
 from app.learning.policies import constant_onnx, ensure_baselines
 from app.learning.snapshots import collect, take_snapshot
 from app.platform import files

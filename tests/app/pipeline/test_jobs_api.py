@@ -10,9 +10,9 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
+from app.evaluation.estimates.service import policies_to_rank
 from app.evaluation.methods import default_methods
 from app.evaluation.schemas import EvaluateParams
-from app.evaluation.service import policies_to_rank
 from app.learning.policies import constant_onnx
 from app.learning.schemas import DEFAULT_SWEEP
 from app.platform import files

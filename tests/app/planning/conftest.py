@@ -9,7 +9,7 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation.service import store_evaluation
+from app.evaluation.estimates.service import store_evaluation
 from app.learning.snapshots import take_snapshot
 from app.platform import files
 from app.study import blinding

@@ -16,7 +16,7 @@ from app.simulation import sessions, tablet
 from app.simulation.design import Design, Preset, Remembered
 from app.simulation.loop import ParticipantLoop, Signer
 from app.study.blinding import arm
-from app.study.sessions import usable_steps
+from app.study.recordings import controller_log
 from app.study.sessions.usable_steps import session_data
 from app.tables.accounts import Role
 from app.tables.plans import BundleRelease, DayEntry, PlanItem
@@ -72,9 +72,9 @@ def test_each_session_runs_from_its_bundle_and_its_log_fills_its_slot(loop: Part
     assert [(s.status, s.duration_s) for s in found] == [("confirmed", 300)] * 3
     assert db.scalars(select(BundleRelease.plan_item_id).order_by(BundleRelease.id)).all() == [i.id for i in items[:2]]
     recordings = [s.segments[0].recording for s in found]
-    assert [usable_steps.simulated(r) for r in recordings] == [True, True, False]
+    assert [controller_log.simulated(r) for r in recordings] == [True, True, False]
     for recording, item in zip(recordings[:2], items[:2], strict=True):
-        slot = usable_steps.slot_of_recording(db, recording)
+        slot = controller_log.slot_of_recording(db, recording)
         assert slot is not None
         assert (slot.slot_id, slot.visit_date) == (item.id, str(DAY))
     random = found[1]

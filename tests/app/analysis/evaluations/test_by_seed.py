@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation.service import store_evaluation
+from app.evaluation.estimates.service import store_evaluation
 from app.learning.snapshots import take_snapshot
 from app.study.repository import participant_by_code
 from app.tables.learning import BufferSnapshot

@@ -20,8 +20,8 @@ from app.accounts.permissions import SYSTEM
 from app.evaluation import wording
 from app.evaluation.estimates.compute import check_coverage
 from app.evaluation.estimates.coverage import CHECKS, VERDICTS, shown_limit, shown_value
+from app.evaluation.estimates.service import store_evaluation
 from app.evaluation.schemas import CheckOut
-from app.evaluation.service import store_evaluation
 from app.learning.policies import constant_onnx, ensure_baselines
 from app.learning.snapshots import collect, take_snapshot
 from app.learning.trajectories import read_buffer

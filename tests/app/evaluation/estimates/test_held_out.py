@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
 from app.evaluation.estimates.held_out import combined, difference_errors, no_difference_error, widened
-from app.evaluation.service import store_evaluation
+from app.evaluation.estimates.service import store_evaluation
 from app.learning.snapshots import take_snapshot
 from app.study.repository import participant_by_code
 from app.tables.evaluations import Evaluation

@@ -14,7 +14,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import SYSTEM
-from app.evaluation.service import store_evaluation
+from app.evaluation.estimates.service import store_evaluation
 from app.learning.policies import constant_onnx
 from app.learning.snapshots import take_snapshot
 from app.platform.errors import Invalid

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from app.evaluation import replay
-from app.evaluation.replay import DifferenceOut, ReplayOut
-from app.evaluation.replay_compute import run
+from app.evaluation.policies import replay
+from app.evaluation.policies.replay import DifferenceOut, ReplayOut
+from app.evaluation.policies.replay_compute import run
 from ml.deploy.windows import PolicyWindow
 from tests.app.words import above_fold, methods_named
 

@@ -11,8 +11,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.evaluation.estimates.rows import estimate_of
-from app.evaluation.service import store_evaluation
+from app.evaluation.estimates.service import estimate_of, store_evaluation
 from app.tables.audit import AuditEvent
 from app.tables.evaluations import Evaluation
 from app.tables.learning import BufferSnapshot, Policy

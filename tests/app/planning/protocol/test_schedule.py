@@ -8,8 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.planning.protocol.schedule import Candidate, PlannedSession, Rule, Rules, cdbs_sessions, most_policies, schedule, total_minutes
-from app.planning.protocol.session_order import Order
+from app.planning.protocol.schedule import (
+    Candidate,
+    Order,
+    PlannedSession,
+    Rule,
+    Rules,
+    cdbs_sessions,
+    most_policies,
+    schedule,
+    total_minutes,
+)
 from app.platform.errors import Invalid
 from app.tables.sessions import Controller
 

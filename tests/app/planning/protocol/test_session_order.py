@@ -7,7 +7,7 @@ from itertools import pairwise, permutations
 
 import pytest
 
-from app.planning.protocol.session_order import Order, latin_square, rounds, williams
+from app.planning.protocol.schedule import Order, latin_square, rounds, williams
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 6])

@@ -15,6 +15,7 @@ from app.accounts.permissions import SYSTEM
 from app.platform.errors import Conflict
 from app.study import characteristics
 from app.study.characteristics import CharacteristicsFields, Lead, Target
+from app.study.outcomes import hand
 from app.study.outcomes import service as outcomes
 from app.tables.participants import Hemisphere, Participant
 from app.tables.sessions import StudySession
@@ -24,7 +25,7 @@ LEFT, RIGHT = Hemisphere.LEFT, Hemisphere.RIGHT
 
 
 def state(db: Session, participant: Participant, seen: int = 0, **fields: object) -> None:
-    characteristics.change_characteristics(db, participant, seen, CharacteristicsFields(**fields), "asked", SYSTEM)  # type: ignore[arg-type]
+    hand.change_characteristics(db, participant, seen, CharacteristicsFields(**fields), "asked", SYSTEM)  # type: ignore[arg-type]
 
 
 def grasped(db: Session, session: StudySession, file: int, hand: str, hz: float) -> list[str]:

@@ -14,6 +14,7 @@ from app.study.blinding import require_known
 from app.study.deps import CurrentParticipant, CurrentSession, CurrentVisit, SessionViewed, VisitViewed
 from app.study.outcomes import values as outcome_values
 from app.study.participation import ParticipantIn
+from app.study.routes.serializers import lock_rows, outcome_out, participant_out, recorded_trace_out, session_out, trace_out, visit_out
 from app.study.schemas import (
     ConditionsChange,
     ConditionsOut,
@@ -33,7 +34,6 @@ from app.study.schemas import (
     VisitOut,
     VisitUnlockIn,
 )
-from app.study.serializers import lock_rows, outcome_out, participant_out, recorded_trace_out, session_out, trace_out, visit_out
 from app.study.sessions import changes, conditions
 from app.study.sessions.usable_steps import session_data
 from app.study.settings_types import SettingsChange, SettingsOut

@@ -1,4 +1,4 @@
-"""Rules of releases: what is signed of a policy, by whom, and what an approved plan may ask of it. The caller commits."""
+"""Release of a policy for testing in participants: signed by a clinician over its bytes, where it comes from, and its limits."""
 
 from __future__ import annotations
 
@@ -8,20 +8,16 @@ from typing import Any, Final
 
 from sqlalchemy.orm import Session
 
-from app.accounts import permissions as can
-from app.accounts import sign_on
 from app.accounts.permissions import Caller
-from app.learning.policies import onnx_of
-from app.planning.bundles import service as bundles
+from app.learning.policies import FOREIGN
 from app.platform.audit import signatures
 from app.platform.audit.signatures import SignatureState, state_of
-from app.platform.errors import Conflict, Forbidden
+from app.platform.errors import Conflict
 from app.settings import get_settings
-from app.study import access
 from app.study import repository as study_repository
 from app.tables.audit import Signature
 from app.tables.learning import BufferSnapshot, Policy
-from app.tables.participants import Hemisphere, Participant
+from app.tables.participants import Participant
 from app.tables.plans import PlanItem
 
 KIND: Final = "policy"
@@ -47,59 +43,11 @@ class Release:
         return self.signature.content.get("limits") if self.signature else None
 
 
-def release(
-    db: Session,
-    participant: Participant,
-    policy: Policy,
-    limits: bundles.Limits,
-    hemisphere: Hemisphere | None,
-    caller: Caller,
-    password: str,
-    code: str = "",
-) -> Release:
-    """Sign a policy as released for testing in participants, within limits. A newer release takes the place of an older one.
-
-    Args:
-        limits: what is left out takes the default of a bundle. password: of the caller, asked for again; empty where a fresh sign-on
-            stands for it. code: of the second factor.
-
-    Raises:
-        Forbidden: whoever brought a policy, or one that it was made from, from elsewhere; one who approves no plans; a wrong password.
-        TooMany: too many wrong ones.
-        Conflict: a retired policy, or as `bundles.refuse_after_events`. Invalid: limits that contradict each other or leave the
-            stimulator's own; a damaged file; or nobody has stated the cDBS amplitude or the unit of beta.
-    """
-    access.require(caller, can.RELEASE, participant)
-    access.require_own(participant, policy, f"policy {policy.id}")
-    if policy.retired_reason:
-        raise Conflict(f"Policy '{policy.name}' was retired: {policy.retired_reason}.", "Take it back first, or release another one.")
-    bundles.refuse_after_events(db, participant, policy)
-    brought = brought_by(db, policy, caller)
-    if brought is not None:
-        made_of = "" if brought is policy else f" Policy '{policy.name}' was made from it."
-        raise Forbidden(
-            f"You brought policy '{brought.name}' from elsewhere yourself.{made_of}",
-            "A second person looks at it and releases it: ask a clinician.",
-        )
-    onnx_of(policy)
-    manifest, _ = bundles.manifest_of(db, participant, policy, limits, hemisphere, caller)
-    signed = {
-        "hemisphere": manifest.hemisphere,
-        "cdbs_ma": manifest.cdbs_ma,
-        "min_ma": manifest.min_ma,
-        "max_ma": manifest.max_ma,
-        "ramp_ma_per_s": manifest.ramp_ma_per_s,
-    }
-    content = signed_content(db, participant, policy) | {"limits": signed}
-    row = sign_on.sign(db, caller, password, kind=KIND, subject_id=policy.id, meaning=MEANING, content=content, code=code)
-    return Release(SignatureState.STANDS, row)
-
-
 def brought_by(db: Session, policy: Policy, caller: Caller) -> Policy | None:
     """What the caller brought from elsewhere of a policy and of those that it was distilled or tuned from; None where nothing."""
     line: list[Policy] = [policy]
     for one in line:  # grows by what each was made from; a policy is never changed, so that no line leads back
-        if one.kind == bundles.FOREIGN and one.created_by == caller.label:
+        if one.kind == FOREIGN and one.created_by == caller.label:
             return one
         line += [db.get_one(Policy, number) for number in (one.teacher_id, one.parent_id) if number is not None]
     return None

@@ -9,10 +9,10 @@ from sqlalchemy.orm import Session
 from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
+from app.evaluation.policies.replay import other_than
 from app.evaluation.ranking import verdict_wording
 from app.evaluation.ranking.answer import Answer
 from app.evaluation.ranking.service import current
-from app.evaluation.replay import other_than
 from app.evaluation.repository import PolicyHead
 from app.learning import repository as learning
 from app.learning.deps import CurrentOwnPolicy

@@ -15,26 +15,45 @@ from app.planning.plans import repository as plans
 from app.planning.plans.visits import today
 from app.planning.slots import service
 from app.planning.slots.matching import DEVIATIONS, slots_summary
-from app.planning.slots.serializers import comparison_out
+from app.planning.slots.serializers import SlotConfirmation, SlotsConfirmed, VisitComparisonOut, comparison_out
 from app.platform.database import Db
 from app.platform.errors import BetaloopError
 from app.platform.web.forms import FormValues
+from app.platform.web.schemas import problems
 from app.platform.web.templates import render
 from app.settings import get_settings
 from app.study.access import may
 from app.study.deps import CurrentVisit, VisitViewed
 from app.tables.visits import Visit
 
-router = APIRouter()
+# REST routes of planned against done.
+
+api = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 409, 422))
 
 
-@router.get("/visits/{visit_id}/slots", dependencies=[VisitViewed])
+@api.get("/visits/{visit_id}/slots", dependencies=[VisitViewed])
+def read_slots(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> VisitComparisonOut:
+    """The slots of the visit's signed plan with the sessions that fill them, planned against done against predicted."""
+    return comparison_out(service.compare(db, visit, caller))
+
+
+@api.post("/visits/{visit_id}/slots/confirm")
+def confirm_slots(visit: CurrentVisit, confirmation: SlotConfirmation, db: Db, caller: CurrentCaller) -> SlotsConfirmed:
+    """Put every found session into its slot and confirm those that wait for it, all or none."""
+    notes = service.confirm(db, visit, caller, other_day=confirmation.other_day)
+    return SlotsConfirmed(comparison=comparison_out(service.compare(db, visit, caller)), notes=notes)
+
+
+pages = APIRouter()
+
+
+@pages.get("/visits/{visit_id}/slots", dependencies=[VisitViewed])
 def slots(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
     """Each slot of the plan with its session, and what is missing."""
     return HTMLResponse(_page(request, db, visit, caller))
 
 
-@router.post("/visits/{visit_id}/slots/confirm")
+@pages.post("/visits/{visit_id}/slots/confirm")
 def confirm(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> HTMLResponse:
     """Confirm all found sessions into their slots."""
     try:

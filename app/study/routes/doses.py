@@ -15,7 +15,7 @@ from app.platform.web.schemas import RowId, problems
 from app.study import doses
 from app.study.deps import CurrentVisit
 from app.study.doses import DoseIn, DoseOut, DoseRemoval, dose_out
-from app.study.visits_web import shown_visit
+from app.study.routes.visits import shown_visit
 from app.tables.visits import Dose, Visit
 
 # The dose that a path names, within what the caller may read.

@@ -34,6 +34,7 @@ from app.study.characteristics import (
 )
 from app.study.deps import CurrentParticipant
 from app.study.doses import DRUG_NAMES
+from app.study.outcomes import hand
 from app.study.settings_form import history_of, reason_of
 from app.tables.participants import Participant
 
@@ -110,7 +111,7 @@ def change_characteristics(
     participant: CurrentParticipant, change: CharacteristicsChange, db: Db, caller: CurrentCaller
 ) -> CharacteristicsOut:
     """State characteristics as a whole: a new version, or the present one where nothing differs."""
-    row = characteristics_rules.change_characteristics(db, participant, change.version, change.characteristics, change.reason, caller)
+    row = hand.change_characteristics(db, participant, change.version, change.characteristics, change.reason, caller)
     return CharacteristicsOut.model_validate(row)
 
 
@@ -133,7 +134,7 @@ def change_characteristics_by_form(
         wanted, seen = characteristics(typed), str(values.get("version", ""))
         if not seen.isdecimal():
             raise Invalid("The form does not say which version it showed.", "Load the page again.")
-        characteristics_rules.change_characteristics(db, participant, int(seen), wanted, reason_of(values) or "", caller)
+        hand.change_characteristics(db, participant, int(seen), wanted, reason_of(values) or "", caller)
     except BetaloopError as error:
         db.rollback()
         return _page(request, db, participant, caller, typed, error, reason_of(values))

@@ -112,7 +112,7 @@ def other_than(policy: Policy, policies: Sequence[Policy], answered: Answer | No
 
 # Runs two or three policies over a recorded session and says how they differ.
 
-ASK = "app.evaluation.replay_compute:ask"
+ASK = "app.evaluation.policies.replay_compute:ask"
 MOST = 3
 """Policies at once: more lines hide each other."""
 

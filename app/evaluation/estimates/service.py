@@ -1,4 +1,4 @@
-"""Rules of evaluations: which policies are ranked, how estimates are stored. The caller commits."""
+"""Rules of evaluations: which policies are ranked, how estimates are stored and read again. The caller commits."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from app.evaluation import repository
 from app.evaluation.estimates import coverage as checks
 from app.evaluation.estimates import dose_shapes, held_out
 from app.evaluation.estimates.held_out import combined, widened
-from app.evaluation.estimates.rows import row_of
-from app.evaluation.ranking.service import current_ranking as current_ranking
 from app.evaluation.schemas import EvaluateParams
 from app.learning import repository as learning
 from app.learning.policies import onnx_of, require_window, window_of
 from app.platform.errors import Invalid
 from app.platform.jobs import service as jobs
 from app.study import repository as study_repository
-from app.tables.evaluations import Evaluation
+from app.tables.evaluations import EstimateRow, Evaluation
 from app.tables.learning import BufferSnapshot, Policy
 from app.tables.participants import Participant
 from ml.ope import AGGREGATE, POSTERIOR, Estimate, default_method, shown
+
+# Rules of evaluations: which policies are ranked, how estimates are stored. The caller commits.
 
 
 def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams, *, least: int = 1) -> list[Policy]:
@@ -135,3 +135,26 @@ def store_evaluation(
     db.add(row)
     db.flush()
     return row
+
+
+# Estimates between the science's own type and their stored rows. A row has columns for what queries need; the rest is in `details`.
+
+_COLUMNS = {column.key for column in EstimateRow.__table__.columns}
+
+
+def row_of(policy_id: int, estimate: Estimate) -> EstimateRow:
+    """An estimate as it is stored."""
+    stored = estimate.to_json()
+    details = stored.pop("details") | {name: stored.pop(name) for name in list(stored) if name not in _COLUMNS}
+    # an interval of a skewed bootstrap may miss the estimate itself; the table keeps it inside
+    ends = {"low": min(estimate.low, estimate.value), "high": max(estimate.high, estimate.value)}
+    predicted = {name: v for name, v in estimate.predicted.items() if v is not None}
+    return EstimateRow(policy_id=policy_id, **stored | ends | {"predicted": predicted, "details": details})
+
+
+def estimate_of(row: EstimateRow) -> Estimate:
+    """A stored estimate of any version."""
+    details = dict(row.details)
+    apart = {name: details.pop(name) for name in ("step_return", "end_reward", "n", "version") if name in details}
+    stored = {name: getattr(row, name) for name in _COLUMNS} | apart | {"details": details}
+    return Estimate.from_json(stored | {"standard_error": row.standard_error or 0.0})

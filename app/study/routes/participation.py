@@ -23,8 +23,8 @@ from app.platform.web.templates import render
 from app.study import participation, repository, settings_form
 from app.study.deps import CurrentParticipant
 from app.study.participation import ParticipantIn, Status, StatusChange
+from app.study.routes.serializers import participant_out
 from app.study.schemas import ParticipantOut
-from app.study.serializers import participant_out
 from app.study.settings_form import texts
 from app.study.settings_types import SettingsIn
 from app.study.settings_web import settings_page

@@ -12,8 +12,8 @@ from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
-from app.evaluation import replay as replays
-from app.evaluation.replay import (
+from app.evaluation.policies import replay as replays
+from app.evaluation.policies.replay import (
     MOST,
     TWO,
     ReplayOut,

@@ -9,15 +9,16 @@ from pydantic import Field
 
 from app.accounts.deps import CurrentCaller
 from app.learning.deps import CurrentPolicy
+from app.planning import releases
+from app.planning.bundles import release
 from app.planning.bundles.service import Limits
-from app.planning.releases import service
 from app.platform.audit.signatures import SignatureOut, SignatureState, Signing
 from app.platform.database import Db
 from app.platform.web.schemas import Model, Number, problems
 from app.tables.learning import Policy
 from app.tables.participants import Hemisphere, Participant
 
-router = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 422))
+api = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 422))
 
 Milliamperes = Annotated[Number, Field(ge=0, le=25.5)]
 
@@ -50,13 +51,13 @@ class PolicyReleaseOut(Model):
     limits: PolicyReleaseLimits | None
 
 
-@router.get("/policies/{policy_id}/release")
+@api.get("/policies/{policy_id}/release")
 def read_release(policy: CurrentPolicy, db: Db) -> PolicyReleaseOut:
     """Whether a policy is released for testing in participants, within which limits, and whether the signature stands."""
-    return _out(policy, service.release_of(db, db.get_one(Participant, policy.participant_id), policy))
+    return _out(policy, releases.release_of(db, db.get_one(Participant, policy.participant_id), policy))
 
 
-@router.post("/policies/{policy_id}/release", status_code=201, responses=problems(409, 429))
+@api.post("/policies/{policy_id}/release", status_code=201, responses=problems(409, 429))
 def release_policy(policy: CurrentPolicy, wanted: PolicyReleaseIn, db: Db, caller: CurrentCaller) -> PolicyReleaseOut:
     """Sign a policy as released for testing in participants: its file, its snapshot and settings, and the limits in mA.
 
@@ -64,11 +65,11 @@ def release_policy(policy: CurrentPolicy, wanted: PolicyReleaseIn, db: Db, calle
     """
     participant = db.get_one(Participant, policy.participant_id)
     limits = Limits(wanted.min_ma, wanted.max_ma, wanted.ramp_ma_per_s)
-    found = service.release(db, participant, policy, limits, wanted.hemisphere, caller, wanted.password, wanted.code)
+    found = release.release(db, participant, policy, limits, wanted.hemisphere, caller, wanted.password, wanted.code)
     return _out(policy, found)
 
 
-def _out(policy: Policy, found: service.Release) -> PolicyReleaseOut:
+def _out(policy: Policy, found: releases.Release) -> PolicyReleaseOut:
     return PolicyReleaseOut(
         policy_id=policy.id,
         signature_state=found.state,
