@@ -31,7 +31,7 @@ from ml.ope.outcomes.model import EndModel, fit_end_model
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale, session_folds
 from ml.ope.support.coverage import AmplitudeSupport, flags_of
-from ml.policies.policy import Policy
+from ml.policies.policy import Policy, start_sessions
 from ml.progress import Report, part_of, silent
 from ml.trajectories import ReplayBuffer
 
@@ -223,6 +223,7 @@ class FittedDlmm:
         window = np.tile(starts[rng.integers(0, len(starts), m)], (p, 1))
         low, high = scale.beta(np.array([scale.beta_low, scale.beta_high]))
         beta, actions, step_return = np.empty((horizon, p * m)), np.empty((horizon, p * m)), np.zeros(p * m)
+        policies = [start_sessions(policy) for policy in policies]
         for t in range(horizon):
             raw = scale.raw_beta(window)
             a = np.concatenate([policy.act(raw[i * m : (i + 1) * m]) for i, policy in enumerate(policies)])

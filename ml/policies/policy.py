@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,19 @@ class Policy(Protocol):
     def act(self, states: NDArray[Any]) -> NDArray[np.float64]:
         """Compute amplitude fractions in [0, 1], shape [N], for beta windows in the beta unit of the participant, shape [N, W], oldest
         first."""
+
+
+@runtime_checkable
+class Remembering(Policy, Protocol):
+    """A policy that remembers more than its window, such as an amplitude on its way."""
+
+    def begin(self) -> Policy:
+        """Start sessions: each call of `act` on what this returns is the next step of the same rows."""
+
+
+def start_sessions(policy: Policy) -> Policy:
+    """Return a policy as it starts sessions that are run step by step; one without a memory is returned as it is."""
+    return policy.begin() if isinstance(policy, Remembering) else policy
 
 
 Score = Callable[[Policy], float]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ml.designs import Bound
-from ml.policies.policy import Policy
+from ml.policies.policy import Policy, start_sessions
 from ml.population.participants import ParticipantModel
 from ml.population.physiology import brain
 from ml.population.physiology.brain import STREAM_CONTROLLER
@@ -37,7 +37,7 @@ def chooser(controller: Controller, counters: NDArray[np.uint64], bound: Bound) 
         if controller not in _FIXED:
             raise ValueError(f"there is no controller {controller!r}; use 'random', 'cdbs', 'no_dbs' or a policy")
         return lambda states: np.full(len(states), _FIXED[controller])
-    policy = controller
+    policy = start_sessions(controller)
 
     def act(states: Floats) -> Floats:
         asked = np.asarray(policy.act(states.copy()), dtype=np.float64)

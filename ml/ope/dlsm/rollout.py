@@ -15,7 +15,7 @@ from ml.ope.dlsm.networks import DlsmNetworks
 from ml.ope.linear.dynamics import LinearResponse
 from ml.ope.outcomes.minutes import AMPLITUDE, BETA, ENERGY, FEATURES, Minutes, each_feature, minute_bounds, with_shares
 from ml.ope.scale import Scale
-from ml.policies.policy import Policy
+from ml.policies.policy import Policy, start_sessions
 from ml.progress import Report, silent
 
 Floats = NDArray[np.float64]
@@ -142,6 +142,7 @@ def _roll_block(
     summed = np.zeros((len(bounds), FEATURES, p * m))
     kept, keep_every = [], max(1, horizon // 50)
     linear = None if networks.linear is None else LinearRun(networks.linear, doses, p)
+    policies = [start_sessions(policy) for policy in policies]
     for t in range(horizon):
         a = np.concatenate([policy.act(window[i * m : (i + 1) * m]) for i, policy in enumerate(policies)])
         action = torch.as_tensor(a, dtype=dtype)

@@ -30,7 +30,7 @@ from ml.ope.posterior.verdict import NEARLY_OFF
 from ml.ope.registry import Size
 from ml.ope.scale import Scale, learn_scale, outcome_table, session_folds
 from ml.ope.support.coverage import AmplitudeSupport, flags_of
-from ml.policies.policy import Policy
+from ml.policies.policy import Policy, start_sessions
 from ml.progress import Report, silent
 from ml.statistics.bootstrap import percentile_interval
 from ml.trajectories import ReplayBuffer
@@ -203,6 +203,7 @@ class FittedLinear:
         low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
         raw, eta, actions = np.empty((w + horizon, *shape)), np.empty((w + horizon, *shape)), np.empty((horizon, *shape))
         raw[:w] = self.scale.raw_beta(start)
+        policy = start_sessions(policy)
         response: Response | None = None
         for t in range(horizon):
             a = actions[t] = policy.act(raw[t : t + w].reshape(w, -1).T).reshape(shape)

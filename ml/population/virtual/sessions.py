@@ -14,7 +14,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.policies.policy import Policy
+from ml.policies.policy import Policy, start_sessions
 from ml.population.virtual import _kernel, equations
 from ml.population.virtual.equations import CONSTANTS, GAIN, HALF, HOUR, LEVEL, NEED, NOISES, NORMALS, STATES, U_BOUT, UNIFORMS
 from ml.population.virtual.patient import HYSTERESIS, OSCILLATOR, TOLERANCE, Patient, measured_qocs, minute_means
@@ -126,6 +126,7 @@ def simulate(
     state[:, equations.BOUT] = beginning * (patient.bout_in + patient.bout_out) < patient.bout_in
     amplitude = np.ones((n, length))
     beta, brady, tremor, overload = (np.empty((n, length)) for _ in range(4))
+    controller = controller if isinstance(controller, np.ndarray) else start_sessions(controller)
     for k in range(length):
         if k >= WARM_STEPS:
             t = k - WARM_STEPS
