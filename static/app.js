@@ -22,9 +22,12 @@ function sortTable(heading) {
   const ascending = heading.getAttribute("aria-sort") !== "ascending";
   for (const other of heading.parentElement.children) other.removeAttribute("aria-sort");
   heading.setAttribute("aria-sort", ascending ? "ascending" : "descending");
-  const rows = [...table.tBodies[0].rows].map((row) => [sortValue(row.cells[column]), row]);
-  rows.sort(([a], [b]) => (a === null || b === null || ascending ? compare(a, b) : compare(b, a)));
-  table.tBodies[0].append(...rows.map(([, row]) => row));
+  for (const body of table.tBodies) {
+    // within each group, whose heading stays first
+    const rows = [...body.rows].filter((row) => !row.classList.contains("group")).map((row) => [sortValue(row.cells[column]), row]);
+    rows.sort(([a], [b]) => (a === null || b === null || ascending ? compare(a, b) : compare(b, a)));
+    body.append(...rows.map(([, row]) => row));
+  }
 }
 
 function makeSortable(root) {

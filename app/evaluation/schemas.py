@@ -64,6 +64,22 @@ class EstimateOut(EstimateSummary):
     n: int | None
 
 
+class _VisitSteps(Model):
+    visit: int = Field(description="Its number.")
+    energy_difference: float | None
+    mean_beta_difference: float | None
+
+
+if TYPE_CHECKING:
+    _VisitMeans = _VisitSteps
+else:
+    _VisitMeans = fields_model("_VisitMeans", lambda o: {f"{o.field}_difference": (float | None, ...)}, _VisitSteps)
+
+
+class VisitDifferences(_VisitMeans):
+    """Mean of a policy's sessions of one visit less that of the visit's cDBS; energy as a share of the latter."""
+
+
 class _Steps(Model):
     sessions: int
     sessions_with_return: int
@@ -75,6 +91,7 @@ class _Steps(Model):
     mean_beta: float | None
     energy_difference: float | None = Field(description="To the cDBS of the same visits, as a share of it; null without such cDBS.")
     mean_beta_difference: float | None = Field(description="To the cDBS of the same visits.")
+    visits: list[VisitDifferences] = Field(default_factory=list, description="Visits that had cDBS too, by number.")
 
 
 if TYPE_CHECKING:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -45,6 +46,14 @@ OFF_SHARE = 0.8
 LEAST_SAVING = 0.05
 """Of the energy of cDBS; a behaviour that saves less is not worth further sessions to know of."""
 
+Group = Literal["proposed", "open", "not_advised"]
+GROUPS: dict[Group, tuple[str, ...]] = {
+    "proposed": ("test", "test_with_care"),
+    "open": ("undecided", "cannot_tell", "same_as_cdbs"),
+    "not_advised": ("likely_worse", "not_advised", "unsafe"),
+}
+"""Verdicts by what to do with a policy; one that is retired is not advised, whatever its verdict."""
+
 QUANTITIES = ("energy", *FIELDS)
 
 
@@ -62,13 +71,14 @@ class Fixed:
     """The best amplitude held all the time by the scores that rank, where that is another than cDBS: what a controller has to beat.
 
     Attributes:
-        fraction: of the cDBS amplitude. ma: mA; None where the cDBS amplitude is not known. differences: to cDBS, by quantity.
+        fraction: of the cDBS amplitude. ma: mA; None where the cDBS amplitude is not known.
+        row: with the verdict by which a plan takes it.
         within: probability that no outcome is worse than under cDBS by more than its margin.
     """
 
     fraction: float
     ma: float | None
-    differences: dict[str, Difference]
+    row: Row
     within: float | None
 
 
@@ -131,6 +141,19 @@ class Answer:
     cdbs_ma: float | None = None
     sessions: int | None = None
     fixed: Fixed | None = None
+
+    @property
+    def groups(self) -> dict[Group, list[Row]]:
+        """Distinct behaviours by what to do with them, each group in the order of `rows`; empty groups are absent.
+
+        A value orders policies and is no safety: the first by value may be likely worse. So what is proposed comes before what is not.
+        """
+        found: dict[Group, list[Row]] = {name: [] for name in GROUPS}
+        for row in self.rows:
+            retired = row.one.policy.retired_reason is not None
+            own = next(name for name, codes in GROUPS.items() if row.decided.standing in codes)
+            found["not_advised" if retired else own].append(row)
+        return {name: rows for name, rows in found.items() if rows}
 
     def of(self, code: str) -> list[Row]:
         """Rows that stand so and are not retired."""
@@ -292,11 +315,13 @@ def _row(found: Assessment, beta_map: BehaviourMap | None, one: Assessed, twins:
 def _fixed(found: Assessment) -> Fixed | None:
     one = next((a for a in found.references if a.reference == "best_constant"), None)
     cdbs = found.cdbs.posterior if found.cdbs else None
-    if one is None or one.posterior is None or cdbs is None or one.policy.amplitude is None or not found.ordered:
+    if one is None or one.posterior is None or cdbs is None or one.policy.amplitude is None or one.planned is None or not found.ordered:
         return None
     ma = None if found.cdbs_ma is None else one.policy.amplitude * found.cdbs_ma
     within = chance_within(one.posterior, cdbs, margins_of(found.participant.margins_in_force))
-    return Fixed(one.policy.amplitude, ma, differences(one.posterior, cdbs), within)
+    # it adapts to nothing
+    row = replace(_row(found, None, replace(one, decided=one.planned)), adds=None)
+    return Fixed(one.policy.amplitude, ma, row, within)
 
 
 def _held_back(row: Row) -> bool:

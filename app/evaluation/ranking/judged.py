@@ -112,7 +112,8 @@ class Judged:
         def read() -> Answer:
             found = self._answer_with_draws
             rows, like_cdbs, like_off = (tuple(map(_row_without_draws, of)) for of in (found.rows, found.like_cdbs, found.like_off))
-            return replace(found, rows=rows, like_cdbs=like_cdbs, like_off=like_off)
+            fixed = replace(found.fixed, row=_row_without_draws(found.fixed.row)) if found.fixed is not None else None
+            return replace(found, rows=rows, like_cdbs=like_cdbs, like_off=like_off, fixed=fixed)
 
         return self.kept("answer", read)
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
 
-from app.evaluation.ranking.answer import QUANTITIES, Row, map_of
+from app.evaluation.ranking.answer import QUANTITIES, Answer, Row, map_of
 from app.evaluation.ranking.assessment import Assessed, Assessment
 from app.platform.numbers import number
 from app.platform.web.charts import Cell, written
-from app.platform.web.svg import Plane, apart, drawing
+from app.platform.web.svg import Plane, apart, drawing, glyph
+from app.study.margins import margins_of
+from app.tables.participants import MarginsVersion
 from ml.designs import Bound
 from ml.ope import DOSES, BehaviourMap, Estimate, interval, outcome_draws
 from ml.outcomes import OUTCOMES
@@ -249,3 +251,71 @@ def _dose_row(name: str, estimate: Estimate | None, scale: Scale) -> tuple[Cell,
         span = _predicted(estimate, quantity)
         cells.append(None if span is None else "{} ({} to {})".format(*(number(factor * v) for v in span)))
     return tuple(cells)
+
+
+# Strips of the candidates' table: each expected change from cDBS with its interval and margin, and the results of visits.
+
+STRIP_W, STRIP_H = 104.0, 16.0
+ROOM = 0.05
+"""Of the span of a scale, at each end."""
+
+
+@dataclass(frozen=True)
+class Strips:
+    """Strips of the table of candidates; a column has one scale.
+
+    Attributes:
+        scales: lowest and highest difference, by quantity. limits: the margin of an outcome as a difference; absent where
+            it is not known.
+    """
+
+    scales: Mapping[str, tuple[float, float]]
+    limits: Mapping[str, float]
+
+    def draw(self, row: Row, quantity: str) -> Markup:
+        """Draw the strip of a row: cDBS dashed, the margin in red, interval and mark, and a ring for each visit that measured it."""
+        plane = Plane(4, 2, STRIP_W - 8, STRIP_H - 4, self.scales[quantity], (0.0, 1.0))
+        plane.line([(0.0, 0.0), (0.0, 1.0)], "muted", 1, "2 2")
+        if quantity in self.limits:
+            plane.line([(self.limits[quantity], 0.0), (self.limits[quantity], 1.0)], "bad", 2)
+        tone = TONES[row.decided.standing]
+        if quantity in row.differences:
+            expected = row.differences[quantity]
+            plane.line([(expected.low, 0.5), (expected.high, 0.5)], tone, 2)
+            plane.dot(expected.value, 0.5, tone, radius=4)
+        for value in _visit_differences(row, quantity):
+            plane.dot(value, 0.5, "text", "ring", radius=3)
+        return glyph(plane)
+
+
+def make_strips(answer: Answer, margins: MarginsVersion) -> Strips:
+    """Return the strips of an answer's rows, of the folded ones and the best fixed amplitude too.
+
+    Args:
+        answer: with all its rows. margins: in force.
+    """
+    rows = [*answer.rows, *answer.like_cdbs, *answer.like_off, *([answer.fixed.row] if answer.fixed is not None else [])]
+    amounts, limits = margins_of(margins), {}
+    for o in OUTCOMES:
+        usual = answer.under_cdbs.get(o.field)
+        if usual is not None:
+            amount = o.margin.amount(amounts.of(o), usual)
+            limits[o.field] = -amount if o.higher_is_better else amount
+    scales = {}
+    for name in QUANTITIES:
+        expected = [row.differences[name] for row in rows if name in row.differences]
+        ends = [
+            0.0,
+            limits.get(name, 0.0),
+            *(v for d in expected for v in (d.low, d.high)),
+            *(v for row in rows for v in _visit_differences(row, name)),
+        ]
+        room = ROOM * ((max(ends) - min(ends)) or 1.0)
+        scales[name] = (min(ends) - room, max(ends) + room)
+    return Strips(scales, limits)
+
+
+def _visit_differences(row: Row, quantity: str) -> list[float]:
+    """List the differences that the visits of a row's policies measured; those of twins are theirs."""
+    visits = row.one.tested.visits if row.one.tested is not None else []
+    return [value for visit in visits if (value := getattr(visit, f"{quantity}_difference")) is not None]

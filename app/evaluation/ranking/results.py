@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.evaluation.ranking.assessment import QUANTITIES, Actual, actual, mean_of
-from app.evaluation.schemas import TestedBefore
+from app.evaluation.schemas import TestedBefore, VisitDifferences
 from app.learning.trajectories import trajectory_of
 from app.platform.errors import Invalid
 from app.platform.kept import kept
@@ -94,7 +94,8 @@ def results_by_policy(ran: list[DrivenSession], settings: MdpSettings, horizon_s
         if policy_id is not None:
             results[policy_id].append(found_in)
             stopped[policy_id] += session.stopped
-    apart = {i: _apart(by_visit[i], by_visit[None]) for i in results if i != cdbs}
+    visits = {i: _apart(by_visit[i], by_visit[None]) for i in results if i != cdbs}
+    apart = {i: {name: mean_of([v[name] for v in found.values()]) for name in QUANTITIES} for i, found in visits.items()}
     return {
         policy_id: TestedBefore(
             sessions=len(found),
@@ -109,22 +110,24 @@ def results_by_policy(ran: list[DrivenSession], settings: MdpSettings, horizon_s
             mean_beta_difference=apart.get(policy_id, {}).get("mean_beta"),
             **{o.field: mean_of([a.shown.get(o.field) for a in found]) for o in OUTCOMES},
             **{f"{o.field}_difference": apart.get(policy_id, {}).get(o.field) for o in OUTCOMES},
+            visits=[
+                VisitDifferences(visit=number, **{f"{name}_difference": value for name, value in found.items()})
+                for number, found in visits.get(policy_id, {}).items()
+            ],
         )
         for policy_id, found in results.items()
     }
 
 
-def _apart(ours: Mapping[int, Sequence[Actual]], cdbs: Mapping[int, Sequence[Actual]]) -> dict[str, float]:
-    """Return by quantity the mean over visits of a policy's mean less that of the same visit's cDBS; energy as a share of the latter."""
-    found = {}
-    for name in QUANTITIES:
-        apart = []
-        for visit in ours.keys() & cdbs.keys():
+def _apart(ours: Mapping[int, Sequence[Actual]], cdbs: Mapping[int, Sequence[Actual]]) -> dict[int, dict[str, float | None]]:
+    """Return by visit and quantity a policy's mean less that of the same visit's cDBS; energy as a share of the latter."""
+    found: dict[int, dict[str, float | None]] = {}
+    for visit in sorted(ours.keys() & cdbs.keys()):
+        found[visit] = dict.fromkeys(QUANTITIES)
+        for name in QUANTITIES:
             own, other = (mean_of([a.shown.get(name) for a in arm[visit]]) for arm in (ours, cdbs))
             if own is not None and other is not None and (name != "energy" or other > 0):
-                apart.append((own - other) / (other if name == "energy" else 1.0))
-        if apart:
-            found[name] = fmean(apart)
+                found[visit][name] = (own - other) / (other if name == "energy" else 1.0)
     return found
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from markupsafe import Markup
 
 from app.evaluation import wording
-from app.evaluation.ranking.answer import OFF_SHARE, Difference, Row
+from app.evaluation.ranking.answer import OFF_SHARE, Difference, Group, Row
 from app.evaluation.ranking.judged import Judged
 from app.evaluation.ranking.results import RandomSessions
 from app.evaluation.schemas import Standing, TestedBefore
@@ -30,6 +30,12 @@ STANDING_NAMES: dict[Standing, str] = {
     "unsafe": "unsafe",
     "not_advised": "not advised",
     "cannot_tell": "cannot tell",
+}
+
+GROUP_NAMES: dict[Group, str] = {
+    "proposed": "Suggested tests",
+    "open": "Not decided: not likely enough to suggest, and not ruled out",
+    "not_advised": "Not advised: planned only with a clinician's stated reason",
 }
 
 

@@ -20,6 +20,7 @@ from app.evaluation.methods import Method, names
 from app.evaluation.ranking import charts, verdict_wording
 from app.evaluation.ranking import service as ranking
 from app.evaluation.ranking.judged import Judged
+from app.evaluation.ranking.picture import make_strips
 from app.evaluation.ranking.verdict_wording import what_next
 from app.evaluation.schemas import RANKING_KINDS, FlagOut, Kind, RankedPolicy, RankingFilter, RankingOut, TestedBefore
 from app.learning.snapshots import not_ready
@@ -57,7 +58,7 @@ _OF_POLICY = (
     "probability_best",
 )
 _GAIN = ("value", "low", "high")
-_TESTED = tuple(TestedBefore.model_fields)
+_TESTED = tuple(name for name in TestedBefore.model_fields if name != "visits")
 _COVERAGE = tuple(CHECKS)
 
 
@@ -209,6 +210,7 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             dose_words=verdict_wording.dose_words,
             reliability=verdict_wording.reliability(),
             chance=wording.chance,
+            amplitude=wording.amplitude,
             weights=assessment.weights,
             correlation=assessment.held_out_correlation,
             errors=assessment.standard_errors,
@@ -221,7 +223,9 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
             label=charts.label,
             method_names=names(),
             method_short={m.key: m.short for m in estimators.methods()},
+            strips=make_strips(answered, participant.margins_in_force),
             standing_names=verdict_wording.STANDING_NAMES,
+            group_names=verdict_wording.GROUP_NAMES,
             standings={number: row.decided.standing for number, row in answered.everyone().items()},
             coverage=coverage,
             shown=shown,

@@ -120,12 +120,13 @@ class Plane:
         """Draw a vertical line from `low` to `high`."""
         self.parts.append(_line(self.at_x(x), self.at_y(low), self.at_x(x), self.at_y(high), token(colour), width=1.5))
 
-    def dot(self, x: float, y: float, colour: str, shape: str = "circle", words: str = "") -> None:
+    def dot(self, x: float, y: float, colour: str, shape: str = "circle", words: str = "", radius: float = 5) -> None:
         """Draw a mark at a value; see `mark`."""
-        self.mark(self.at_x(x), self.at_y(y), colour, shape, words)
+        self.mark(self.at_x(x), self.at_y(y), colour, shape, words, radius)
 
-    def mark(self, px: float, py: float, colour: str, shape: str = "circle", words: str = "") -> None:
-        """Draw a mark at a place of the figure; `shape` is circle, square, diamond, up, down or ring. `words` are its tooltip."""
+    def mark(self, px: float, py: float, colour: str, shape: str = "circle", words: str = "", radius: float = 5) -> None:
+        """Draw a mark at a place of the figure; `shape` is circle, square, diamond, up, down or ring. `words` are its tooltip, `radius` is
+        of circles and rings."""
         paint = token(colour)
         title = f"<title>{escape(words)}</title>" if words else ""
         if shape == "square":
@@ -138,7 +139,7 @@ class Plane:
         else:
             fill = token("surface") if shape == "ring" else paint
             self.parts.append(
-                f'<circle cx="{px:.1f}" cy="{py:.1f}" r="5" fill="{fill}" stroke="{paint}" stroke-width="1.5">{title}</circle>'
+                f'<circle cx="{px:.1f}" cy="{py:.1f}" r="{radius:g}" fill="{fill}" stroke="{paint}" stroke-width="1.5">{title}</circle>'
             )
 
     def text(self, x: float, y: float, words: str, anchor: str = "start", colour: str = "text", weight: int = 400) -> None:
@@ -173,6 +174,14 @@ def drawing(width: float, height: float, title: str, description: str, planes: S
     # every part escapes the words that it is given
     told = f"{escape(title)}. {escape(description)}"
     return Markup(f'<svg class="drawing" viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{told}">{body}</svg>')  # noqa: S704
+
+
+def glyph(plane: Plane) -> Markup:
+    """Draw a small figure inside a line of text that has its numbers; programs that read a page aloud leave it out."""
+    width, height = 2 * plane.left + plane.width, 2 * plane.top + plane.height
+    body = "".join(plane.parts)
+    # as in `drawing`, every part escapes the words that it is given
+    return Markup(f'<svg class="glyph" viewBox="0 0 {width:g} {height:g}" width="{width:g}" aria-hidden="true">{body}</svg>')  # noqa: S704
 
 
 def _line(x0: float, y0: float, x1: float, y1: float, paint: str, dash: str = "", width: float = 1.0) -> str:

@@ -36,6 +36,26 @@ def test_the_best_fixed_amplitude_stands_beside_the_answer_where_it_is_not_that_
     assert "For comparison" not in above_fold(client.get(PAGE).text), "cDBS is the best fixed amplitude"
 
 
+def test_the_best_fixed_amplitude_is_a_row_that_can_be_ticked_and_planned(
+    client: TestClient, policies: list[int], judge: Judge, db: Session
+) -> None:
+    judge({policies[0]: judged(50.0)})
+    constants = db.scalars(select(Policy).where(Policy.kind == "baseline", Policy.algorithm == "constant").order_by(Policy.id)).all()
+    low = next(p for p in constants if p.config["amplitude"] < 1)
+    judge({policies[0]: judged(50.0), low.id: judged(60.0)})
+    last = client.get(PAGE).text.split('id="candidates"')[1].split("</table>")[0].split("For comparison:")[1]
+    assert "2.55 mA all the time" in " ".join(last.split())
+    assert f'name="policy_ids" value="{low.id}"' in last
+    sent = {"policy_ids": str(low.id), "visit_number": "7", "visit_date": "2031-01-07", "random_sessions": "0"}
+    planned = client.post("/participants/P1/plan/draft", data=sent, follow_redirects=False)
+    assert planned.status_code == 303, planned.text
+    visit = int(planned.headers["location"].split("/")[2])
+    assert low.id in [s["policy_id"] for s in client.get(f"/api/v1/visits/{visit}/plan").json()["sessions"]]
+    judge({policies[0]: judged(50.0), low.id: judged(60.0, outcome_draws={"tremor_percent": [45.0] * N})})
+    last = client.get(PAGE).text.split("For comparison:")[1]
+    assert f'name="policy_ids" value="{low.id}"' not in last, "one that is unsafe is planned with a reason alone"
+
+
 def test_where_nothing_is_worth_a_test_random_and_cdbs_sessions_are_planned_at_a_click(
     client: TestClient, policies: list[int], judge: Judge
 ) -> None:

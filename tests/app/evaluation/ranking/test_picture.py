@@ -6,14 +6,22 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy.orm import Session
 
+from app.accounts.permissions import SYSTEM
 from app.evaluation.ranking import picture
-from app.evaluation.ranking.picture import DARKEST, MOST, SHAPES, TONES
+from app.evaluation.ranking.picture import DARKEST, MOST, SHAPES, STRIP_W, TONES, make_strips
+from app.evaluation.ranking.service import current
 from app.learning.policies import constant_onnx
 from app.platform.web.svg import Plane
+from app.study.margins import margins_of
+from app.study.repository import participant_by_code
 from ml.ope.support.behaviour_map import COLUMNS, DOSES, BehaviourMap, Curve
+from ml.outcomes import OUTCOMES
 from tests.app.evaluations import judged
+from tests.ml.ope.posterior.draws import N
 
 PAGE = "/participants/P1/ranking"
 
@@ -119,3 +127,24 @@ def test_lines_and_names_stand_out_in_both_themes_and_on_paper() -> None:
         for tone in {*TONES.values(), "cdbs"}:
             assert contrast(colours[tone], paper) >= 4.5, f"{tone}: its name is text"
             assert contrast(colours[tone], cell) >= 3.0, f"{tone}: a line over the darkest cell"
+
+
+def test_a_strip_has_the_margin_on_its_worse_side_and_every_mark_within_its_width(
+    client: TestClient, policies: list[int], judge: Callable[..., int], db: Session
+) -> None:
+    a, b, c = policies
+    judge({a: judged(50.0), b: judged(60.0, outcome_draws={"tremor_percent": [45.0] * N}), c: judged(40.0)})
+    participant = participant_by_code(db, "P1", SYSTEM)
+    found = current(db, participant, SYSTEM).answer
+    drawn = make_strips(found, participant.margins_in_force)
+    assert {o.field: drawn.limits[o.field] < 0 for o in OUTCOMES} == {o.field: o.higher_is_better for o in OUTCOMES}
+    assert drawn.limits["grasp_hz"] == pytest.approx(
+        -margins_of(participant.margins_in_force).of(OUTCOMES[0]) * found.under_cdbs["grasp_hz"]
+    )
+    for row in found.rows:
+        for quantity in ("energy", *(o.field for o in OUTCOMES)):
+            strip = drawn.draw(row, quantity)
+            places = [float(x) for x in re.findall(r'cx="(-?[\d.]+)"|[ML](-?[\d.]+) ', strip) for x in x if x]
+            assert len(places) >= 5, "cDBS, the interval and its mark"
+            assert all(0 <= x <= STRIP_W for x in places)
+            assert ("--c-bad" in strip) == (quantity != "energy" or row.decided.standing == "unsafe"), "energy has no margin"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -185,7 +186,19 @@ def test_where_a_policy_ran_its_actual_return_stands_beside_the_estimate(
         "grasp_hz_difference": 0.0,
         "rating_difference": 1.0,
         "tremor_percent_difference": 10.0,
+        "visits": [
+            {
+                "visit": 1,
+                "energy_difference": pytest.approx(0.64 - 1, abs=1e-5),
+                "mean_beta_difference": pytest.approx(beta.mean() - np.mean(cdbs["beta"][10:]), abs=1e-5),
+                "grasp_hz_difference": 0.0,
+                "rating_difference": 1.0,
+                "tremor_percent_difference": 10.0,
+            }
+        ],
     }
+    strip = re.findall(r'<svg class="glyph".*?</svg>', client.get("/participants/P1/ranking").text, re.S)
+    assert [s.count('r="3" fill="var(--c-surface)"') for s in strip[:4]] == [1, 1, 1, 1], "a ring for the visit that measured it"
     assert tested[policies[1]] is None
 
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
+from html import unescape
 from typing import Any
 
 from fastapi.testclient import TestClient
@@ -73,10 +74,17 @@ def test_the_posterior_ranks_and_its_verdicts_stand_in_the_contract(client: Test
     assert "likely within the margins of grasp, rating and tremor" in body["policies"][0]["decision_reason"]
 
 
-def test_the_page_follows_values_and_the_first_proposal_is_a_test_all_the_same(
+def table_rows(page: str) -> tuple[list[str], list[str]]:
+    """Return the names of the groups and the rows of the table of candidates."""
+    found = re.findall(r"<tr.*?</tr>", page.split('id="candidates"')[1].split("</table>")[0], re.S)[1:]
+    heads = [unescape(re.sub("<.*?>", "", row, flags=re.S)).strip() for row in found if 'class="group"' in row]
+    return heads, [row for row in found if 'class="group"' not in row]
+
+
+def test_the_page_groups_by_verdict_and_each_policy_keeps_the_rank_of_its_value(
     client: TestClient, policies: list[int], judge: Judge
 ) -> None:
-    """A likely worse policy keeps the place of its value with its label; only a hazard is a place of its own."""
+    """A likely worse policy keeps the rank of its value after what is proposed; only a hazard is a place of its own."""
     a, b, c = policies
     likely_worse = {"outcome_draws": {"tremor_percent": [33.0] * N}}
     judge({a: judged(50.0), b: judged(60.0, **likely_worse), c: judged(70.0, **WORSE)})
@@ -84,9 +92,11 @@ def test_the_page_follows_values_and_the_first_proposal_is_a_test_all_the_same(
     assert [(p["policy_id"], p["rank"], p["decision"]) for p in found] == [(b, 1, "likely_worse"), (a, 2, "test"), (c, 3, "unsafe")]
     assert {p["policy_id"]: p["probability_best"] for p in found} == {a: 1.0, b: 0.0, c: 0.0}
     page = client.get(PAGE).text
-    rows = re.findall(r"<tr.*?</tr>", page.split('id="candidates"')[1].split("</table>")[0], re.S)[1:]
-    assert [re.findall(r">(p\d)</a>", r)[0] for r in rows] == ["p1", "p0", "p2"]
-    assert ['type="checkbox"' in r for r in rows] == [False, True, False]
+    heads, rows = table_rows(page)
+    assert heads == ["Suggested tests", "Not advised: planned only with a clinician's stated reason"]
+    assert [re.findall(r">(p\d)</a>", r)[0] for r in rows] == ["p0", "p1", "p2"]
+    assert [re.findall(r'<td class="num">(\d|—)</td>', r)[0] for r in rows] == ["2", "1", "3"]
+    assert ['type="checkbox"' in r for r in rows] == [True, False, False]
     words = first_screen(client)
     assert words.index("Suggested tests") < words.index("p0 :") < words.index("p1 :"), "what is likely worse is no proposal"
     assert "p1 :" in words.split("Not advised:")[1]
@@ -246,7 +256,7 @@ def test_behaviours_that_are_cdbs_or_no_stimulation_by_another_name_are_folded(
     page = client.get(PAGE).text
     assert "1 policy acts like cDBS" in page
     assert "1 policy acts like no stimulation" in page
-    table = page[page.index("Candidates against cDBS") : page.index("1 policy acts like cDBS")]
+    table = page[page.index("Expected change from cDBS") : page.index("1 policy acts like cDBS")]
     assert {i: f'/policies/{i}"' in table for i in policies} == {a: True, b: False, c: False}
 
 
