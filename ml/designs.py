@@ -233,7 +233,7 @@ class DrawDensity:
 
     def __post_init__(self) -> None:
         if not (0 <= self.low < 1 and 0 <= self.level <= 1):
-            raise ValueError(f"a level lies in [0, 1] and a bound in [0, 1), not {self.level} and {self.low}")
+            raise ValueError(f"a level must be in [0, 1] and a bound in [0, 1), not {self.level} and {self.low}")
 
     @property
     def near(self) -> tuple[float, float]:

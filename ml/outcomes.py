@@ -105,7 +105,7 @@ class Outcome:
     Attributes:
         key: its name in analyses. field: in tables, forms and the interface. column: in the data package.
         label: its whole name. short: the name in columns. noun: within a sentence. the_noun: as the subject of one.
-        unit: of a value. entry_unit: the same beside a field and in columns. sentence_unit: the same within a sentence.
+        unit: of a value. entry_unit: the same next to a field and in columns. sentence_unit: the same within a sentence.
         difference_unit: of a change. difference_words: the same within a sentence. contrast_unit: of the primary comparison.
         help: what is measured. explained: the same for a glossary.
         worse: the word for a worse value. note: for a reader of a value within a sentence.

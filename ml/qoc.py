@@ -82,7 +82,7 @@ def failed_qoc(measured: Iterable[Qoc]) -> Qoc:
 
 
 def grasp_frequency(open_fist_s: NDArray[np.float64]) -> float:
-    """Grasp frequency over one hand-grasp test (eq:grasp_speed).
+    """Compute the grasp frequency over one hand-grasp test (eq:grasp_speed).
 
     Args:
         open_fist_s: times of consecutive open fists, shape [N], seconds, strictly increasing.
@@ -102,7 +102,7 @@ def grasp_frequency(open_fist_s: NDArray[np.float64]) -> float:
 
 
 def tremor_percent(class_seconds: dict[str, float], session_s: float) -> float:
-    """Share of the session with mild or worse tremor (eq:tremor_severity), per cent.
+    """Compute the share of the session with mild or worse tremor (eq:tremor_severity), per cent.
 
     Args:
         class_seconds: seconds per class; `mild`, `moderate` and `strong` count, every other key does not.
@@ -130,7 +130,7 @@ class TremorReading:
         class_seconds: seconds of the session per class of `TREMOR_CLASSES`, by duration.
         session_s: length of the session, s.
         covered_s: seconds of it that minutes with divided tremor cover.
-        undivided_s: seconds of minutes that tell only all tremor together; not part of `covered_s`.
+        undivided_s: seconds of minutes that report only the sum of all tremor; not part of `covered_s`.
     """
 
     duration_weighted: float
@@ -142,7 +142,7 @@ class TremorReading:
 
     @property
     def unknown_s(self) -> float:
-        """Seconds in which the watch could not tell (mostly active movement); the paper counts them into the session."""
+        """Seconds in which the watch could not decide (mostly active movement); the paper counts them into the session."""
         return self.class_seconds["unknown"]
 
 
@@ -153,14 +153,14 @@ def read_tremor(
     session_start_s: float,
     session_s: float,
 ) -> TremorReading:
-    """QoC_tremor of one session (eq:tremor_severity) from minutes that each hold a share per class.
+    """Compute QoC_tremor of one session (eq:tremor_severity) from minutes that each hold a share per class.
 
     The paper speaks of one class per minute, the watch gives shares. Both readings are given, and they differ. Minutes at the ends of the
     session count by their overlap with it.
 
     Args:
         start_s, duration_s: begin and length of each minute's measurement, s, shape [n], in any order.
-        fractions: share per class in the order of `TREMOR_CLASSES`, shape [n, 6]; NaN where the export does not tell.
+        fractions: share per class in the order of `TREMOR_CLASSES`, shape [n, 6]; NaN where the export does not say.
         session_start_s: begin of the session on the minutes' clock, s.
         session_s: its length, s.
 
@@ -194,12 +194,12 @@ def read_tremor(
 
 
 def tremor_by_duration(fractions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shares of each minute as the watch reported them, shape [n, 6]; shares that it did not report are 0."""
+    """Return the shares of each minute as the watch reported them, shape [n, 6]; shares that it did not report are 0."""
     return np.nan_to_num(fractions, nan=0.0)
 
 
 def tremor_by_class(fractions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Each minute whole in its largest class, shape [n, 6] of 0 and 1: the paper's "one class per minute".
+    """Assign each minute whole to its largest class, shape [n, 6] of 0 and 1: the paper's "one class per minute".
 
     Of equal shares the class that comes first in `TREMOR_CLASSES` has the minute, so never the stronger tremor. Time that the export gives
     to no class counts as unknown.

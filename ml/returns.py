@@ -108,7 +108,7 @@ def gain(draws: Floats, reference: Floats, level: float = BOUND) -> Gain:
             f"and {reference.shape}"
         )
     if not 0 < level < 1:
-        raise ValueError(f"the level of a lower bound lies between 0 and 1, not at {level}")
+        raise ValueError(f"the level of a lower bound must be between 0 and 1, not {level}")
     differences = draws - reference
     if not np.isfinite(differences).all():
         raise ValueError("a draw of a return is not finite")

@@ -277,7 +277,7 @@ _SCHEMA_VERSION = 1
 _IMPUTED_SCHEMA_VERSION = 2
 """Of buffers whose windows may hold imputed values, which a reader of version 1 would not find. Values are stored as measured."""
 _HELD_SCHEMA_VERSION = 3
-"""Of buffers with held draws, whose steps a reader of version 2 would take for decisions of their own."""
+"""Version of buffers with sustained draws, whose steps a reader of version 2 would take for decisions of their own."""
 _STOPPED_SCHEMA_VERSION = 5
 """Version of buffers with stopped sessions, which a reader of version 3 would take as measured. Version 4 lacks what they count as."""
 

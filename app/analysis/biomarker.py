@@ -52,7 +52,7 @@ class Biomarker:
 
 
 def biomarker(db: Session, participant: Participant, caller: Caller) -> Biomarker:
-    """Associations of one participant, over the sessions that count."""
+    """Compute the associations of one participant over the sessions that count."""
     held = evidence(db, participant, caller)
     visits, _ = study.visits(db, participant.id, 1000, 0)
     days = {v.number: v.date.toordinal() for v in visits if v.date is not None}

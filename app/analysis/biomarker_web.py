@@ -63,7 +63,7 @@ _NUMBERS = ("slope", "low", "high", "p_value", "correlation", "correlation_low",
 
 
 def biomarker_out(found: Biomarker) -> BiomarkerOut:
-    """Everything of the page."""
+    """Convert the associations to the page's schema."""
     parts = {name: [_pairing(p) for p in getattr(found, name)] for name in ("beta", "progression", "medication")}
     return BiomarkerOut(participant=found.participant, beta_unit=found.beta_unit, **parts)
 
@@ -91,7 +91,7 @@ UNITS = {
 }  # fmt: skip
 
 FACTORS = {"amplitude": 100.0}
-"""Of what is stored in the unit that is shown; 1 where nothing stands here."""
+"""Factors of quantities that are stored in the unit that is shown; 1 for a quantity without an entry."""
 
 SCALE = ((0.0, "token:cdbs"), (1.0, "token:rl"))
 """Early visits to late ones, in colours that either theme shows on its ground."""
@@ -101,12 +101,12 @@ _STEP = 0.022
 
 
 def unit(name: str, beta_unit: str) -> str:
-    """The unit of an axis."""
+    """Return the unit of an axis."""
     return beta_unit if name == "mean_beta" else UNITS.get(name, "")
 
 
 def _some(visits: list[int]) -> list[int]:
-    """At most seven visits, the first and the last among them."""
+    """Choose at most seven visits, the first and the last among them."""
     step = max(1, -(-(len(visits) - 1) // 6))
     return [*visits[:-1:step], visits[-1]] if visits else []
 
@@ -117,7 +117,7 @@ def _round(value: float) -> float:
 
 
 def scatter(pair: Pairing, beta_unit: str) -> Chart:
-    """All sessions that have both, in the units of the axes."""
+    """Plot all sessions that have both measurements, in the units of the axes."""
     points = [(i, v, x * FACTORS.get(pair.x, 1.0), y * FACTORS.get(pair.y, 1.0)) for i, v, x, y in pair.points]
     visits, across = [p[1] for p in points], [p[2] for p in points]
     width = (max(across) - min(across)) or abs(across[0]) or 1.0 if across else 1.0
@@ -151,7 +151,7 @@ api = APIRouter(tags=["analysis"], responses=problems(401, 403, 404, 422))
 
 @api.get("/participants/{code}/analyses/beta")
 def read_biomarker(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> BiomarkerOut:
-    """Beta against amplitude and each QoC, cDBS sessions over the months, and the course after a dose; within and between visits."""
+    """Return beta against amplitude and each QoC, cDBS sessions over the months, and the course after a dose; within and between visits."""
     return biomarker_out(biomarker.biomarker(db, participant, caller))
 
 
@@ -160,7 +160,7 @@ pages = APIRouter()
 
 @pages.get("/participants/{code}/analyses/beta")
 def biomarker_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """Is beta a biomarker here, how did the months go, and what does a dose do?"""
+    """Show whether beta is a biomarker here, how the months went, and what a dose does."""
     found = biomarker.biomarker(db, participant, caller)
     pairs = [*found.beta, *found.progression, *found.medication]
     page = render(

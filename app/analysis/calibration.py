@@ -45,7 +45,7 @@ from ml.returns import KNOWN_SHARE
 #
 # The prediction of a visit is that of its signed plan: the evaluation which that pins; of a visit without one the newest. Nothing peeks:
 # only an evaluation counts that was stored before the service knew of any of the visit's sessions. Its own settings version, horizon H
-# and discount are applied to the sessions; sessions longer than H count to H, shorter ones by the mean of the steps that they have
+# and discount are applied to the sessions. Sessions longer than H count to H; shorter ones by the mean of the steps that they have
 # (`actual.actual`).
 
 
@@ -66,7 +66,7 @@ class _Before:
 
 
 def calibration(db: Session, participant: Participant, caller: Caller) -> CalibrationOut:
-    """Predicted against actual, of every policy that ran at a visit after an evaluation of it."""
+    """Compare predictions with results, for every policy that ran at a visit after an evaluation of it."""
     access.require(caller, can.READ, participant)
     made = repository.evaluation_times(db, participant.id)
     planned = plans.pinned_evaluations(db, participant.id)
@@ -108,7 +108,7 @@ def calibration(db: Session, participant: Participant, caller: Caller) -> Calibr
 
 
 def newest_before(made: Mapping[int, datetime], known_from: datetime) -> int | None:
-    """The newest evaluation that was stored before a moment."""
+    """Return the newest evaluation that was stored before a moment."""
     earlier = [i for i, at in made.items() if at < known_from]
     return max(earlier, key=lambda i: (made[i], i)) if earlier else None
 
@@ -125,7 +125,7 @@ def _load(db: Session, participant: Participant, evaluation_id: int, caller: Cal
 
 
 def _of_visit(before: _Before, visit: Visit) -> tuple[list[TestedPolicyOut], list[str]]:
-    """Every policy of a visit that the evaluation holds, and what of the visit it cannot be held against."""
+    """Compare every policy of a visit that the evaluation contains; list what of the visit cannot be compared with it."""
     by_policy: dict[int, list[DrivenSession]] = defaultdict(list)
     missed: list[str] = []
     for session in (r for r in before.ran if r.visit == visit.number):
@@ -176,7 +176,7 @@ def _tested(before: _Before, visit: Visit, policy_id: int, ran: Sequence[DrivenS
 
 
 def _prediction(method: str, estimate: Estimate, results: Sequence[Actual]) -> PredictionOut | None:
-    """One method against the sessions; None where none has the return that it speaks of."""
+    """Compare one method with the sessions; None where no session has the return that the method predicts."""
     whole = estimate.end_reward is not None
     values = [a.value if whole else a.step_return for a in results]
     returns = tuple(v for v in values if v is not None)
@@ -207,7 +207,7 @@ def _prediction(method: str, estimate: Estimate, results: Sequence[Actual]) -> P
 
 
 def _metrics(method: str, policies: Sequence[TestedPolicyOut]) -> list[AccuracyOut]:
-    """Metrics of a method over candidate policies; cDBS, which nobody chooses by an estimate, is shown and not counted."""
+    """Compute the metrics of a method over candidate policies; cDBS, which is never chosen by an estimate, is shown and not counted."""
     pairs = [
         Pair(p.visit, q.predicted, q.low, q.high, tuple(q.session_returns))
         for p in policies
@@ -233,7 +233,7 @@ def _quantity_errors(methods: Sequence[str], policies: Sequence[TestedPolicyOut]
 
 
 def _missing(made: Mapping[int, datetime], visited: bool, policies: Sequence[TestedPolicyOut]) -> str | None:
-    """The first check that failed; None where there is something to compare."""
+    """Name the first check that failed; None where there is something to compare."""
     if any(p.reference is None for p in policies):
         return None
     if not made:
@@ -253,7 +253,7 @@ FEW_PAIRS = 8
 
 
 def in_sentences(found: CalibrationOut, method: str) -> list[str]:
-    """The method's record over all visits; empty where nothing of it could be compared.
+    """Describe the method's record over all visits; empty where nothing of it could be compared.
 
     Args:
         found: the calibration. method: one of its methods.

@@ -28,12 +28,12 @@ class QuantityOut(Model):
 
 
 class PredictionOut(Model):
-    """What one method had said of a policy before a visit."""
+    """Prediction of a policy by one method before a visit."""
 
     method: str
     supported: bool
     parts: Literal["return", "steps"] = Field(
-        description="`steps`: the method had no r_end to learn, so it is held against the step returns alone."
+        description="`steps`: the method had no r_end to learn, so it is compared with the step returns alone."
     )
     predicted: float
     low: float
@@ -59,7 +59,7 @@ class TestedPolicyOut(Model):
     policy_id: int
     name: str
     kind: str
-    reference: str | None = Field(description="`cdbs` for sessions of cDBS, shown beside the policies; null for policies.")
+    reference: str | None = Field(description="`cdbs` for sessions of cDBS, shown next to the policies; null for policies.")
     horizon_steps: int
     gamma: float
     sessions: int
@@ -118,11 +118,11 @@ class CalibrationOut(Model):
 
 # The paper's metrics of estimates against actual returns, with intervals over visits.
 #
-# A pair is a policy at a visit: what the visit's plan had predicted of it, and the mean return of its sessions there; a policy tested at
+# A pair is a policy at a visit: what the visit's plan had predicted of it, and the mean return of its sessions there. A policy tested at
 # two visits is two pairs. Visits are what is resampled, whole: sessions of one day share medication, sleep and the state of the
 # participant. `ml.ope.compare.metrics` gives the values, the arrays here the same metrics of every resample at once. Nothing is divided
-# by a range, or a best return, that is no larger than what tells two returns apart (`least_range`). Source: Gao et al. 2023, appendix on
-# the metrics of off-policy evaluation.
+# by a range, or a best return, that is no larger than the least distinguishable difference (`least_range`). Source: Gao et al. 2023,
+# appendix on the metrics of off-policy evaluation.
 
 Floats = NDArray[np.float64]
 
@@ -135,7 +135,7 @@ FEWEST_VISITS = 5
 DEFINED_SHARE = 0.5
 """Least share of resamples in which a metric must be defined for its interval to be given."""
 SMALL_SHARE = 0.05
-"""Where no policy has two sessions at a visit, returns closer than this share of the largest one are not told apart."""
+"""Where no policy has two sessions at a visit, returns closer than this share of the largest one count as equal."""
 LEAST_SHARE = 0.01
 """The same where policies have several: few sessions can chance to agree, or be the same session entered twice."""
 WITHIN_NOISE = "the actual returns lie closer together than sessions of one policy do"
@@ -162,7 +162,7 @@ class Pair:
 
 
 def mean_interval(returns: Sequence[float], level: float = LEVEL) -> tuple[float, float] | None:
-    """Percentile bootstrap of a mean over sessions; None below `FEWEST_SESSIONS`."""
+    """Bootstrap a mean over sessions (percentile interval); None below `FEWEST_SESSIONS`."""
     values = np.asarray(returns, dtype=np.float64)
     if values.size < FEWEST_SESSIONS:
         return None
@@ -171,10 +171,10 @@ def mean_interval(returns: Sequence[float], level: float = LEVEL) -> tuple[float
 
 
 def least_range(pairs: Sequence[Pair]) -> float:
-    """The range of actual returns that must be exceeded for a share of it to mean something, in units of the return.
+    """Return the range of actual returns that must be exceeded for a share of it to mean something, in units of the return.
 
-    The pooled standard deviation between sessions of one policy at one visit; where no policy has two, or they agree by chance, a small
-    share of the largest return.
+    It is the pooled standard deviation between sessions of one policy at one visit. Where no policy has two, or they agree by chance, it is
+    a small share of the largest return.
     """
     largest = max(abs(p.actual) for p in pairs)
     repeated = [np.asarray(p.returns) for p in pairs if len(p.returns) > 1]
@@ -185,7 +185,7 @@ def least_range(pairs: Sequence[Pair]) -> float:
 
 
 def accuracies(method: str, pairs: Sequence[Pair]) -> list[AccuracyOut]:
-    """Metrics of one method: over all visits, then of each visit, which alone has no interval."""
+    """Compute the metrics of one method: over all visits, then of each visit, which has no interval."""
     visits = sorted({p.visit for p in pairs})
     floor = least_range(pairs)
     return [_over_visits(method, pairs, floor)] + [_of_visit(method, [p for p in pairs if p.visit == v], v, floor) for v in visits]
@@ -211,7 +211,7 @@ def _of_visit(method: str, pairs: Sequence[Pair], visit: int, floor: float) -> A
 
 
 def _over_visits(method: str, pairs: Sequence[Pair], floor: float) -> AccuracyOut:
-    """MAE and rank correlation over all pairs; regret, which chooses among the policies of one visit, as the mean over visits."""
+    """Compute MAE and rank correlation over all pairs; regret, which chooses among the policies of one visit, as the mean over visits."""
     found = accuracy([p.actual for p in pairs], [p.predicted for p in pairs], least_range=floor)
     by_visit = [[p for p in pairs if p.visit == v] for v in sorted({p.visit for p in pairs})]
     means, estimated, drawn = _resampled(by_visit)
@@ -241,7 +241,7 @@ def _over_visits(method: str, pairs: Sequence[Pair], floor: float) -> AccuracyOu
 
 
 def _regret_of(pairs: Sequence[Pair], floor: float, name: str) -> float:
-    """One form of regret@1 among the policies of a visit; NaN where it has none."""
+    """Compute one form of regret@1 among the policies of a visit; NaN where it has none."""
     if len(pairs) < 2:
         return float("nan")
     value = getattr(accuracy([p.actual for p in pairs], [p.predicted for p in pairs], least_range=floor), name)
@@ -249,7 +249,7 @@ def _regret_of(pairs: Sequence[Pair], floor: float, name: str) -> float:
 
 
 def rank_correlations(means: Floats, estimated: Floats) -> Floats:
-    """Spearman's correlation of every row of means [D, C] with its estimates; NaN cells are left out; NaN where one side is flat."""
+    """Compute Spearman's correlation of every row of means [D, C] with its estimates; ignore NaN cells; NaN where one side is flat."""
     there = np.isfinite(means)
     ours, theirs = _ranks(means, there), _ranks(np.where(there, estimated, np.nan), there)
     top = np.nansum(ours * theirs, axis=1)
@@ -258,8 +258,9 @@ def rank_correlations(means: Floats, estimated: Floats) -> Floats:
 
 
 def _resampled(by_visit: Sequence[Sequence[Pair]]) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """Visits drawn with replacement: actual means and estimates of their pairs, [DRAWS, most pairs], NaN where a row has fewer, and the
-    drawn visits, [DRAWS, visits]."""
+    """Draw visits with replacement. Returns the actual means and the estimates of their pairs, [DRAWS, most pairs], NaN where a row has
+    fewer, and the drawn visits, [DRAWS, visits].
+    """
     drawn = resamples(len(by_visit), DRAWS, 0)
     most = len(by_visit) * max(len(own) for own in by_visit)
     filled = np.full((2, len(by_visit), most // len(by_visit)), np.nan)
@@ -271,7 +272,7 @@ def _resampled(by_visit: Sequence[Sequence[Pair]]) -> tuple[Floats, Floats, NDAr
 
 
 def _metric(visits: int) -> Callable[..., MethodMetricOut]:
-    """Makes a metric of its value and of that of every resample."""
+    """Return a function that makes a metric of its value and of that of every resample."""
 
     def make(value: float | None, draws: Floats, missing: str = "") -> MethodMetricOut:
         if value is None:
@@ -286,7 +287,7 @@ def _metric(visits: int) -> Callable[..., MethodMetricOut]:
 
 
 def _plain(value: float | None, missing: str = "") -> MethodMetricOut:
-    """A metric without an interval, or the reason why there is none."""
+    """Make a metric without an interval, or with the reason why there is no value."""
     return MethodMetricOut(value=value, low=None, high=None, missing=missing if value is None else "")
 
 
@@ -295,7 +296,7 @@ def _covered(pairs: Sequence[Pair]) -> MethodMetricOut:
 
 
 def _ranks(values: Floats, there: NDArray[np.bool_]) -> Floats:
-    """Mean ranks of every row less their mean, NaN where a cell is missing; NaN compares as neither less nor equal."""
+    """Compute mean ranks of every row less their mean, NaN where a cell is missing; NaN compares as neither less nor equal."""
     less = (values[:, None, :] < values[:, :, None]).sum(2)
     equal = (values[:, None, :] == values[:, :, None]).sum(2)
     ranks = np.where(there, less + 0.5 * (equal + 1), np.nan)
@@ -307,14 +308,14 @@ def _mae(means: Floats, estimated: Floats) -> Floats:
 
 
 def _range(means: Floats, floor: float) -> Floats:
-    """Range of every row; NaN where it is no larger than the floor."""
+    """Compute the range of every row; NaN where it is no larger than the floor."""
     there = np.isfinite(means)
     spread = np.where(there, means, -np.inf).max(1) - np.where(there, means, np.inf).min(1)
     return np.asarray(np.where(spread > floor, spread, np.nan), dtype=np.float64)
 
 
 def _nan_mean(values: Floats) -> Floats:
-    """Mean of the known values of every row; NaN where none is known."""
+    """Average the known values of every row; NaN where none is known."""
     there = np.isfinite(values)
     count = there.sum(1)
     return np.asarray(np.where(count > 0, np.where(there, values, 0.0).sum(1) / np.maximum(count, 1), np.nan), dtype=np.float64)

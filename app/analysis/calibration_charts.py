@@ -29,12 +29,12 @@ Point = tuple[TestedPolicyOut, PredictionOut]
 
 
 def label(p: TestedPolicyOut) -> str:
-    """A policy at a visit."""
+    """Label a policy at a visit."""
     return f"{'cDBS (reference)' if p.reference else p.name}, visit {p.visit}"
 
 
 def returns(found: CalibrationOut, method: str) -> Chart:
-    """Actual against predicted return by one method, with the line on which they agree."""
+    """Plot actual against predicted return by one method, with the line on which they agree."""
     shown = [(p, q) for p in found.policies for q in p.predictions if q.method == method]
     bars = [v for _, q in shown for v in (q.predicted, q.low, q.high, q.actual, q.actual_low, q.actual_high) if v is not None]
     square = _square(bars, bars)
@@ -65,7 +65,7 @@ def returns(found: CalibrationOut, method: str) -> Chart:
 
 
 def metrics(found: CalibrationOut) -> Chart:
-    """MAE, rank correlation and regret of every method over all visits, side by side, with intervals over resampled visits."""
+    """Plot MAE, rank correlation and regret of every method over all visits, side by side, with intervals over resampled visits."""
     rows = [m for m in found.metrics if m.visit is None]
     names = [method_of(m.method).short for m in rows]
     data: list[dict[str, Any]] = []
@@ -114,9 +114,9 @@ def metrics(found: CalibrationOut) -> Chart:
 
 
 def over_visits(found: CalibrationOut, method: str) -> Chart | None:
-    """The three metrics of every method at each visit, side by side; None where there are not two visits to compare.
+    """Plot the three metrics of every method at each visit, side by side; None where there are not two visits to compare.
 
-    The shown method is drawn strongly with its intervals, the others thinly beside it.
+    The shown method is drawn strongly with its intervals, the others thinly.
     """
     rows = [m for m in found.metrics if m.visit is not None]
     visits = sorted({m.visit for m in rows if m.visit is not None})
@@ -178,7 +178,7 @@ def over_visits(found: CalibrationOut, method: str) -> Chart | None:
 
 
 def quantities(found: CalibrationOut, method: str) -> list[Chart]:
-    """Actual against predicted, of every outcome that the method predicts."""
+    """Plot actual against predicted values of every outcome that the method predicts."""
     points = [(p, q) for p in found.policies for q in p.predictions if q.method == method]
     charts = []
     for name, (title, unit, factor) in QUANTITY_NAMES.items():
@@ -220,7 +220,7 @@ def quantities(found: CalibrationOut, method: str) -> list[Chart]:
 
 
 def _n(compared: Sequence[tuple[TestedPolicyOut, int]]) -> str:
-    """How many points and sessions; cDBS is named apart, since it is not counted in the metrics."""
+    """Count the points and sessions; cDBS is counted apart, since the metrics exclude it."""
     policies = sum(p.reference is None for p, _ in compared)
     beside = len(compared) - policies
     references = f" and {beside} of cDBS" if beside else ""
@@ -228,7 +228,7 @@ def _n(compared: Sequence[tuple[TestedPolicyOut, int]]) -> str:
 
 
 def _square(values: Sequence[float], everything: Sequence[float]) -> dict[str, Any]:
-    """Layout members: both axes over one range that holds the values, and the line on which predicted and actual agree, over everything."""
+    """Build layout members: both axes over one range of the values, and the line on which predicted and actual agree, over everything."""
     low, high = min(values), max(values)
     margin = 0.06 * (high - low) or 1.0
     ends = [min(low - margin, *everything), max(high + margin, *everything)]
@@ -240,7 +240,7 @@ def _trace(method: str, points: Sequence[Point]) -> dict[str, Any]:
     marks = style(method)
 
     def bars(of: Callable[[PredictionOut], tuple[float | None, float, float | None]]) -> dict[str, Any]:
-        """Error bars from (low, value, high); none where an end is unknown."""
+        """Build error bars from (low, value, high); none where an end is unknown."""
         ends = [of(q) for _, q in points]
         return {
             "type": "data",

@@ -35,7 +35,7 @@ _OF_PREDICTION = ("method", "supported", "parts", "predicted", "low", "high", "l
 
 
 def calibration_to_csv(found: CalibrationOut) -> str:
-    """One row per visit, policy and method: what had been predicted, and what the sessions brought."""
+    """Write one row per visit, policy and method: the prediction, and the result of the sessions."""
     sink = io.StringIO()
     out = csv.writer(sink, lineterminator="\n")
     shown = [f"{name}_{part}" for name in QUANTITIES for part in ("predicted", "actual")]
@@ -52,7 +52,7 @@ def calibration_to_csv(found: CalibrationOut) -> str:
 
 
 def calibration_csv_of(found: CalibrationOut) -> Response:
-    """A calibration as a CSV download."""
+    """Serve a calibration as a CSV download."""
     return download(calibration_to_csv(found), f"{found.participant}-calibration.csv")
 
 
@@ -73,7 +73,7 @@ def read_calibration(
     caller: CurrentCaller,
     format: Annotated[Literal["json", "csv"], Query(description="csv: one row per visit, policy and method.")] = "json",
 ) -> CalibrationOut | Response:
-    """Estimates made before each visit against what the visit brought, and the metrics of every method."""
+    """Return estimates made before each visit against the results of the visit, and the metrics of every method."""
     found = calibration_rules.calibration(db, participant, caller)
     return calibration_csv_of(found) if format == "csv" else found
 
@@ -85,7 +85,7 @@ pages = APIRouter()
 def calibration_page(
     request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller, method: str | None = None
 ) -> HTMLResponse:
-    """Predicted against actual, by one method on top and by every method in the tables."""
+    """Show predicted against actual results, by one method on top and by every method in the tables."""
     found = calibration(db, participant, caller)
     if method and method not in found.methods:
         known = f"Choose one of {', '.join(found.methods)}." if found.methods else "Nothing can be compared yet."
@@ -113,5 +113,5 @@ def calibration_page(
 
 @pages.get("/participants/{code}/calibration.csv")
 def calibration_csv(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
-    """The calibration as CSV."""
+    """Download the calibration as CSV."""
     return calibration_csv_of(calibration(db, participant, caller))

@@ -1,4 +1,4 @@
-"""What stimulation took, by several measures, each with its definition; and what a battery would make of it."""
+"""Energy of stimulation by several measures, each with its definition, and the battery life that follows."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class MeasureOut(Model):
 
 
 class EnergyOut(Model):
-    """What stimulation took, by controller and measure."""
+    """Energy of stimulation, by controller and measure."""
 
     participant: str
     rows: list[MeasureOut]
@@ -89,9 +89,9 @@ class BatteryOut(Model):
 
 # Measures of the stimulation of a session, over all its sides and programs where their pulses are logged. No database.
 #
-# With current I (A), pulse width w (s), rate f (Hz) and impedance R (ohm): charge per second I w f, and total electrical energy delivered
-# per second I^2 R w f (Koss et al. 2005, for currents), each summed over sides and programs. Relative to cDBS both are shares of what the
-# cDBS amplitude would have taken with the same pulses.
+# With current I (A), pulse width w (s), rate f (Hz) and impedance R (ohm): charge per second is I w f. Total electrical energy delivered
+# per second is I^2 R w f (Koss et al. 2005, for currents). Each is summed over sides and programs. Relative to cDBS both are shares of what
+# the cDBS amplitude would have taken with the same pulses.
 
 
 class Measure(StrEnum):
@@ -114,7 +114,7 @@ class Pulses:
 
 @dataclass(frozen=True)
 class Taken:
-    """What one session took, by measure, absent where not known; `unknown_sides` have no logged width or rate or amplitude in mA."""
+    """Energy of one session, by measure, absent where not known; `unknown_sides` have no logged width or rate or amplitude in mA."""
 
     session: Facts
     values: Mapping[Measure, float]
@@ -122,7 +122,7 @@ class Taken:
 
 
 def pulses_of(events: Sequence[Mapping[str, object]], program: int, start_s: float, stop_s: float) -> Pulses:
-    """Pulses of a program over a stretch of a recording, from its logged states of stimulation in time order.
+    """Find the pulses of a program over a stretch of a recording, from its logged states of stimulation in time order.
 
     The state in force at the start counts; where a later state within the stretch has another width or rate, neither is known.
     """
@@ -137,10 +137,10 @@ def pulses_of(events: Sequence[Mapping[str, object]], program: int, start_s: flo
 
 
 def taken(session: Facts, pulses: Mapping[tuple[int, int], Pulses], impedance_ohm: float | None) -> Taken:
-    """The measures of one session.
+    """Compute the measures of one session.
 
     Args:
-        pulses: by recording and program. impedance_ohm: of the therapy contacts, where somebody states it.
+        pulses: by recording and program. impedance_ohm: of the therapy contacts, None where not stated.
     """
     values: dict[Measure, float] = {}
     if session.mean_fraction is not None:
@@ -159,7 +159,7 @@ def taken(session: Facts, pulses: Mapping[tuple[int, int], Pulses], impedance_oh
 
 
 def _all_sides(sides: Sequence[Side], pulses: Mapping[tuple[int, int], Pulses]) -> float | None:
-    """Energy of all sides and programs relative to their cDBS amplitudes; with one side its mean a^2, whatever its pulses.
+    """Compute the energy of all sides and programs relative to their cDBS amplitudes; with one side its mean a^2, whatever its pulses.
 
     A silent side took nothing and would have taken its share under cDBS, for which its pulses must be known; 0 where all were silent.
     """
@@ -178,7 +178,7 @@ def _all_sides(sides: Sequence[Side], pulses: Mapping[tuple[int, int], Pulses]) 
 
 
 def _complete(side: Side, pulses: Mapping[tuple[int, int], Pulses]) -> tuple[float, float] | None:
-    """Width and rate of a side whose amplitude in mA is known too; without any current they do not matter."""
+    """Return width and rate of a side whose amplitude in mA is known too; without any current they do not matter."""
     if side.milliamperes == 0:
         return 0.0, 0.0
     width, rate = _pulses(side, pulses)
@@ -186,13 +186,13 @@ def _complete(side: Side, pulses: Mapping[tuple[int, int], Pulses]) -> tuple[flo
 
 
 def _pulses(side: Side, pulses: Mapping[tuple[int, int], Pulses]) -> tuple[float | None, float | None]:
-    """Width (us) and rate (Hz) of a side's program, None where not known."""
+    """Look up width (us) and rate (Hz) of a side's program, None where not known."""
     found = pulses.get((side.recording_id or 0, side.program), Pulses(None, None))
     return found.width_us, found.rate_hz
 
 
 def mean(values: Sequence[float]) -> float | None:
-    """Mean over sessions; None without any."""
+    """Average over sessions; None without any."""
     return float(np.mean(values)) if values else None
 
 
@@ -202,7 +202,7 @@ def _t(event: Mapping[str, object]) -> float:
 
 
 def _state(event: Mapping[str, object], program: int) -> tuple[float | None, float | None] | None:
-    """Width and rate of a program in one state; None where it does not stimulate there."""
+    """Return width and rate of a program in one state; None where it does not stimulate there."""
     data = event.get("data")
     if not isinstance(data, Mapping):
         return None
@@ -257,7 +257,7 @@ class Energy:
 
 
 def energy(db: Session, participant: Participant, caller: Caller, impedance_ohm: float | None = None) -> Energy:
-    """The measures of every session and their means by controller."""
+    """Compute the measures of every session and their means by controller."""
     held = evidence(db, participant, caller)
 
     def compute() -> Energy:
@@ -271,7 +271,7 @@ def energy(db: Session, participant: Participant, caller: Caller, impedance_ohm:
 
 
 def battery(found: Energy, stated: ImplantIn) -> list[BatteryRow]:
-    """Days of one charge if a controller ran all the time, at the mean and mean square of its amplitude fraction.
+    """Estimate the days of one charge if a controller ran all the time, at the mean and mean square of its amplitude fraction.
 
     Args:
         found: the energy. stated: assumptions about the implant.
@@ -287,7 +287,7 @@ def battery(found: Energy, stated: ImplantIn) -> list[BatteryRow]:
 
 
 def _life(found: Energy, implant: Implant, controller: Controller, cdbs_ma: float) -> BatteryRow | None:
-    """None where no session of the controller has an amplitude."""
+    """Estimate the battery life under one controller; None where no session of the controller has an amplitude."""
     mine = [t for t in found.sessions if t.session.controller is controller and {Measure.SQUARE, Measure.AMPLITUDE} <= t.values.keys()]
     square, amplitude = (mean([t.values[m] for t in mine]) for m in (Measure.SQUARE, Measure.AMPLITUDE))
     if square is None or amplitude is None:
@@ -298,7 +298,7 @@ def _life(found: Energy, implant: Implant, controller: Controller, cdbs_ma: floa
 
 
 def _implant(stated: ImplantIn) -> Implant:
-    """Raises Invalid for a range that falls."""
+    """Build the implant from the stated assumptions. Raises Invalid for a range that falls."""
 
     def exactly(value: float) -> Range:
         return Range(value, value)
@@ -327,7 +327,7 @@ def _row(measure: Measure, controller: Controller, sessions: Sequence[Taken]) ->
 
 
 def _pulses_of_sessions(db: Session, held: Evidence) -> dict[int, Mapping[tuple[int, int], Pulses]]:
-    """Logged pulses by session, then by recording and program."""
+    """Collect logged pulses by session, then by recording and program."""
     wanted = {side.recording_id for s in held.sessions for side in s.sides if side.recording_id is not None}
     events = evidence_rules.stimulation_events(db, wanted)
     spans = evidence_rules.spans(db, [s.session_id for s in held.sessions])
@@ -345,7 +345,7 @@ def _of_session(
     return found
 
 
-# What each measure of energy is, in words that stand beside its number.
+# What each measure of energy is, in words next to its number.
 
 SHARES = {Measure.AMPLITUDE, Measure.SQUARE, Measure.ALL_SIDES}
 """Measures that are shares of what cDBS takes: pages show them in % of cDBS, files and the API as they are."""

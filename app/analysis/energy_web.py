@@ -28,7 +28,7 @@ BATTERY_COLUMNS = ("participant", "controller", "days_low", "days_high", "sessio
 
 
 def energy_out(found: Energy) -> EnergyOut:
-    """All measures of all controllers."""
+    """Convert all measures of all controllers to the schema."""
     rows = []
     for r in found.rows:
         title, unit, definition = MEASURES[r.measure]
@@ -48,7 +48,7 @@ def energy_out(found: Energy) -> EnergyOut:
 
 
 def csv_rows(found: Energy) -> list[tuple[object, ...]]:
-    """One row per measure and controller."""
+    """List one row per measure and controller."""
     return [
         (found.participant, r.measure, r.unit, r.controller.value, r.mean, r.saved_percent, len(r.session_ids), r.definition)
         for r in energy_out(found).rows
@@ -56,7 +56,7 @@ def csv_rows(found: Energy) -> list[tuple[object, ...]]:
 
 
 def battery_out(found: Energy, rows: Sequence[BatteryRow], stated: ImplantIn) -> BatteryOut:
-    """Days of every controller."""
+    """Convert the battery days of every controller to the schema."""
     days = [
         BatteryRowOut(controller=r.controller, days_low=r.days.low, days_high=r.days.high, session_ids=list(r.session_ids)) for r in rows
     ]
@@ -64,7 +64,7 @@ def battery_out(found: Energy, rows: Sequence[BatteryRow], stated: ImplantIn) ->
 
 
 def battery_csv_rows(found: Energy, rows: Sequence[BatteryRow], stated: ImplantIn) -> list[tuple[object, ...]]:
-    """One row per controller, with the assumptions."""
+    """List one row per controller, with the assumptions."""
     assumed = [getattr(stated, name) for name in ImplantIn.model_fields]
     return [(found.participant, r.controller.value, r.days.low, r.days.high, len(r.session_ids), *assumed) for r in rows]
 
@@ -86,7 +86,9 @@ def read_energy(
     impedance_ohm: Annotated[float | None, Query(gt=0, le=100_000, allow_inf_nan=False, description="Of the contacts, for TEED.")] = None,
     format: Annotated[Literal["json", "csv"], Query()] = "json",
 ) -> EnergyOut | Response:
-    """What stimulation took by controller: mean a, a squared, all sides and programs, charge, and TEED where an impedance is stated."""
+    """Return the energy of stimulation by controller: mean a, a squared, all sides and programs, charge, and TEED where an impedance is
+    stated.
+    """
     found = energy.energy(db, participant, caller, impedance_ohm)
     if format == "csv":
         return download(csv_of(CSV_COLUMNS, csv_rows(found)), f"{participant.code}-energy.csv")
@@ -101,7 +103,7 @@ def read_energy(
 def read_battery(
     participant: CurrentParticipant, db: Db, caller: CurrentCaller, stated: Annotated[BatteryIn, Query()]
 ) -> BatteryOut | Response:
-    """Days of one charge, or of a primary cell, if a controller ran all the time; under assumptions that the query states."""
+    """Return the days of one charge, or of a primary cell, if a controller ran all the time; under assumptions that the query states."""
     found = energy.energy(db, participant, caller)
     rows = energy.battery(found, stated)
     if stated.format == "csv":
@@ -133,7 +135,7 @@ def energy_page(
     caller: CurrentCaller,
     impedance: Annotated[float | None, Query(gt=0, le=100_000, allow_inf_nan=False)] = None,
 ) -> HTMLResponse:
-    """Every measure of energy with its definition; days of a battery under assumptions that the page's form states."""
+    """Show every measure of energy with its definition; days of a battery under assumptions that the page's form states."""
     found = energy.energy(db, participant, caller, impedance)
     typed = {name: request.query_params.get(name, "") for name in FIELDS}
     rows, problem, implant = list[energy.BatteryRow](), None, None
@@ -163,5 +165,5 @@ def energy_page(
 
 @pages.get("/participants/{code}/analyses/energy.csv")
 def energy_table(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
-    """Every measure of energy as a table."""
+    """Download every measure of energy as a table."""
     return download(csv_of(CSV_COLUMNS, csv_rows(energy.energy(db, participant, caller))), f"{participant.code}-energy.csv")

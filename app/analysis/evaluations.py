@@ -23,14 +23,14 @@ from ml.ope import accuracy, shown
 
 
 def evaluations(db: Session, participant_id: int) -> Sequence[Evaluation]:
-    """A participant's evaluations with their estimates less the details of these, oldest first."""
+    """Load a participant's evaluations with their estimates less the details of these, oldest first."""
     query = select(Evaluation).where(Evaluation.participant_id == participant_id).order_by(Evaluation.id)
     wanted = selectinload(Evaluation.estimates).load_only(EstimateRow.policy_id, EstimateRow.method, EstimateRow.value)
     return db.scalars(query.options(wanted)).all()
 
 
 def sessions_of_snapshot(db: Session, snapshot_id: int) -> set[int]:
-    """Sessions that a snapshot rests on, left-out ones included: their outcomes were there to be seen."""
+    """Return the sessions that a snapshot rests on, excluded ones too: their outcomes could be seen."""
     return set(db.scalars(select(SnapshotSession.session_id).where(SnapshotSession.snapshot_id == snapshot_id)))
 
 
@@ -64,9 +64,9 @@ class BySeed:
     """The snapshot with most seeds under one horizon, settings version and preset, newest first among equals.
 
     Attributes:
-        snapshot_id: None without an evaluation. seeds: that were run on it. rows: where later sessions tell. policies: estimated under
-            every seed, with a return after the snapshot; the errors are of these. sessions: ids of the sessions after the snapshot that
-            those returns are of.
+        snapshot_id: None without an evaluation. seeds: that were run on it. rows: where later sessions have returns. policies: estimated
+            under every seed, with a return after the snapshot (the errors are of these). sessions: ids of the sessions after the snapshot
+            that those returns are of.
     """
 
     participant: str
@@ -78,11 +78,11 @@ class BySeed:
 
 
 def by_seed(db: Session, participant: Participant, caller: Caller) -> BySeed:
-    """Errors of every method and seed on one snapshot; raises Forbidden as `app.study.blinding`."""
+    """Compute the errors of every method and seed on one snapshot; raises Forbidden as `app.study.blinding`."""
     alike: dict[tuple[int, int, int, str], dict[int, Evaluation]] = defaultdict(dict)
     for one in evaluations(db, participant.id):
-        # seeds are compared where nothing else differs: returns under another horizon or settings are other numbers, and a quick
-        # estimate is not one of full size
+        # Seeds are compared where nothing else differs. Returns under another horizon or settings are other numbers; a quick estimate is
+        # not one of full size
         key = (one.snapshot_id, one.settings_version_id, one.horizon_steps, str(one.config.get("preset", "")))
         alike[key][int(one.config.get("seed", 0))] = one
     if not alike:
@@ -100,13 +100,13 @@ def by_seed(db: Session, participant: Participant, caller: Caller) -> BySeed:
 
 
 def _later_sessions(db: Session, evaluation: Evaluation, caller: Caller) -> list[DrivenSession]:
-    """Sessions of policies that the snapshot does not hold."""
+    """Return the sessions of policies that are not in the snapshot."""
     seen = sessions_of_snapshot(db, evaluation.snapshot_id)
     return [s for s in driven_sessions(db, db.get_one(BufferSnapshot, evaluation.snapshot_id), caller) if s.session_id not in seen]
 
 
 def _returns(db: Session, evaluation: Evaluation, ran: list[DrivenSession]) -> dict[int, float]:
-    """Mean return by policy of sessions, under the evaluation's settings, horizon and discount."""
+    """Average the return of sessions by policy, under the evaluation's settings, horizon and discount."""
     settings = mdp_settings(study.settings_version(db, evaluation.settings_version_id))
     results = results_by_policy(ran, settings, evaluation.horizon_steps, None)
     return {i: r.mean_return for i, r in results.items() if r.mean_return is not None}

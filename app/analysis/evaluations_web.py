@@ -60,7 +60,7 @@ CSV_COLUMNS = (
 
 
 def by_seed_out(found: BySeed) -> BySeedOut:
-    """Everything of the page."""
+    """Convert the comparison by seed to the page's schema."""
     return BySeedOut(
         participant=found.participant,
         snapshot_id=found.snapshot_id,
@@ -72,7 +72,7 @@ def by_seed_out(found: BySeed) -> BySeedOut:
 
 
 def missing(found: BySeed) -> str:
-    """What the figure lacks, in words."""
+    """Say in words what the figure lacks."""
     if found.snapshot_id is None:
         return "No evaluation has been made yet."
     if found.policies < LEAST_POLICIES:
@@ -86,7 +86,7 @@ def missing(found: BySeed) -> str:
 
 
 def csv_rows(found: BySeed) -> list[tuple[object, ...]]:
-    """One row per method and seed."""
+    """List one row per method and seed."""
     return [(found.participant, found.snapshot_id, *asdict(r).values()) for r in found.rows]
 
 
@@ -100,12 +100,12 @@ METRICS = {
 
 
 def charts(found: BySeed) -> list[Chart]:
-    """One chart per metric that some method has."""
+    """Plot one chart per metric that some method has."""
     return [c for c in (_chart(found, name) for name in METRICS) if c.rows]
 
 
 def panels(found: BySeed) -> list[Panel]:
-    """The same for an SVG."""
+    """Build the panels of the SVG, one per metric."""
     made = []
     for name, (title, unit) in METRICS.items():
         by_method = _by_method(found, name)
@@ -159,12 +159,12 @@ def _chart(found: BySeed, metric: str) -> Chart:
 
 
 def table_of(found: BySeed) -> Response:
-    """One row per method and seed."""
+    """Serve a table with one row per method and seed."""
     return download(csv_of(CSV_COLUMNS, csv_rows(found)), f"{found.participant}-methods-by-seed.csv")
 
 
 def figure_of(found: BySeed, *, synthetic: bool) -> Response:
-    """A panel per metric, a point per seed."""
+    """Serve the figure: a panel per metric, a point per seed."""
     note = f"Snapshot {found.snapshot_id}, seeds {', '.join(map(str, found.seeds))}; against sessions recorded after the snapshot."
     note = f"{SYNTHETIC} {note}" if synthetic else note
     shown = panels(found) if found.rows else []
@@ -188,7 +188,7 @@ def read_by_seed(
     caller: CurrentCaller,
     format: Annotated[Literal["json", "csv", "svg"], Query()] = "json",
 ) -> BySeedOut | Response:
-    """Every method of evaluation over seeds on one snapshot, against the returns of the sessions recorded after it."""
+    """Return every method of evaluation over seeds on one snapshot, against the returns of the sessions recorded after it."""
     found = evaluations.by_seed(db, participant, caller)
     if format != "json":
         return table_of(found) if format == "csv" else figure_of(found, synthetic=participant.synthetic)
@@ -200,7 +200,7 @@ pages = APIRouter()
 
 @pages.get("/participants/{code}/analyses/evaluations")
 def by_seed_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """How well each method did on one snapshot, by seed."""
+    """Show how well each method did on one snapshot, by seed."""
     found = evaluations.by_seed(db, participant, caller)
     page = render(
         request,
@@ -217,11 +217,11 @@ def by_seed_page(request: Request, participant: CurrentParticipant, db: Db, call
 
 @pages.get("/participants/{code}/analyses/evaluations.csv")
 def by_seed_table(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
-    """Methods by seed as a table."""
+    """Download methods by seed as a table."""
     return table_of(evaluations.by_seed(db, participant, caller))
 
 
 @pages.get("/participants/{code}/analyses/evaluations.svg")
 def by_seed_figure(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
-    """Methods by seed as a figure."""
+    """Download methods by seed as a figure."""
     return figure_of(evaluations.by_seed(db, participant, caller), synthetic=participant.synthetic)

@@ -1,4 +1,4 @@
-"""What every session of a participant contributes to the analyses, read at once and kept until one of its rows changes."""
+"""Contribution of every session of a participant to the analyses, read at once and cached until one of its rows changes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STIMULATION_EVENTS = '$.events[*] ? (@.kind == "stimulation")'
 
 
 def sessions_of(db: Session, participant_ids: Collection[int]) -> dict[int, list[StudySession]]:
-    """Sessions and proposals by participant, visit and order, to read many at once: without their conditions and recordings."""
+    """Load sessions and proposals by participant, visit and order, for many at once: without their conditions and recordings."""
     visit = contains_eager(StudySession.visit).options(
         joinedload(Visit.participant).joinedload(Participant.site), selectinload(Visit.locks), selectinload(Visit.cdbs_amplitudes)
     )
@@ -54,21 +54,21 @@ def sessions_of(db: Session, participant_ids: Collection[int]) -> dict[int, list
 
 
 def recordings(db: Session, recording_ids: Collection[int]) -> Sequence[Recording]:
-    """Recordings without what they tell; while somebody holds them, segments find theirs without a query."""
+    """Load recordings without their details; while the caller keeps them, segments find theirs without a query."""
     if not recording_ids:
         return []
     return db.scalars(select(Recording).where(Recording.id.in_(recording_ids)).options(defer(Recording.details))).all()
 
 
 def stimulation_events(db: Session, recording_ids: Collection[int]) -> dict[int, list[dict[str, Any]]]:
-    """Logged states of the stimulation by recording, in time order: `t_s` and `data` with `rate_hz` and `programs`."""
+    """Return logged states of the stimulation by recording, in time order: `t_s` and `data` with `rate_hz` and `programs`."""
     events = func.jsonb_path_query_array(Recording.details, cast(literal(STIMULATION_EVENTS), JSONPATH))
     rows = db.execute(select(Recording.id, events).where(Recording.id.in_(recording_ids)))
     return {row[0]: sorted(row[1], key=lambda e: e.get("t_s") or 0.0) for row in rows}
 
 
 def spans(db: Session, session_ids: Collection[int]) -> dict[tuple[int, int], tuple[float, float]]:
-    """Where sessions lie in their recordings, s: by session and recording, from the first start to the last stop."""
+    """Locate sessions in their recordings, s: by session and recording, from the first start to the last stop."""
     rows = db.execute(
         select(SessionSegment.session_id, SessionSegment.recording_id, func.min(SessionSegment.start_s), func.max(SessionSegment.stop_s))
         .where(SessionSegment.session_id.in_(session_ids))
@@ -91,7 +91,7 @@ def some_at_once(places: Sequence[int]) -> Iterator[Sequence[int]]:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a caller may know of a participant's sessions.
+    """Facts of a participant's sessions that a caller may know.
 
     Attributes:
         key: names participant, row versions and what the caller may know: equal keys, equal evidence.
@@ -110,19 +110,21 @@ class Evidence:
 
 
 def evidence(db: Session, participant: Participant, caller: Caller) -> Evidence:
-    """The evidence of a participant, as the caller may know it; errors as in `app.study.blinding`."""
+    """Return the evidence of a participant, as the caller may know it; errors as in `app.study.blinding`."""
     return of_all(db, [participant], caller)[0]
 
 
 def keys_of(db: Session, participants: Sequence[Participant], caller: Caller) -> list[Hashable]:
-    """The keys of the participants' evidence: they change with whatever it depends on."""
+    """Return the keys of the participants' evidence: they change with everything it depends on."""
     versions = fingerprints(db, [p.id for p in participants])
     sights = blinding.sights(db, participants, caller)
     return [("evidence", p.id, versions[p.id], sight) for p, sight in zip(participants, sights, strict=True)]
 
 
 def of_all(db: Session, participants: Sequence[Participant], caller: Caller, keys: Sequence[Hashable] | None = None) -> list[Evidence]:
-    """The evidence of several participants; what is not kept is read for some of them at once. `keys`: theirs, where at hand."""
+    """Return the evidence of several participants; what is not cached is read for some of them at once. `keys`: theirs, where already
+    computed.
+    """
     keys = keys_of(db, participants, caller) if keys is None else keys
     found: list[Evidence | None] = [recalled(key) for key in keys]
     lacking = [i for i, known in enumerate(found) if known is None]
@@ -143,7 +145,7 @@ def of_all(db: Session, participants: Sequence[Participant], caller: Caller, key
 def _recordings_of_several_sides(
     db: Session, sessions: Sequence[StudySession], traces: Mapping[int, Sequence[Trace]]
 ) -> Sequence[Recording]:
-    """Recordings of sessions with several sides or programs; those of all others, nearly all, are never asked for."""
+    """Load recordings of sessions with several sides or programs; those of all others, nearly all, are never queried."""
     several = [s for s in sessions if several_sides(s, lambda i: traces.get(i, []))]
     return recordings(db, {g.recording_id for s in several for g in s.segments})
 

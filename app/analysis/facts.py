@@ -1,4 +1,4 @@
-"""What one session contributes: its metrics, what is missing of them and why, and the stimulation of all its sides. No database."""
+"""Facts that one session contributes: its metrics, missing ones with the reason, and the stimulation of all its sides. No database."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from ml.outcomes import KEYS, OUTCOMES
 from ml.statistics.within_visits.contrasts import Measurements
 
 KNOWN_SHARE = 0.5
-"""Share of a session's steps that must be known for its energy and its mean beta to stand for the session (ours)."""
+"""Share of a session's steps that must be known for its energy and its mean beta to describe the session (ours)."""
 
 METRICS = ("energy", "mean_beta", *KEYS)
 """The paper's five metrics, in its order."""
 
 
 class Missing(StrEnum):
-    """Why a session has no value of a metric."""
+    """Reason why a session has no value of a metric."""
 
     NOT_ENTERED = "not_entered"
     NO_TRACE = "no_trace"
@@ -42,7 +42,7 @@ class Missing(StrEnum):
 
 
 class LeftOut(StrEnum):
-    """Why a session counts in no analysis."""
+    """Reason why a session counts in no analysis."""
 
     EXCLUDED = "excluded"
     NOT_CONFIRMED = "not_confirmed"
@@ -54,7 +54,7 @@ class LeftOut(StrEnum):
 
 @dataclass(frozen=True)
 class BetaKind:
-    """What makes beta amplitudes comparable."""
+    """Unit and source of beta: amplitudes are comparable where both are equal."""
 
     unit: str
     source: str
@@ -86,9 +86,9 @@ class Facts:
     """One session that counts.
 
     Attributes:
-        values: by metric, absent where not measured. missing: why, by metric. steps: usable share of beta and amplitude is judged on them.
-        stopped: it was stopped for the patient's sake, for the reason given. late_stop: so, but known only after its visit was locked:
-            it counts as measured. medication_h: hours since the last dose, where known.
+        values: by metric, absent where not measured. missing: why, by metric. steps: shares of usable beta and amplitude are taken of them.
+        stopped: it was stopped for the patient's sake, for the reason given. late_stop: so, but known only after its visit was locked; it
+            counts as measured. medication_h: hours since the last dose, where known.
         created_at: when the record of the session came into being. visit_date: of its visit, where stated.
         policy_share: of its decisions that followed policy or schedule; None without a log.
     """
@@ -126,10 +126,10 @@ class Facts:
 
 @dataclass(frozen=True)
 class Excluded:
-    """A session that the analyses leave out altogether.
+    """Session that is excluded from the analyses altogether.
 
     Attributes:
-        detail: the reason that somebody gave, or what could not be read. arm, duration_s: of a session that could not be read: it ran.
+        detail: the reason given, or what could not be read. arm, duration_s: of a session that could not be read: it ran.
     """
 
     session_id: int
@@ -145,7 +145,7 @@ def read(session: StudySession, arm: Arm, traces: TracesOf, *, late_stop: bool =
     """Return the facts of one session.
 
     Raises:
-        Invalid: traces that do not fit the session's grid, or a cDBS amplitude that cannot be told.
+        Invalid: traces that do not fit the session's grid, or an ambiguous cDBS amplitude.
     """
     settings = session.visit.participant.current_settings
     table = laid_out(session, settings, traces)
@@ -191,7 +191,7 @@ def _why(metric: str, table: StepTable) -> Missing:
 
 
 def _sides(session: StudySession, table: StepTable, fraction: _Means, traces: TracesOf) -> tuple[Side, ...]:
-    """Every side and program that was recorded; a session of one amplitude trace has it already in its step table.
+    """Return every side and program that was recorded; a session of one amplitude trace has it already in its step table.
 
     Where another side cannot be read, it is there without numbers, so that no sum over sides passes for the whole.
     """
@@ -205,7 +205,7 @@ def _sides(session: StudySession, table: StepTable, fraction: _Means, traces: Tr
 
 
 def several_sides(session: StudySession, traces: TracesOf) -> bool:
-    """Whether a session has several recordings, or one with amplitudes of several programs: then its recordings are read too."""
+    """Check whether a session has several recordings, or one with amplitudes of several programs: then its recordings are read too."""
     recordings = {s.recording_id for s in session.segments}
     return len(recordings) > 1 or sum(len(_amplitudes(i, traces)) for i in recordings) > 1
 
@@ -227,18 +227,18 @@ def _side(name: str, is_control: bool, table: StepTable | None, fraction: _Means
 
 @dataclass(frozen=True)
 class _Means:
-    """Mean and mean square over the known steps; None where too few are known or nobody asked."""
+    """Mean and mean square over the known steps; None where too few are known or the value was not requested."""
 
     mean: float | None
     square: float | None
 
     def times(self, unit: float) -> _Means:
-        """The same in another unit, which a fraction is to be multiplied by."""
+        """Convert to another unit, by multiplying with the size of `unit`."""
         return _Means(None if self.mean is None else unit * self.mean, None if self.square is None else unit**2 * self.square)
 
 
 def _means(values: NDArray[np.float64], square: Callable[[ArrayLike], float] | None = None) -> _Means:
-    """Of a session's steps, shape [n], NaN where unknown; `square` takes the mean square of the known ones."""
+    """Average a session's steps, shape [n], NaN where unknown; `square` takes the mean square of the known ones."""
     unknown = np.isnan(values)
     known = values[~unknown] if unknown.any() else values
     if not known.size or known.size < KNOWN_SHARE * values.size:
@@ -251,8 +251,9 @@ def _means(values: NDArray[np.float64], square: Callable[[ArrayLike], float] | N
 HIGHER_IS_BETTER = {"energy": False, "mean_beta": False} | {o.key: o.higher_is_better for o in OUTCOMES}
 RESOLUTION = {"energy": 0.05} | {o.key: o.resolution for o in OUTCOMES}
 """Step between neighbouring values of a metric; 0 where it is continuous. Stimulators deliver steps of 0.1 mA: at cDBS of 4 mA, 0.05 of its
-energy. Without it, a controller of one constant amplitude would save the same at every visit, and no test could say so; nor could one say
-of a participant who never trembles that none came, if shares of the time were taken for more exact than to 1 %."""
+energy. Without it, a controller of one constant amplitude would save the same at every visit, and no test could report a saving. Nor could
+a test report that a participant never trembles, if shares of the time were taken as more exact than 1 %.
+"""
 
 BOUNDED = frozenset(o.key for o in OUTCOMES if o.bounded)
 """Metrics that end at a floor or a ceiling which sessions reach."""
@@ -274,12 +275,12 @@ class Chosen:
 
 
 def choose(sessions: Sequence[Facts], metric: str, is_tested: Callable[[Facts], bool]) -> Chosen:
-    """One metric of the sessions that `is_tested` names and of all cDBS sessions."""
+    """Choose one metric of the sessions that `is_tested` selects and of all cDBS sessions."""
     return choose_each(sessions, (metric,), is_tested)[metric]
 
 
 def choose_each(sessions: Sequence[Facts], metrics: Sequence[str], is_tested: Callable[[Facts], bool]) -> dict[str, Chosen]:
-    """Several metrics of the same sessions."""
+    """Choose several metrics of the same sessions."""
     taken = tuple(s for s in sessions if s.controller is Controller.CDBS or is_tested(s))
     nothing = float("nan")
     plain = Measurements.of(
@@ -300,12 +301,12 @@ def choose_each(sessions: Sequence[Facts], metrics: Sequence[str], is_tested: Ca
 
 
 def of_controller(controller: Controller) -> Callable[[Facts], bool]:
-    """Sessions of a controller, whichever policy ran."""
+    """Select sessions of a controller, whichever policy ran."""
     return lambda s: s.controller is controller
 
 
 def comparable_beta(sessions: Sequence[Facts], unit: str | None, source: str | None) -> BetaKind | None:
-    """The kind of beta that is compared: the participant's where some session has it, else the most frequent."""
+    """Choose the kind of beta that is compared: the participant's where some session has it, else the most frequent."""
     kinds = Counter(s.beta_kind for s in sessions if s.beta_kind and "mean_beta" in s.values)
     wanted = BetaKind(unit or "", source or "")
     if wanted in kinds or not kinds:
@@ -314,7 +315,7 @@ def comparable_beta(sessions: Sequence[Facts], unit: str | None, source: str | N
 
 
 def with_comparable_beta(sessions: Sequence[Facts], kind: BetaKind | None) -> tuple[Facts, ...]:
-    """The sessions, those with another kind of beta without their mean beta."""
+    """Return the sessions; remove the mean beta of those with another kind of beta."""
     return tuple(
         s
         if "mean_beta" not in s.values or s.beta_kind == kind

@@ -24,7 +24,7 @@ DOT = 2.4
 
 @dataclass(frozen=True)
 class Box:
-    """One box of a panel: a label (a participant or controller), its values, and what stands above it."""
+    """One box of a panel: a label (a participant or controller), its values, and the text above it."""
 
     label: str
     colour: str
@@ -42,7 +42,7 @@ class Panel:
 
 
 def boxes_svg(panels: Sequence[Panel], title: str, note: str) -> str:
-    """Boxes (quartiles, whiskers to the extremes) with every session as a point, a panel per metric."""
+    """Draw boxes (quartiles, whiskers to the extremes) with every session as a point, a panel per metric."""
     widths = [max(PANEL_W, _place_width(p) * len(p.boxes) + 40) for p in panels]
     width = LEFT + sum(widths) + (GAP + LEFT) * (len(panels) - 1) + 16 if panels else EMPTY_W
     height = TOP + PANEL_H + BOTTOM + 40
@@ -61,7 +61,7 @@ def boxes_svg(panels: Sequence[Panel], title: str, note: str) -> str:
 
 
 def _place_width(panel: Panel) -> float:
-    """Of one box: wide enough for the longest line of a label, so that none runs into the next."""
+    """Return the width of one box: wide enough for the longest line of a label, so that labels do not overlap."""
     lines = [line for b in panel.boxes for line in (*b.label.split("\n"), b.above)]
     return max(36.0, CHARACTER_W * max(map(len, lines), default=0) + 6)
 
@@ -122,7 +122,7 @@ def _quantile(ordered: Sequence[float], q: float) -> float:
 
 
 def csv_of(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A CSV with its header; what is not there is empty."""
+    """Write a CSV with its header; missing values are empty."""
     sink = io.StringIO()
     out = csv.writer(sink, lineterminator="\n")
     out.writerow(columns)

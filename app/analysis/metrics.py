@@ -87,7 +87,7 @@ def group(controller: Controller, values: Mapping[int, float]) -> Group:
 
 
 def compare(tested: Group, cdbs: Group) -> Comparison:
-    """Two-sided Wilcoxon rank-sum test of a controller against cDBS, or the check that failed."""
+    """Compare a controller with cDBS by a two-sided Wilcoxon rank-sum test, or name the check that failed."""
     plain = Comparison(tested.controller, tested.label, tested.n, cdbs.n)
     missing = not_enough(tested, cdbs)
     if missing:
@@ -97,12 +97,12 @@ def compare(tested: Group, cdbs: Group) -> Comparison:
 
 
 def smallest_p(n_x: int, n_y: int) -> float:
-    """The smallest two-sided p that the exact test of so many sessions can give: both most extreme of all equally likely rankings."""
+    """Return the smallest two-sided p of the exact test of so many sessions: both most extreme of all equally likely rankings."""
     return min(1.0, 2 / comb(n_x + n_y, n_x))
 
 
 def sessions_needed(n_other: int) -> int | None:
-    """The fewest sessions that can reach p < .05 against `n_other` sessions; None where the other side has none."""
+    """Return the fewest sessions that can reach p < .05 against `n_other` sessions; None where the other side has none."""
     if n_other < 1:
         return None
     n = 1
@@ -112,7 +112,7 @@ def sessions_needed(n_other: int) -> int | None:
 
 
 def not_enough(tested: Group, cdbs: Group) -> str:
-    """Why the test is not made: the numbers of sessions cannot give p < .05 whatever the values are. Empty where they can."""
+    """Explain why the test is not made: the numbers of sessions cannot give p < .05 whatever the values are. Empty where they can."""
     if smallest_p(tested.n, cdbs.n) < ALPHA:
         return ""
     found = f"{tested.label} has {tested.n}, {cdbs.label} {cdbs.n}"
@@ -146,7 +146,7 @@ LIMITS = (
 
 @dataclass(frozen=True)
 class AmplitudeMismatch:
-    """A session whose mean amplitude fraction is not that of its controller; it counts all the same until somebody corrects it."""
+    """A session whose mean amplitude fraction is not that of its controller; it counts all the same until it is corrected."""
 
     session_id: int
     visit: int
@@ -240,7 +240,7 @@ class FiveMetrics:
 
 
 def five_metrics(db: Session, participant: Participant, caller: Caller, held: Evidence | None = None) -> FiveMetrics:
-    """Energy, mean beta and outcomes of every session, by controller and by policy, each compared with cDBS.
+    """Compute energy, mean beta and outcomes of every session, by controller and by policy, each compared with cDBS.
 
     `held`: the evidence, where it is at hand.
     """
@@ -248,7 +248,7 @@ def five_metrics(db: Session, participant: Participant, caller: Caller, held: Ev
 
 
 def of_all(db: Session, participants: Sequence[Participant], held: Sequence[Evidence]) -> list[FiveMetrics]:
-    """The same of several participants, whose evidence is `held`."""
+    """Compute the five metrics of several participants, whose evidence is `held`."""
     names = primary.find_policy_names(db, [p.id for p in participants])
     return [_of(h, names[p.id]) for p, h in zip(participants, held, strict=True)]
 
@@ -275,7 +275,7 @@ def _compute(held: Evidence, names: Mapping[int, str]) -> FiveMetrics:
 
 
 def _mismatches(sessions: Sequence[Facts]) -> list[AmplitudeMismatch]:
-    """Sessions that were stimulated otherwise than their controller says."""
+    """Find sessions whose stimulation differs from what their controller implies."""
     found = []
     for s in sessions:
         mean = s.mean_fraction

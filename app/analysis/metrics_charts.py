@@ -1,4 +1,4 @@
-"""The five metrics in the units of pages and figures: energy in % of cDBS, as on every other page; files and the API keep its share."""
+"""Five metrics in the units of pages and figures: energy in % of cDBS, as on every other page. Files and the API keep its share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ml.outcomes import BY_KEY
 
 
 def for_readers(found: FiveMetrics) -> FiveMetrics:
-    """The same analysis with every metric in the unit in which it is shown."""
+    """Convert every metric of the analysis to the unit in which it is shown."""
     return replace(found, metrics=[_metric(m) for m in found.metrics])
 
 
@@ -58,25 +58,25 @@ COLUMNS = (
 )  # fmt: skip
 
 _HALF, _STEP, _ROWS = 0.27, 0.11, 24
-"""Of the dots beside a box: furthest offset, distance of neighbours where there is room, and how many rows of dots a panel is high."""
+"""Dots next to a box: furthest offset, distance of neighbours where there is room, and how many rows of dots a panel is high."""
 
 
 @dataclass(frozen=True)
 class FiveMetricsView:
-    """What the fragment `analysis/five_metrics.html` shows: pass it as `analysis`."""
+    """Content of the fragment `analysis/five_metrics.html`: pass it as `analysis`."""
 
     result: FiveMetrics
     charts: list[Chart]
 
 
 def view(result: FiveMetrics, evidence: Hashable) -> FiveMetricsView:
-    """The analysis as it is shown, with its charts, which are kept under the key of the evidence that it is made of."""
+    """Return the analysis as it is shown, with its charts, which are cached under the key of its evidence."""
     shown = for_readers(result)
     return FiveMetricsView(shown, kept(("metric charts", evidence), lambda: [metric_chart(m) for m in shown.metrics if m.n]))
 
 
 def metric_chart(metric: MetricResult) -> Chart:
-    """Box and strip of one metric by controller, with p-values above and the numbers in the table."""
+    """Plot box and strip of one metric by controller, with p-values above and the numbers in the table."""
     shown = [g for g in metric.groups if g.n]
     tests = {c.controller: c for c in metric.comparisons}
     data: list[dict[str, Any]] = []
@@ -101,7 +101,7 @@ def metric_chart(metric: MetricResult) -> Chart:
 
 
 def box(at: int, g: Group) -> dict[str, Any]:
-    """Quartiles of a group, whiskers to its extremes."""
+    """Draw quartiles of a group, whiskers to its extremes."""
     return {
         "type": "box", "x": [at], "q1": [g.q1], "median": [g.median], "q3": [g.q3],
         "lowerfence": [min(g.values)], "upperfence": [max(g.values)], "width": 0.5, "boxpoints": False, "hoverinfo": "skip",
@@ -110,7 +110,7 @@ def box(at: int, g: Group) -> dict[str, Any]:
 
 
 def points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
-    """Every session of a group, to the four digits that its label shows: a page of many participants has thousands."""
+    """Draw every session of a group, to the four digits that its label shows: a page of many participants has thousands."""
     height = max((max(other.values) for other in metric.groups if other.n), default=0.0)
     outcome = BY_KEY.get(metric.metric)
     unit = outcome.entry_unit if outcome is not None and outcome.whole else metric.unit
@@ -124,7 +124,7 @@ def points(at: int, g: Group, metric: MetricResult) -> dict[str, Any]:
 
 
 def above(test: Comparison | None, metric: str) -> str:
-    """What stands above a box: p, with an asterisk where a learned controller is better at .05."""
+    """Write the text above a box: p, with an asterisk where a learned controller is better at .05."""
     if test is None:
         return "p"
     return "too few" if test.p_value is None else p_text(test.p_value) + (" *" if is_better(test, metric) else "")
@@ -163,12 +163,12 @@ SVG = "image/svg+xml"
 
 
 def table(found: Sequence[FiveMetrics], name: str) -> Response:
-    """One row per participant, metric and controller or policy."""
+    """Serve one row per participant, metric and controller or policy."""
     return download(csv_of(EXPORTED, (row for one in found for row in _rows(one))), f"{name}-as-in-the-paper.csv")
 
 
 def svg(found: Sequence[FiveMetrics], name: str, *, synthetic: bool) -> Response:
-    """The results figure: a panel per metric, a box per participant and controller, every session a point."""
+    """Draw the results figure: a panel per metric, a box per participant and controller, every session a point."""
     shown = [for_readers(one) for one in found]
     panels = [_panel(shown, metric) for metric in METRICS]
     note = "Two-sided Wilcoxon rank-sum test against cDBS, sessions taken as independent; * a learned controller is better, p < .05."

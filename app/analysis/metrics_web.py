@@ -83,7 +83,7 @@ class ControllerOut(Model):
 
 
 class ExcludedOut(Model):
-    """A session left out of the analysis."""
+    """Session that the analysis excludes."""
 
     session_id: int
     visit: int
@@ -102,7 +102,7 @@ class MissingValueOut(Model):
 
 
 class ContradictionOut(Model):
-    """A session whose amplitudes are not those of its controller; it counts until somebody corrects it."""
+    """A session whose amplitudes are not those of its controller; it counts until it is corrected."""
 
     session_id: int
     visit: int
@@ -156,7 +156,7 @@ pages = APIRouter()
 
 @pages.get("/participants/{code}/analyses/paper")
 def analyses(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """The five metrics by controller, with tests, tables and limits."""
+    """Show the five metrics by controller, with tests, tables and limits."""
     held = evidence(db, participant, caller)
     analysis = view(metrics.five_metrics(db, participant, caller, held), held.key)
     return HTMLResponse(render(request, "analysis/analyses.html", participant=participant, analysis=analysis))
@@ -164,11 +164,11 @@ def analyses(request: Request, participant: CurrentParticipant, db: Db, caller: 
 
 @pages.get("/participants/{code}/analyses/paper.csv")
 def paper_table(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
-    """The paper's comparisons as a table."""
+    """Download the paper's comparisons as a table."""
     return metrics_charts.table([metrics.five_metrics(db, participant, caller)], participant.code)
 
 
 @pages.get("/participants/{code}/analyses/paper.svg")
 def paper_figure(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
-    """The results figure of one participant."""
+    """Download the results figure of one participant."""
     return metrics_charts.svg([metrics.five_metrics(db, participant, caller)], participant.code, synthetic=participant.synthetic)

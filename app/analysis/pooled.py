@@ -45,7 +45,7 @@ class TrialTimeRow:
 
     Attributes:
         tested: one entry for each of the table's controllers, with zeros where it was not tested.
-        excluded: sessions that are left out because somebody excluded them.
+        excluded: sessions that a user excluded.
     """
 
     participant: str
@@ -65,7 +65,7 @@ class TrialTime:
 
 
 def trial_time(db: Session, participants: Sequence[Participant], caller: Caller) -> TrialTime:
-    """The table over these participants, in their order. Proposed and excluded sessions do not count."""
+    """Build the table over these participants, in their order. Proposed and excluded sessions do not count."""
     by_participant: dict[int, list[StudySession]] = {p.id: [] for p in participants}
     for session in study.sessions_without_data(db, list(by_participant)):
         by_participant[session.visit.participant_id].append(session)
@@ -119,11 +119,11 @@ def _tested(controller: Controller, seconds: Sequence[float]) -> TimeTested:
 
 @dataclass(frozen=True)
 class Saved:
-    """What learned controllers saved in one participant.
+    """Saving of learned controllers in one participant.
 
     Attributes:
-        share: 1 less the mean of a^2 over the sessions' minutes, a being the fraction of the cDBS amplitude of the controlled side; below 0
-            where they spent more. minutes, sessions: of theirs with a known energy.
+        share: 1 less the mean of a^2 over the sessions' minutes; below 0 where they spent more. a is the fraction of the cDBS amplitude on
+            the controlled side. minutes, sessions: of theirs with a known energy.
     """
 
     participant: str
@@ -133,7 +133,9 @@ class Saved:
 
 
 def _saving(held: Evidence) -> Saved | None:
-    """Energy saved in one participant; None without a session of a learned controller that the caller may know of and that counts."""
+    """Compute the energy saved in one participant; None without a session of a learned controller that the caller may know of and that
+    counts.
+    """
     ran = [s for s in held.sessions if s.controller in LEARNED and "energy" in s.values]
     seconds = sum(s.duration_s for s in ran)
     if not seconds:
@@ -143,7 +145,7 @@ def _saving(held: Evidence) -> Saved | None:
 
 
 def overall(saved: Sequence[Saved]) -> Saved | None:
-    """All participants together, weighted by minutes; None without any."""
+    """Average all participants, weighted by minutes; None without any."""
     minutes = sum(s.minutes for s in saved)
     if not minutes:
         return None
@@ -154,7 +156,7 @@ def overall(saved: Sequence[Saved]) -> Saved | None:
 
 
 def step_seconds(db: Session, participant_ids: Sequence[int]) -> Sequence[Row[str, str, int, float, float]]:
-    """Finished compute steps of these participants' jobs: kind of job, of step (its key up to the number), n, median and longest, s."""
+    """Query finished compute steps of the participants' jobs: kind of job, step (its key up to the number), n, median and longest, s."""
     seconds = func.extract("epoch", JobStep.finished_at - JobStep.started_at)
     name = func.regexp_replace(JobStep.key, "/[0-9]+$", "")
     return db.execute(
@@ -224,14 +226,14 @@ def readable(db: Session, caller: Caller) -> Sequence[Participant]:
 
 
 def pooled(db: Session, participants: Sequence[Participant], caller: Caller) -> Pooled:
-    """Results of each participant and over all of them."""
+    """Compute the results of each participant and over all of them."""
     found = outlines(db, participants, caller)
     controllers = kept(("pooled", tuple(o.key for o in found)), lambda: tuple(_controller(found, c) for c in LEARNED if _ran(found, c)))
     return Pooled(tuple(found), controllers, _table([o.time for o in found]))
 
 
 def outlines(db: Session, participants: Sequence[Participant], caller: Caller) -> list[Outline]:
-    """Outlines of the participants; those that nothing changed are kept."""
+    """Return outlines of the participants; unchanged ones come from the cache."""
     of_evidence = evidence.keys_of(db, participants, caller)
     keys = [("outline", key, primary.locked_margins(p)[-1]) for key, p in zip(of_evidence, participants, strict=True)]
 
@@ -252,7 +254,7 @@ def _outline(key: Hashable, held: Evidence, participant: Participant) -> Outline
 
 
 def paper(db: Session, participants: Sequence[Participant], caller: Caller) -> list[FiveMetrics]:
-    """The paper's comparisons of each participant."""
+    """Compute the paper's comparisons of each participant."""
     return metrics.of_all(db, participants, evidence.of_all(db, participants, caller))
 
 
@@ -268,7 +270,7 @@ class StepTime:
 
 
 def computation_times(db: Session, participants: Sequence[Participant]) -> list[StepTime]:
-    """How long the compute steps of these participants' jobs took."""
+    """Return the time that the compute steps of these participants' jobs took."""
     rows = step_seconds(db, [p.id for p in participants])
     return [StepTime(kind, step, n, float(median), float(longest)) for kind, step, n, median, longest in rows]
 

@@ -111,7 +111,7 @@ Table = tuple[Sequence[str], Sequence[Sequence[object]]]
 
 
 def pooled_out(found: Pooled, times: Sequence[StepTime]) -> PooledOut:
-    """Everything of the page."""
+    """Convert the pooled results to the page's schema."""
     return PooledOut(
         verdicts=[
             ParticipantVerdictsOut(participant=p.participant, verdicts=[verdict_out(v) for v in p.verdicts]) for p in found.participants
@@ -136,13 +136,13 @@ def pooled_out(found: Pooled, times: Sequence[StepTime]) -> PooledOut:
 
 
 def trial_table(found: TrialTime) -> Table:
-    """Columns and rows of the trial time, one row per participant and controller."""
+    """Return columns and rows of the trial time, one row per participant and controller."""
     rows = [(row.participant, t.controller.value, t.sessions, t.minutes) for row in found.rows for t in row.tested]
     return tuple(TimeTestedOut.model_fields), rows
 
 
 def computation_table(times: Sequence[StepTime]) -> Table:
-    """Columns and rows of the computation time, one row per job and step."""
+    """Return columns and rows of the computation time, one row per job and step."""
     columns = tuple(StepTimeOut.model_fields)
     return columns, [tuple(asdict(t)[name] for name in columns) for t in times]
 
@@ -158,7 +158,7 @@ def _summary(found: Summary | Unavailable) -> SummaryOut:
 # The results figure of several participants: a box and every session by participant and controller, a chart per metric.
 
 MOST_WIDE = 8
-"""Boxes whose names stand side by side on a tablet in letters of full size."""
+"""Number of boxes whose names fit side by side on a tablet in letters of full size."""
 
 
 def results(found: Sequence[FiveMetrics], which: str = "") -> list[Chart]:
@@ -259,7 +259,7 @@ def read_pooled(
         Query(description="Which table the CSV is; the figure is always the results."),
     ] = "comparisons",
 ) -> PooledOut | Response:
-    """Every participant that the caller may read, and all together: verdicts, random-effects summary, trial time, computation time."""
+    """Return every participant the caller may read, and all together: verdicts, random-effects summary, trial time, computation time."""
     if format == "csv" and table == "computation_time":
         return download(csv_of(*computation_table(pooled.computation_times(db, participants))), "computation-time.csv")
     if format != "json" and not (format == "csv" and table == "trial_time"):
@@ -314,18 +314,18 @@ def _charts(db: Session, participants: Sequence[Participant], caller: Caller, wh
 
 @pages.get("/analyses/results.csv")
 def results_table(participants: Summed, db: Db, caller: CurrentCaller) -> Response:
-    """The paper's comparisons of all participants as a table."""
+    """Download the paper's comparisons of all participants as a table."""
     return metrics_charts.table(pooled.paper(db, participants, caller), "all")
 
 
 @pages.get("/analyses/results.svg")
 def results_figure(participants: Summed, db: Db, caller: CurrentCaller) -> Response:
-    """The results figure of all participants."""
+    """Download the results figure of all participants."""
     return _svg(pooled.paper(db, participants, caller), participants)
 
 
 @pages.get("/trial-time")
 def trial_time_page(request: Request, participants: Summed, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """Minutes of every controller in every participant that the caller may read."""
+    """Show minutes of every controller in every participant that the caller may read."""
     trial = trial_time(db, participants, caller)
     return HTMLResponse(render(request, "analysis/trial_time.html", trial=trial, withdrawn=withdrawn_codes(participants)))

@@ -33,7 +33,7 @@ from ml.statistics.within_visits.mixed_models import MixedComparison, linear_com
 
 
 def find_policy_names(db: Session, participant_ids: Collection[int]) -> dict[int, dict[int, str]]:
-    """Names of the participants' policies: by participant, then by policy."""
+    """Return names of the participants' policies: by participant, then by policy."""
     found: dict[int, dict[int, str]] = {i: {} for i in participant_ids}
     for mine, policy, name in db.execute(select(Policy.participant_id, Policy.id, Policy.name).where(Policy.participant_id.in_(found))):
         found[mine][policy] = name
@@ -41,7 +41,7 @@ def find_policy_names(db: Session, participant_ids: Collection[int]) -> dict[int
 
 
 def last_picked(db: Session, participant_ids: Collection[int]) -> dict[int, dict[int, datetime]]:
-    """When each policy was last put on a plan that was approved, by participant: what was known then may have picked it."""
+    """Find when each policy was last put on an approved plan, by participant: what was known then may have picked it."""
     found: dict[int, dict[int, datetime]] = {i: {} for i in participant_ids}
     rows = db.execute(
         select(Policy.participant_id, PlanItem.policy_id, func.max(Plan.created_at))
@@ -61,10 +61,10 @@ def last_picked(db: Session, participant_ids: Collection[int]) -> dict[int, dict
 
 @dataclass(frozen=True)
 class Primary:
-    """Everything of one participant.
+    """Results of one participant.
 
     Attributes:
-        evidence: the sessions, and those left out. sessions: those that count, with comparable beta. beta_kind: which beta that is.
+        evidence: the sessions, and the excluded ones. sessions: those that count, with comparable beta. beta_kind: which beta that is.
         results: controllers, then policies. verdicts: of the learned controllers. locked: the margins that they go by.
         earlier: verdicts under the locks before, oldest first.
     """
@@ -87,12 +87,12 @@ class Primary:
 
 
 def primary(db: Session, participant: Participant, caller: Caller) -> Primary:
-    """Primary results, as the caller may know them; errors as in `app.study.blinding`."""
+    """Compute the primary results, as the caller may know them; errors as in `app.study.blinding`."""
     return of_all(db, [participant], evidence.of_all(db, [participant], caller))[0]
 
 
 def of_all(db: Session, participants: Sequence[Participant], held: Sequence[Evidence]) -> list[Primary]:
-    """Primary results of several participants, whose evidence is `held`."""
+    """Compute the primary results of several participants, whose evidence is `held`."""
     ids = [p.id for p in participants]
     names, picked, declared = find_policy_names(db, ids), last_picked(db, ids), declared_margins(db, ids)
     for i, of_participant in declared.items():  # a declared confirmation counts whatever is planned afterwards
@@ -114,12 +114,12 @@ def _of(held: Evidence, locks: Sequence[LockedMargins], names: Mapping[int, str]
 
 
 def verdicts_of(db: Session, participant: Participant, caller: Caller) -> tuple[VerdictResult, ...]:
-    """The verdicts of `primary` alone, for pages that show no comparison: those of forty policies take many times as long."""
+    """Return only the verdicts of `primary`, for pages that show no comparison: those of forty policies take many times as long."""
     return verdicts_on(evidence.of_all(db, [participant], caller)[0], participant)
 
 
 def verdicts_on(facts: Evidence, participant: Participant) -> tuple[VerdictResult, ...]:
-    """The same of evidence that is at hand."""
+    """Compute the verdicts on evidence that is already loaded."""
     return _verdicts(facts, locked_margins(participant)[-1])
 
 
@@ -194,12 +194,12 @@ def _verdicts(held: Evidence, locked: LockedMargins) -> tuple[VerdictResult, ...
 
 
 def _tested(sessions: Sequence[Facts]) -> list[Controller]:
-    """Controllers that have a verdict."""
+    """List controllers that have a verdict."""
     return [c for c in LEARNED if any(s.controller is c for s in sessions)]
 
 
 def locked_margins(participant: Participant) -> tuple[LockedMargins, ...]:
-    """The margins of every lock, oldest first; those in force come last, locked or not."""
+    """Return the margins of every lock, oldest first; those in force come last, locked or not."""
     if not participant.margins_locks:
         return (LockedMargins(margins_of(participant.margins_in_force), participant.margins_in_force.version, None, None),)
     until = [*(lock.created_at for lock in participant.margins_locks[1:]), None]
@@ -210,7 +210,7 @@ def locked_margins(participant: Participant) -> tuple[LockedMargins, ...]:
 
 
 def result_of(found: Primary, key: str) -> ControllerResult:
-    """The result of a controller (`rl`) or policy (`policy-7`). Raises NotFound."""
+    """Return the result of a controller (`rl`) or policy (`policy-7`). Raises NotFound."""
     result = next((r for r in found.results if r.tested.key == key), None)
     if result is None:
         raise NotFound(f"Participant {found.evidence.participant} has no sessions of '{key}' that count.", "Choose one from the analyses.")
@@ -221,12 +221,12 @@ MixedFits = tuple[tuple[str, MixedComparison | Unavailable], ...]
 
 
 def mixed_models(found: Primary, controller: Controller) -> MixedFits:
-    """Mixed models by metric, policies nested in the controller, of the kind that an outcome's record names. Slow: up to 0.3 s."""
+    """Fit mixed models by metric, policies nested in the controller, of the kind that an outcome's record names. Slow: up to 0.3 s."""
     return kept(("mixed", found.evidence.key, controller), lambda: tuple((m, _fit(found.sessions, m, controller)) for m in METRICS))
 
 
 def policy_names(db: Session, participant: Participant) -> dict[int, str]:
-    """Names of a participant's policies."""
+    """Return names of a participant's policies."""
     return find_policy_names(db, [participant.id])[participant.id]
 
 
@@ -244,7 +244,9 @@ def _fit(sessions: Sequence[Facts], metric: str, controller: Controller) -> Mixe
 
 
 def next_visits(found: Primary, controller: Controller, sessions_per_arm: int) -> tuple[tuple[str, Power | Unavailable], ...]:
-    """Power of the primary test after each number of further visits, by metric: simulated from the posterior of both variances."""
+    """Estimate the power of the primary test after each number of further visits, by metric: simulated from the posterior of both
+    variances.
+    """
 
     def compute() -> tuple[tuple[str, Power | Unavailable], ...]:
         tested = of_controller(controller)

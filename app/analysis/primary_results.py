@@ -28,14 +28,14 @@ LEVEL = 0.95
 
 
 class Role(StrEnum):
-    """What a comparison was made for."""
+    """Purpose of a comparison."""
 
     PLANNED = "planned"
     EXPLORATION = "exploration"
 
 
 class Disagreement(StrEnum):
-    """How the paper's test and the primary one differ."""
+    """Difference between the paper's test and the primary one."""
 
     PAPER_ONLY = "paper_only"
     PRIMARY_ONLY = "primary_only"
@@ -43,7 +43,7 @@ class Disagreement(StrEnum):
 
 
 class Basis(StrEnum):
-    """Which sessions of a policy a comparison rests on: those after it was last picked, or those that may have picked it."""
+    """Sessions of a policy that a comparison rests on: those after it was last picked, or those that may have picked it."""
 
     ALL = "all"
     CONFIRMATION = "confirmation"
@@ -137,16 +137,16 @@ class ControllerResult:
     comparisons: tuple[Comparison, ...]
 
     def of(self, metric: str) -> Comparison:
-        """The comparison of a metric."""
+        """Return the comparison of a metric."""
         return next(c for c in self.comparisons if c.metric == metric)
 
 
 def results(sessions: Sequence[Facts], names: Mapping[int, str], picked_at: Mapping[int, datetime]) -> tuple[ControllerResult, ...]:
-    """Every controller, then every policy.
+    """Compute the result of every controller, then of every policy.
 
     Args:
-        sessions: that count, with comparable beta. names: of policies. picked_at: when each policy was last put on an approved plan:
-            sessions of before may have picked it.
+        sessions: that count, with comparable beta. names: of policies. picked_at: when each policy was last put on an approved plan.
+            Earlier sessions may have picked it.
     """
     controllers = [c for c in Controller if c is not Controller.CDBS and any(s.controller is c for s in sessions)]
     found = [_of_controller(sessions, c) for c in controllers]
@@ -156,7 +156,7 @@ def results(sessions: Sequence[Facts], names: Mapping[int, str], picked_at: Mapp
 
 
 def planned_results(sessions: Sequence[Facts]) -> tuple[ControllerResult, ...]:
-    """The controllers of the planned family that ran, without policies and adjusted p-values."""
+    """Compute the controllers of the planned family that ran, without policies and adjusted p-values."""
     return tuple(_of_controller(sessions, c) for c in LEARNED if any(s.controller is c for s in sessions))
 
 

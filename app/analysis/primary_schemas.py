@@ -27,7 +27,7 @@ from ml.statistics.within_visits.stratified import StratifiedTest
 
 
 class AverageOut(Model):
-    """An average contrast to cDBS over visits; without visits to tell it, `reason` says why."""
+    """An average contrast to cDBS over visits; without visits to estimate it, `reason` says why."""
 
     estimate: float | None
     low: float | None
@@ -185,7 +185,7 @@ def primary_out(found: Primary, synthetic: bool, policies: Sequence[PolicyVerdic
 
 
 def margins_out(locked: LockedMargins) -> MarginsLockedOut:
-    """Margins with their lock."""
+    """Convert margins with their lock."""
     return MarginsLockedOut(
         version=locked.version,
         **asdict(locked.margins),
@@ -196,7 +196,7 @@ def margins_out(locked: LockedMargins) -> MarginsLockedOut:
 
 
 def average_out(found: Average | Unavailable) -> AverageOut:
-    """An average over visits, or why there is none."""
+    """Convert an average over visits, or the reason why there is none."""
     if isinstance(found, Unavailable):
         return AverageOut(
             estimate=None,
@@ -221,7 +221,7 @@ def average_out(found: Average | Unavailable) -> AverageOut:
 
 
 def saving_out(found: Saving | Unavailable) -> AverageOut:
-    """An energy saving, per cent, or why there is none."""
+    """Convert an energy saving, per cent, or the reason why there is none."""
     if isinstance(found, Unavailable):
         return average_out(found)
     return AverageOut(
@@ -277,7 +277,7 @@ def verdict_out(result: VerdictResult, policy_id: int | None = None, name: str =
 
 
 def csv_rows(found: Primary) -> list[tuple[object, ...]]:
-    """One row per controller or policy and metric, in the order of CSV_COLUMNS."""
+    """List one row per controller or policy and metric, in the order of CSV_COLUMNS."""
     rows: list[tuple[object, ...]] = []
     for r in found.results:
         for c in r.comparisons:
@@ -294,7 +294,7 @@ def csv_rows(found: Primary) -> list[tuple[object, ...]]:
 
 
 def unit_of(metric: str, found: Primary) -> str:
-    """The unit of a metric; that of beta is the one that is compared."""
+    """Return the unit of a metric; that of beta is the one that is compared."""
     return primary_words.TITLES[metric][1] or (found.beta_kind.unit if found.beta_kind else "")
 
 

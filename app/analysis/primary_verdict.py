@@ -1,10 +1,10 @@
-"""Is energy saved without loss? Non-inferiority on the participant's margins, then the saving. No database.
+"""Test of energy saving without loss: non-inferiority on the participant's margins, then the saving. No database.
 
 A verdict confirms where the margins were locked before every session that it rests on; else it explores. A newer lock does not undo an
-older one: the visits that began between the two keep their verdict under the older, so that each is judged by the margins in force at its
-time. Where a margin is a share of the value under cDBS, the cDBS values are made worse by it, so that what is tested is "no worse than
-1 - share of the same visit's cDBS", with the spread of that reference in the error. A scale without equal steps is ordinal: made better by
-its margin, a value must win at least half of the pairs with the same visit's cDBS.
+older one. Visits that began between the two keep their verdict under the older, so that each is judged by the margins in force at its time.
+Where a margin is a share of the value under cDBS, the cDBS values are made worse by it. The test is then "no worse than 1 - share of the
+same visit's cDBS", with the spread of that reference in the error. A scale without equal steps is ordinal: made better by its margin, a
+value must win at least half of the pairs with the same visit's cDBS.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ml.statistics.within_visits.contrasts import Measurements
 
 
 class NoVerdict(StrEnum):
-    """Why nothing was assessed."""
+    """Reason why nothing was assessed."""
 
     NO_VISIT_AFTER_LOCK = "no_visit_after_lock"
     NO_REFERENCE = "no_reference"
@@ -35,7 +35,7 @@ class NoVerdict(StrEnum):
 
 @dataclass(frozen=True)
 class LockedMargins:
-    """Margins as they were locked, or the present ones where nobody locked any.
+    """Margins as they were locked, or the present ones where none are locked.
 
     Attributes:
         reason: of the lock. until: when a newer lock followed; None of the lock in force.
@@ -60,7 +60,7 @@ class VerdictResult:
         locked: the margins that it goes by. confirmatory: every session that it rests on began, and was recorded, after their lock.
         assessment: of those sessions; None for the reason in `no_verdict`.
         visits: with both arms, among the sessions that it rests on. drawn_from: all visits of these sessions.
-        left_to_exploration: visits of before the lock.
+        left_to_exploration: visits before the lock.
         margin: by outcome, in its unit. stopped: sessions of the controller that were stopped for the patient's sake.
         late_stops: so, but known only after their visit was locked: they count as measured.
         policy_shares: of decisions by the policy, in the sessions with a log.
@@ -81,12 +81,12 @@ class VerdictResult:
 
 
 def opened_at(session: Facts) -> datetime:
-    """When somebody could first know of a session: it began, or its record was made."""
+    """Return when a session could first be known: when it began, or when its record was made."""
     return min(session.created_at, session.started_at) if session.started_at else session.created_at
 
 
 def verdicts(sessions: Sequence[Facts], controllers: Sequence[Controller], locked: LockedMargins, failed: Qoc) -> list[VerdictResult]:
-    """For every controller its confirmatory verdict where there is a lock, and its exploratory one where the other lacks visits that
+    """Compute the confirmatory verdict of every controller where there is a lock. Add the exploratory one where the first lacks visits that
     earlier sessions could add.
 
     Args:
@@ -149,7 +149,8 @@ def policy_verdicts(sessions: Sequence[Facts], margins: LockedMargins, failure: 
 def earlier_verdicts(
     sessions: Sequence[Facts], controllers: Sequence[Controller], locks: Sequence[LockedMargins], failed: Qoc
 ) -> list[VerdictResult]:
-    """What earlier locks concluded, by lock and controller: of the visits that began under each, by its margins; without planning.
+    """Compute the conclusions of earlier locks, by lock and controller: of the visits that began under each, by its margins; without
+    planning.
 
     Args:
         locks: that a newer one followed, oldest first. failed: what a stopped session of the participant counts as, as in every verdict.
@@ -164,7 +165,7 @@ def earlier_verdicts(
 
 
 def _after(sessions: Sequence[Facts], moment: datetime | None) -> list[Facts]:
-    """Sessions of the visits of which nothing was there before a moment."""
+    """Select sessions of visits of which nothing existed before a moment."""
     if moment is None:
         return []
     early = {s.visit for s in sessions if opened_at(s) <= moment}
@@ -217,7 +218,7 @@ def _judge(
 def judged_outcome(
     outcome: Outcome, data: Measurements, stopped: NDArray[np.bool_], margin: float, failure: float | None
 ) -> JudgedOutcome | None:
-    """Return an outcome as verdicts judge it; None where no cDBS session tells what a share of the value under cDBS is.
+    """Return an outcome as verdicts judge it; None where no cDBS session gives the reference for a share.
 
     Args:
         outcome: its record. data: its values in both arms, n sessions. stopped: for the patient's sake, [n].

@@ -26,7 +26,7 @@ from ml.statistics.within_visits.contrasts import Average
 
 
 def by_visit(tested: Tested, found: Comparison, unit: str) -> Chart:
-    """Contrasts by visit as points, the average over visits beside them; `unit` is the one that pages show."""
+    """Plot contrasts by visit as points and their average over visits; `unit` is the one that pages show."""
     rows = [r for r in found.rows if r.contrast is not None]
     factor = primary_words.shown_factor(found.metric)
     name, title = primary_words.tested_name(tested), primary_words.TITLES[found.metric][0]
@@ -83,7 +83,9 @@ def read_primary(
     caller: CurrentCaller,
     format: Annotated[Literal["json", "csv"], Query(description="csv: one row per controller or policy and metric.")] = "json",
 ) -> PrimaryOut | Response:
-    """Each controller and policy against the same visit's cDBS, with the visit as the unit of evidence, and the verdicts on the margins."""
+    """Return each controller and policy against the same visit's cDBS, with the visit as the unit of evidence, and the verdicts on the
+    margins.
+    """
     found = primary.primary(db, participant, caller)
     standings = make_part(Part.STANDINGS, db, participant, caller)
     if format == "csv":
@@ -96,7 +98,7 @@ pages = APIRouter()
 
 @pages.get("/participants/{code}/analyses")
 def primary_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """What the visits have shown: verdicts, the primary comparisons, what they leave out."""
+    """Show the results of the visits: verdicts, the primary comparisons, what they exclude."""
     found = primary.primary(db, participant, caller)
     page = render(
         request,
@@ -113,13 +115,13 @@ def primary_page(request: Request, participant: CurrentParticipant, db: Db, call
 
 @pages.get("/participants/{code}/analyses.csv")
 def primary_table(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
-    """The primary comparisons as a table."""
+    """Download the primary comparisons as a table."""
     return primary_csv(primary.primary(db, participant, caller), make_part(Part.STANDINGS, db, participant, caller))
 
 
 @pages.get("/participants/{code}/analyses/visits/{key}")
 def visits_page(request: Request, key: str, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """One controller or policy visit by visit, with the sessions behind every number and what else could explain it."""
+    """Show one controller or policy visit by visit, with the sessions behind every number and what else could explain it."""
     found = primary.primary(db, participant, caller)
     result = primary.result_of(found, key)
     units = _units(found)
@@ -147,11 +149,11 @@ def models_page(
     caller: CurrentCaller,
     sessions: Annotated[int, Query(ge=1, le=20)] = 3,
 ) -> HTMLResponse:
-    """Mixed models of one controller, and what further visits would show; up to a second where nobody asked before."""
+    """Show mixed models of one controller, and what further visits would show; up to a second where the result is not cached."""
     found = primary.primary(db, participant, caller)
     result = primary.result_of(found, key)
     if result.tested.policy_id is not None:
-        raise NotFound("Models are of controllers; their policies stand inside.", "Choose a controller.")
+        raise NotFound("Models are of controllers; their policies are inside.", "Choose a controller.")
     page = render(
         request,
         "analysis/models.html",
@@ -169,5 +171,5 @@ def models_page(
 
 
 def _units(found: primary.Primary) -> dict[str, str]:
-    """The unit in which a page shows each metric."""
+    """Return the unit in which a page shows each metric."""
     return {m: written(primary_words.shown_unit(m, unit_of(m, found))) for m in METRICS}

@@ -1,4 +1,4 @@
-"""Sentences of the analyses, made where somebody reads them; nothing is decided by them."""
+"""Sentences of the analyses, made where they are shown; nothing is decided by them."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ MISSING = {
 
 
 def unavailable(why: Unavailable, what: str = "the controller") -> str:
-    """Why a number is not given."""
+    """Explain why a number is not given."""
     sentences = {
         Reason.NO_SESSION: f"No session of {what}, or none of cDBS, has this metric.",
         Reason.NO_VISIT_WITH_BOTH_ARMS: f"No visit has both {what} and cDBS with this metric: no primary evidence.",
@@ -91,19 +91,19 @@ def unavailable(why: Unavailable, what: str = "the controller") -> str:
 
 
 def not_pooled(why: Unavailable) -> str:
-    """Why a metric has no summary over participants."""
+    """Explain why a metric has no summary over participants."""
     return "Beta of different unit or source is not pooled." if why.reason is Reason.NOT_IDENTIFIED else unavailable(why)
 
 
 def tested_name(tested: Tested) -> str:
-    """A controller, or a policy of it, by name."""
+    """Name a controller, or a policy of it."""
     if tested.policy_id is None:
         return CONTROLLER_NAMES[tested.controller]
     return tested.policy_name or f"policy {tested.policy_id}"
 
 
 def basis(tested: Tested) -> str:
-    """Which sessions of a policy count, and which do not; empty for controllers."""
+    """Describe which sessions of a policy count, and which do not; empty for controllers."""
     if tested.basis is Basis.ALL:
         return ""
     if tested.basis is Basis.SELECTION:
@@ -150,7 +150,7 @@ def policy_shares(shares: Sequence[float]) -> str:
 
 
 def verdict_sentence(name: str, found: Verdict, visits: int, *, planned: bool) -> str:
-    """A verdict over so many visits, in one sentence. `planned`: whether it was asked how many further visits would settle it."""
+    """Write a verdict over so many visits in one sentence. `planned`: the number of further visits that would settle it was requested."""
     over = f"over {counted(visits, 'visit')}"
     if isinstance(found, NonInferiorAndSaving):
         return (
@@ -187,7 +187,7 @@ def _more(found: Inconclusive, *, planned: bool = True) -> str:
 
 
 def _not_told(why: Reason, names: Sequence[str]) -> str:
-    """Why outcomes of a verdict could not be tested, or why no number of further visits follows from them."""
+    """Explain why outcomes of a verdict could not be tested, or why no number of further visits follows from them."""
     what, are = _listed(names), _are(names)
     unknown = "which does not tell how far another could be off"
     sentences = {
@@ -202,7 +202,7 @@ def _not_told(why: Reason, names: Sequence[str]) -> str:
 
 
 def outlook(result: VerdictResult, sessions_per_arm: int) -> str:
-    """What further visits would settle of a controller, for the plan of the next one."""
+    """Describe what further visits would settle of a controller, for the plan of the next one."""
     name, a = CONTROLLER_NAMES[result.controller], result.assessment
     if a is None or not isinstance(a.verdict, Inconclusive):
         return verdict(result)
@@ -221,28 +221,28 @@ def _outlook(name: str, verdict_now: Inconclusive, sessions_per_arm: int) -> str
 
 
 def effect_unit(metric: str, unit: str) -> str:
-    """In what a mixed model states its effect on a metric."""
+    """Return the unit in which a mixed model states its effect on a metric."""
     return _EFFECTS.get(BY_KEY[metric].model, unit) if metric in BY_KEY else unit
 
 
 def share_margins(locked: LockedMargins) -> str:
-    """Which margins are shares, and of what."""
+    """Describe which margins are shares, and of what."""
     shares = [o for o in OUTCOMES if o.margin.kind == "share"]
     return " ".join(f"The margin of {o.noun} is {100 * locked.margins.of(o):g} % of the mean under cDBS." for o in shares)
 
 
 def judged_as(outcome: str, unit: str) -> str:
-    """In what an outcome of a verdict and its margin are stated."""
+    """Return the unit in which an outcome of a verdict and its margin are stated."""
     return BY_KEY[outcome].contrast_unit if outcome in BY_KEY else unit
 
 
 def verdict_kind(result: VerdictResult) -> str:
-    """Whether a verdict confirms, and why not."""
+    """Describe whether a verdict confirms, and why not."""
     return f"{'Confirmatory' if result.confirmatory else 'Exploratory'}: {verdict_ground(result)}"
 
 
 def verdict_ground(result: VerdictResult) -> str:
-    """Why a verdict confirms, or does not, to stand behind that word."""
+    """Explain why a verdict confirms, or does not; the text follows that word."""
     locked = result.locked
     if result.confirmatory:
         before = "declaration" if locked.declared_at else "lock"
@@ -266,26 +266,26 @@ def verdict_ground(result: VerdictResult) -> str:
 
 
 def _superseded(locked: LockedMargins) -> str:
-    """When a newer lock followed."""
+    """State when a newer lock followed."""
     if locked.until is None:
         return ""
     return f" A newer lock followed on {locked.until:%Y-%m-%d %H:%M} UTC; visits that began after it are judged by that one."
 
 
 def margins(found: LockedMargins) -> str:
-    """Margins in a line."""
+    """Write the margins in a line."""
     return ", ".join(f"{o.noun} {margin(o, found.margins.of(o))}" for o in OUTCOMES)
 
 
 def margin(outcome: Outcome, value: float) -> str:
-    """A margin with its unit."""
+    """Write a margin with its unit."""
     if outcome.margin.kind == "share":
         return f"{100 * value:g} % of cDBS"
     return counted(value, "point") if outcome.margin.form_unit == "points" else f"{value:g} {outcome.margin.form_unit}"
 
 
 def disagreement(found: Comparison) -> str:
-    """Where the paper's test and the primary one differ; empty where they agree."""
+    """Describe where the paper's test and the primary one differ; empty where they agree."""
     if found.disagreement is Disagreement.PAPER_ONLY:
         return (
             "The paper's test is below .05 and the primary one is not: to take sessions of one day as independent makes days look like "
@@ -299,7 +299,7 @@ def disagreement(found: Comparison) -> str:
 
 
 def lacking(found: Comparison) -> str:
-    """Visits that give no primary evidence; empty where all do."""
+    """Describe the visits that give no primary evidence; empty where all do."""
     if not found.lacking_visits:
         return ""
     one = len(found.lacking_visits) == 1
@@ -309,7 +309,7 @@ def lacking(found: Comparison) -> str:
 
 
 def left_out(excluded: Excluded) -> str:
-    """Why a session counts in no analysis."""
+    """Explain why a session counts in no analysis."""
     return {
         LeftOut.EXCLUDED: excluded.detail,
         LeftOut.NOT_CONFIRMED: "not confirmed yet",
@@ -320,7 +320,7 @@ def left_out(excluded: Excluded) -> str:
 
 
 def no_association(why: Unavailable) -> str:
-    """Why two measurements are not set against each other."""
+    """Explain why two measurements are not compared."""
     if why.reason is Reason.TOO_FEW_VISITS:
         return f"{counted(why.found, 'visit')} can be compared; {why.needed} are needed."
     sentences = {
@@ -332,7 +332,7 @@ def no_association(why: Unavailable) -> str:
 
 
 def no_population_claim(found: Summary) -> str:
-    """What a summary of so few participants does not say."""
+    """Describe what a summary of so few participants does not show."""
     k = found.participants
     floor = f"With {k} participants the two-sided sign test cannot go below {p_text(found.smallest_sign_p)}"
     if found.population_claim:
@@ -361,10 +361,10 @@ def _numbers(numbers: Iterable[int]) -> str:
 
 
 def shown_unit(metric: str, unit: str) -> str:
-    """The unit in which pages and figures show a metric whose own unit is `unit`."""
+    """Return the unit in which pages and figures show a metric whose own unit is `unit`."""
     return ENERGY_SHOWN[0] if metric == "energy" else unit
 
 
 def shown_factor(metric: str) -> float:
-    """What a metric's numbers are multiplied by where they are shown in `shown_unit`."""
+    """Return the factor that converts a metric's numbers to `shown_unit`."""
     return ENERGY_SHOWN[1] if metric == "energy" else 1.0

@@ -40,7 +40,7 @@ class Standing:
 
     @property
     def sentence(self) -> str:
-        """Say the standing in words."""
+        """Standing in words."""
         return f"{self.name}. " + " ".join(part for part in (self._harms(), self._measurement(), self._prediction()) if part)
 
     def _harms(self) -> str:

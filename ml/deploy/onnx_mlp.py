@@ -94,7 +94,7 @@ class _Path:
         if operator in _KEEPING and attributes.get("to", onnx.TensorProto.FLOAT) in _REAL:
             return
         if self.clip is not None and operator not in ("Clip", "Min", "Max", "Flatten", "Reshape"):
-            raise NoPlainNetwork(f"its operator {operator} stands behind a clip")
+            raise NoPlainNetwork(f"its operator {operator} follows a clip")
         if operator in ("Add", "Sub", "Mul", "Div", "Neg"):
             self._elementwise(operator, inputs)
         elif operator in ("Relu", "Tanh", "Sigmoid"):

@@ -72,7 +72,7 @@ class OnnxPolicy:
         bad = ~((fractions >= -RANGE_TOLERANCE) & (fractions <= 1 + RANGE_TOLERANCE))  # True for NaN as well
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
-            raise PolicyOutputError(f"the policy answered {fractions[row]:.6g} for window {row}; an amplitude fraction lies in [0, 1]")
+            raise PolicyOutputError(f"the policy answered {fractions[row]:.6g} for window {row}; an amplitude fraction must be in [0, 1]")
         return np.clip(fractions, 0.0, 1.0)
 
     def _run(self, states: NDArray[Any]) -> NDArray[np.float64]:

@@ -39,7 +39,7 @@ class ConstantPolicy:
 
     def __init__(self, amplitude: float) -> None:
         if not 0 <= amplitude <= 1:
-            raise ValueError(f"an amplitude fraction lies in [0, 1], not {amplitude}")
+            raise ValueError(f"an amplitude fraction must be in [0, 1], not {amplitude}")
         self.amplitude = amplitude
 
     def act(self, states: NDArray[Any]) -> NDArray[np.float64]:
@@ -60,7 +60,7 @@ class ProportionalPolicy:
         if not low < high:
             raise ValueError(f"low ({low}) must lie below high ({high})")
         if not 0 <= floor <= 1:
-            raise ValueError(f"an amplitude fraction lies in [0, 1], not {floor}")
+            raise ValueError(f"an amplitude fraction must be in [0, 1], not {floor}")
         self.low, self.high, self.floor, self.newest = low, high, floor, newest
 
     def act(self, states: NDArray[Any]) -> NDArray[np.float64]:

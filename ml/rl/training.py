@@ -185,7 +185,7 @@ def train_on(
     """Run `train_many` on transitions of any source, with gamma, the mean and standard deviation of beta, and what critics remember."""
     _require_together(configs)
     if remembers(configs[0]) and memory is None:
-        raise ValueError("critics with a memory of past amplitudes need it beside the transitions")
+        raise ValueError("critics with a memory of past amplitudes need it with the transitions")
     config, device = configs[0], configs[0].resolved_device()
     learner_type = algorithm(config.algorithm).learner
     scale = RewardScale.of(transitions.rewards, gamma)

@@ -128,4 +128,4 @@ def _check(x: Floats, y: Floats, visit: Integers, level: float) -> None:
     if np.isinf(x).any() or np.isinf(y).any():
         raise ValueError("an infinite value was given: leave it out, or give NaN where nothing was measured")
     if not 0 < level < 1:
-        raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")
+        raise ValueError(f"the level of an interval must be between 0 and 1, not {level}")

@@ -145,6 +145,6 @@ def _scale_down(values: NDArray[Any]) -> tuple[Floats, float]:
 
 def _check(level: float, *numbers: NDArray[Any]) -> None:
     if not 0 < level < 1:
-        raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")
+        raise ValueError(f"the level of an interval must be between 0 and 1, not {level}")
     if not all(np.isfinite(n).all() for n in numbers):
         raise ValueError("an interval needs finite values: an estimate of some resample is infinite or not a number")

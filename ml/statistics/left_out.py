@@ -1,4 +1,4 @@
-"""Draws of a mixed model for sessions that are left out one by one: all of them side by side, from one set of sums."""
+"""Draws of a mixed model for sessions excluded one by one: all of them side by side, from one set of sums."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ BATCH: Final = 128
 def left_out_draws(
     model: MixedModel, sums: SessionSums, ratios: Floats, held: Sequence[int], draws: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Draws for each held session of what the other sessions say of it, at given lambdas.
+    """Draw for each held-out session what the other sessions predict of it, at given lambdas.
 
     A column that no other row has is drawn from its prior, and so is the level of the session itself.
 
     Args:
         model: of the sums. sums: of n sessions. ratios: lambda of every estimated group, those of visits and sessions last.
-        held: the sessions, m, at least one. draws: D of each.
+        held: held-out sessions, m, at least one. draws: D of each.
 
     Returns:
         Coefficients of the columns, [m, D, q], and the visit's plus the session's level, [m, D].

@@ -1,9 +1,9 @@
 """Linear mixed model with a posterior over its variance components: y = W c + e, groups of coefficients c_g ~ N(0, lambda_g sigma^2).
 
-A visit's level, a session's level, curvature: each group is shrunk as far as the data ask for, and what they leave open about that is
-averaged over instead of being fixed at its likeliest value, which in a dozen sessions is often zero. Sources: Henderson's mixed model
-equations and the restricted likelihood as in Searle, Casella and McCulloch 1992, chapters 6 and 7; the prior of a group's standard
-deviation over that of the noise is the half-Cauchy of scale 1 (Gelman 2006; Polson and Scott 2012).
+Each group (visits' levels, sessions' levels, curvature) is shrunk as far as the data ask for. What they leave open about that is averaged
+over. The likeliest value alone would often be zero in a dozen sessions. Sources: Henderson's mixed model equations and the restricted
+likelihood as in Searle, Casella and McCulloch 1992, chapters 6 and 7. The prior of a group's standard deviation over that of the noise is
+the half-Cauchy of scale 1 (Gelman 2006; Polson and Scott 2012).
 
 Everything follows from sums over rows (W^T W, W^T y, y^T y): rows are read once. Columns cost: with q of them a point of the lambdas' grid
 takes q^3 operations and q^2 numbers. Levels of sessions and visits are not among the q: `ml.statistics.nested` eliminates them first, which
@@ -44,21 +44,22 @@ FINE = tuple(float(v) for v in 10.0 ** np.arange(-0.5, 0.55, 0.1))
 """Multiples of them that it tries next."""
 
 FINER = tuple(10.0 ** (np.linspace(-1, 1, 9)[None] * np.array([[0.1], [0.03], [0.01], [0.003]])))
-"""Multiples that a fit at one point tries after these, ever closer: the square root of a lambda is then found to half a per cent."""
+"""Multiples that a fit at one point tries after these, ever closer. The square root of a lambda is then found to half a per cent."""
 
 STEPS = (1.2, 1.5, 2.0, 3.0, 5.0, 8.0)
-"""Ratios between neighbouring lambdas of the grid that the posterior is averaged over; the first at which the log posterior has fallen by
-a half on average is taken, so that the grid is as wide as what the data leave open."""
+"""Ratios between neighbouring lambdas of the grid that the posterior is averaged over. The first is taken at which the log posterior has
+fallen by a half on average; the grid then covers what the data leave open.
+"""
 
 
 def live_columns(diagonal: Floats) -> NDArray[np.bool_]:
-    """Columns that are not zero, for their sums of squares [..., q]."""
+    """Find columns that are not zero, for their sums of squares [..., q]."""
     return np.asarray(diagonal > SMALLEST_SQUARES)
 
 
 @dataclass(frozen=True)
 class Sums:
-    """What the rows are needed for: gram W^T W [q, q], moment W^T y [q], square y^T y, number of rows."""
+    """Sums over the rows, all that a fit needs of them: gram W^T W [q, q], moment W^T y [q], square y^T y, number of rows."""
 
     levels: ClassVar[tuple[str, ...]] = ()
 
@@ -69,7 +70,7 @@ class Sums:
 
     @classmethod
     def of(cls, design: Floats, y: Floats) -> Sums:
-        """Of a design [n, q] and targets [n]."""
+        """Sum over the rows of a design [n, q] and targets [n]."""
         return cls(design.T @ design, design.T @ y, float(y @ y), len(y))
 
     @property
@@ -83,21 +84,21 @@ class Sums:
         return float(np.trace(self.gram))
 
     def take(self, columns: Indices) -> Sums:
-        """Of some columns."""
+        """Select the sums of some columns."""
         return replace(self, gram=self.gram[np.ix_(columns, columns)], moment=self.moment[columns])
 
     def means(self, at: Reduced, columns: Floats) -> tuple[Floats, ...]:
-        """Levels given the columns' coefficients: there is none."""
+        """Return the levels given the columns' coefficients: there is none."""
         return ()
 
     def spread(self, at: Reduced, penalties: Floats, noise: Floats) -> Floats:
-        """L^-T times noise [K, R, q], where L L^T are the equations with penalties [K, q]."""
+        """Multiply L^-T by noise [K, R, q], where L L^T are the equations with penalties [K, q]."""
         q = penalties.shape[1]
         lower = np.linalg.cholesky(at.joint[:, :q, :q] + penalties[:, :, None] * np.eye(q))
         return np.asarray(noise @ np.linalg.inv(lower), dtype=np.float64)
 
     def reduced(self, ratios: Floats) -> Reduced:
-        """The equations, K times for ratios [K, 0]: there is no level to eliminate."""
+        """Return the equations, K times for ratios [K, 0]: there is no level to eliminate."""
         whole = np.block([[self.gram, self.moment[:, None]], [self.moment, np.full((1, 1), self.square)]])
         k = len(ratios)
         return Reduced(np.broadcast_to(whole, (k, *whole.shape)), np.zeros(k), np.zeros((k, 0, len(whole))), ratios, np.zeros((k, 0)))
@@ -105,7 +106,7 @@ class Sums:
 
 @dataclass(frozen=True)
 class MixedModel:
-    """Which columns form which group.
+    """Grouping of the columns of a mixed model.
 
     Attributes:
         columns: q, without those of the levels of `SessionSums`, which follow them: those of the visits, then those of the sessions.
@@ -118,7 +119,7 @@ class MixedModel:
     known: Mapping[int, float]
 
     def fit(self, sums: Sums | SessionSums) -> MixedFit:
-        """Posterior by the restricted likelihood.
+        """Compute the posterior by the restricted likelihood.
 
         Raises:
             ValueError: no row.
@@ -126,22 +127,22 @@ class MixedModel:
         problem = _Problem(self, sums)
         names = [*self.estimated, *sums.levels]
         best = problem.search()
-        # Five values of each lambda, three wider apart where four groups would make too many combinations; from six groups on the two
-        # at one standard deviation, which still have its mean and its variance (Gauss and Hermite's rule of two points).
+        # Five values of each lambda, or three wider apart where four groups would make too many combinations. From six groups on the two
+        # at one standard deviation, which keep its mean and its variance (Gauss and Hermite's rule of two points).
         powers = np.arange(-2.0, 3.0) if len(names) < 4 else np.array([-1.7, 0.0, 1.7]) if len(names) < 6 else np.array([-1.0, 1.0])
         axes = [np.clip(v * step**powers, SMALLEST, LARGEST) for v, step in zip(best, problem.steps(best), strict=True)]
         points = sorted(set(product(*[axis.tolist() for axis in axes])))
         ratios = np.array(points, dtype=np.float64).reshape(len(points), len(names))
         logs, means, _, squares = problem.solve(ratios)
         weights = np.exp(logs - logs.max())
-        # every point stands for a cell of the grid, whose volume in log lambda is the product of its axes' spacings
+        # every point represents a cell of the grid, whose volume in log lambda is the product of its axes' spacings
         cell = float(np.sum([np.log(max(np.log(axis.max() / axis.min()), 1e-9) / max(len(np.unique(axis)) - 1, 1)) for axis in axes]))
         log_evidence = float(logs.max() + np.log(weights.sum()) + cell)
         weights /= weights.sum()
         return MixedFit(tuple(names), best, ratios, weights, means, squares, problem.degrees, log_evidence, problem)
 
     def restricted(self, sums: Sums) -> RestrictedFit:
-        """Coefficients and their covariance at the lambdas of the largest restricted likelihood, without a prior of them.
+        """Estimate the coefficients and their covariance at the lambdas of the largest restricted likelihood, without a prior of them.
 
         Raises:
             ValueError: no row.
@@ -154,7 +155,7 @@ class MixedModel:
         return RestrictedFit(tuple(self.estimated), best, means[0], variance * factors[0] @ factors[0].T, variance, degrees)
 
     def likeliest(self, sums: Sums | SessionSums) -> tuple[Floats, Floats]:
-        """The likeliest lambdas [G] and all coefficients there: `fit` without what the data leave open.
+        """Find the likeliest lambdas [G] and all coefficients there: `fit` without what the data leave open.
 
         Raises:
             ValueError: no row.
@@ -204,12 +205,12 @@ class MixedFit:
         return np.asarray(inside + np.einsum("k,ki,kj->ij", self.weights, apart, apart), dtype=np.float64)
 
     def share(self, group: str) -> float:
-        """Posterior mean of lambda / (1 + lambda): a level's share of the variance of one row."""
+        """Return the posterior mean of lambda / (1 + lambda): a level's share of the variance of one row."""
         values = self.ratios[:, self.groups.index(group)]
         return float(self.weights @ (values / (1 + values)))
 
     def draws(self, number: int, rng: np.random.Generator) -> Floats:
-        """Coefficients drawn from the posterior, [number, p]."""
+        """Draw coefficients from the posterior, [number, p]."""
         k = rng.choice(len(self.weights), number, p=self.weights)
         # A variance of one degree of freedom has no mean; what is drawn is cut to what can be averaged.
         sigma = np.sqrt(self.squares[k] / np.maximum(rng.chisquare(self.degrees, number), 0.05 * self.degrees))
@@ -296,14 +297,16 @@ class _Problem:
         return logs, np.concatenate([means, *self.sums.means(at, columns)], axis=1), factors, squares
 
     def spread(self, ratios: Floats, noise: Floats) -> Floats:
-        """Noise [K, R, p] turned into deviations of the coefficients over sigma, [K, R, p], at lambdas [K, G]."""
+        """Turn noise [K, R, p] into deviations of the coefficients over sigma, [K, R, p], at lambdas [K, G]."""
         found, kept = np.zeros(noise.shape), np.append(self.live, np.arange(self.q, noise.shape[2]))
         at = self.sums.reduced(ratios[:, len(self.groups) :])
         found[:, :, kept] = self.sums.spread(at, self._penalties(ratios), noise[:, :, kept])
         return found
 
     def _without_levels(self, ratios: Floats) -> tuple[Floats, Floats]:
-        """Equations [K, q + 1, q + 1] and log determinants [K] of what was eliminated, for lambdas [K, G]: few pairs of levels differ."""
+        """Return equations [K, q + 1, q + 1] and log determinants [K] of what was eliminated, for lambdas [K, G]: few pairs of levels
+        differ.
+        """
         pairs, place = np.unique(ratios[:, len(self.groups) :], axis=0, return_inverse=True)
         at = self.sums.reduced(pairs)
         return at.joint[place], at.log_det[place]
@@ -322,7 +325,7 @@ class _Problem:
         return np.asarray(prior - 0.5 * (log_det + self.degrees * np.log(squares)), dtype=np.float64)
 
     def search(self) -> Floats:
-        """Likeliest lambdas [G], one coordinate at a time, first over decades, then around what was found."""
+        """Search the likeliest lambdas [G], one coordinate at a time, first over decades, then around the best ones."""
         groups = len(self.groups) + len(self.sums.levels)
         best = np.full(groups, 0.1)
         for _ in range(6):
@@ -337,7 +340,7 @@ class _Problem:
         return best
 
     def refined(self, best: Floats) -> Floats:
-        """The likeliest lambdas [G] near those that the search found, which lie on a grid."""
+        """Find the likeliest lambdas [G] near those of the search, which are on a grid."""
         best = best.copy()
         for multiples in FINER:
             for _ in range(3):  # one coordinate at a time: what one gains another gives up
@@ -346,11 +349,11 @@ class _Problem:
         return best
 
     def satterthwaite(self, best: Floats, variance: float) -> Floats:
-        """Degrees of freedom of the coefficients' variances, [q], at the largest restricted likelihood (Satterthwaite 1946; Giesbrecht and
-        Burns 1985).
+        """Compute the degrees of freedom of the coefficients' variances, [q], at the largest restricted likelihood (Satterthwaite 1946;
+        Giesbrecht and Burns 1985).
 
         2 over the variance of the logarithm of a coefficient's variance, which has that of log lambda and log sigma^2 from the curvature of
-        the likelihood. Groups without a variance of their own are left out, as in lmerTest (Kuznetsova, Brockhoff and Christensen 2017).
+        the likelihood. Groups without a variance of their own are ignored, as in lmerTest (Kuznetsova, Brockhoff and Christensen 2017).
         """
         active = [g for g, columns in enumerate(self.groups) if columns and 1e2 * SMALLEST < best[g] < LARGEST]
         n, step = len(active) + 1, 1e-2
@@ -379,7 +382,7 @@ class _Problem:
         return np.asarray(np.divide(2.0, spread, out=np.full(self.q, np.inf), where=spread > 0))
 
     def steps(self, best: Floats) -> list[float]:
-        """Ratio between neighbouring lambdas of the grid, per group."""
+        """Choose the ratio between neighbouring lambdas of the grid, per group."""
         top = self.log_posterior(best[None])[0]
         found = []
         for g in range(len(best)):

@@ -1,11 +1,11 @@
 """Sums of sessions that lie in visits, and the elimination of both levels from the equations of a mixed model.
 
-A session has a level of its own, and its visit has one. The column of a level is that of the overall level on its own rows, so that no
-row of the equations for levels has to be written down: the block of the sessions is diagonal, and once sessions are eliminated (Schur
-complement) so is that of the visits. What is left has the size of the other columns, however many sessions there are.
+A session has a level of its own, and its visit has one. The column of a level is that of the overall level on its own rows. So no row of
+the equations for levels has to be written down. The block of the sessions is diagonal; once sessions are eliminated (Schur complement), so
+is that of the visits. What is left has the size of the other columns, however many sessions there are.
 
-Draws are those of the Cholesky factor of all equations in the order columns, visits, sessions, without making it: from the last session to
-the first each level is drawn given those after it. What the columns leave open is kept as a small covariance, which every step updates by
+Draws are those of the Cholesky factor of all equations in the order columns, visits, sessions, without making it. Each level is drawn given
+those after it, from the last session to the first. What the columns leave open is kept as a small covariance, which every step updates by
 one vector, as in Kalman's filter.
 """
 
@@ -79,18 +79,18 @@ class SessionSums:
         return float(self.diagonal.sum() + 2 * self.joint[:, 0, 0].sum())
 
     def take(self, columns: Indices) -> SessionSums:
-        """Of some columns, the first among them."""
+        """Select the sums of some columns, the first among them."""
         kept = np.append(columns, self.joint.shape[1] - 1)
         return replace(self, joint=self.joint[:, kept[:, None], kept])
 
     def changed(self, change: Floats) -> SessionSums:
-        """Of the columns that are the present ones times a matrix [c, c'], whose first is the first."""
+        """Return the sums of new columns: the present ones times a matrix [c, c'], which keeps the first column."""
         whole = np.zeros((change.shape[0] + 1, change.shape[1] + 1))
         whole[:-1, :-1], whole[-1, -1] = change, 1.0
         return replace(self, joint=whole.T @ self.joint @ whole)
 
     def reduced(self, ratios: Floats, present: Floats | None = None) -> Reduced:
-        """Equations without the levels at lambdas of visits and sessions [B, 2]; `present` [B, n] leaves sessions out."""
+        """Return the equations without the levels at lambdas of visits and sessions [B, 2]; `present` [B, n] excludes sessions."""
         by_level = self.joint[:, 0, :]
         own, of_visit, of_session = by_level[:, 0], 1 / ratios[:, :1], 1 / ratios[:, 1:]
         some = np.ones((len(ratios), len(own))) if present is None else present
@@ -107,7 +107,7 @@ class SessionSums:
         return Reduced(joint, log_det, visits, ratios, some)
 
     def means(self, at: Reduced, columns: Floats) -> tuple[Floats, Floats]:
-        """Levels of visits [B, V] and sessions [B, n] given the columns' coefficients [B, c]; 0 where no row counts."""
+        """Return levels of visits [B, V] and sessions [B, n] given the columns' coefficients [B, c]; 0 where no row counts."""
         with_y = np.concatenate([-columns, np.ones((len(columns), 1))], axis=1)[..., None]
         of_visit = (at.visits @ with_y)[..., 0] / (at.visits[:, :, 0] + 1 / at.ratios[:, :1])
         by_level = at.present[..., None] * self.joint[:, 0, :]
@@ -115,7 +115,7 @@ class SessionSums:
         return of_visit, left / (by_level[:, :, 0] + 1 / at.ratios[:, 1:])
 
     def spread(self, at: Reduced, penalties: Floats, noise: Floats) -> Floats:
-        """L^-T times noise [B, R, c + V + n], where L L^T are all equations with the penalties [B, c] of the columns.
+        """Multiply L^-T by noise [B, R, c + V + n], where L L^T are all equations with the penalties [B, c] of the columns.
 
         Levels without a row are 0; columns without one keep their share of the noise.
         """

@@ -45,7 +45,8 @@ class FailureRule(StrEnum):
     """Value of a session that was stopped for the patient's sake.
 
     WORST_CASE: the failure value under the controller; under cDBS what was measured, so that no failure of cDBS helps the controller.
-    BOTH_ARMS: the failure value under either. AS_MEASURED: what was measured, or left out. END_OF_SCALE: under the controller the worst end
+    BOTH_ARMS: the failure value under either. AS_MEASURED: what was measured, or excluded where nothing was. END_OF_SCALE: under the
+        controller the worst end
     of the scale, also where the failure value is not that bad.
     """
 
@@ -218,7 +219,7 @@ def assess(
     if not outcomes:
         raise ValueError("non-inferiority needs at least one outcome with its margin")
     if not 0 < alpha < 0.5:
-        raise ValueError(f"the level of a one-sided test lies between 0 and 0.5, not at {alpha}")
+        raise ValueError(f"the level of a one-sided test must be between 0 and 0.5, not {alpha}")
     rule = FailureRule.WORST_CASE
     results = tuple(_outcome(o, rule, level) for o in outcomes)
     spent = counted_energy(energy, stopped, rule)

@@ -62,7 +62,7 @@ def pool_estimates(estimates: Floats, errors: Floats, level: float = 0.95) -> Su
         ValueError: a standard error that is not above zero, or a level outside (0, 1).
     """
     if not 0 < level < 1:
-        raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")
+        raise ValueError(f"the level of an interval must be between 0 and 1, not {level}")
     k = estimates.size
     if k < 2:
         return Unavailable(Reason.TOO_FEW_PARTICIPANTS, k, 2)

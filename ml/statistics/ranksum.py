@@ -55,7 +55,7 @@ class RankSum:
 
 
 def rank_sum(x: ArrayLike, y: ArrayLike, level: float = 0.95) -> RankSum:
-    """Two-sided Wilcoxon rank-sum test and the Hodges-Lehmann shift between two groups of sessions.
+    """Test two groups of sessions by the two-sided Wilcoxon rank-sum test, and estimate the Hodges-Lehmann shift between them.
 
     Args:
         x: one value per session of the first controller, shape [n_x], finite.
@@ -67,7 +67,7 @@ def rank_sum(x: ArrayLike, y: ArrayLike, level: float = 0.95) -> RankSum:
     """
     x, y = _group(x, "first"), _group(y, "second")
     if not 0 < level < 1:
-        raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")
+        raise ValueError(f"the level of an interval must be between 0 and 1, not {level}")
     u = _u(x, y)
     exact = _is_exact(x, y)
     null = _null(x, y) if exact else None
@@ -92,7 +92,7 @@ def rank_sum(x: ArrayLike, y: ArrayLike, level: float = 0.95) -> RankSum:
 
 
 def as_in_the_paper(data: Measurements, level: float = 0.95) -> RankSum | Unavailable:
-    """The paper's test: all sessions of a controller against all of cDBS, whatever their visit.
+    """Run the paper's test: all sessions of a controller against all of cDBS, whatever their visit.
 
     Returns:
         The test of the sessions that have a value, or that one of the arms has none.
@@ -105,7 +105,7 @@ def as_in_the_paper(data: Measurements, level: float = 0.95) -> RankSum | Unavai
 
 
 def p_greater(x: ArrayLike, y: ArrayLike) -> float:
-    """One-sided p-value of the rank-sum test that x tends to be larger than y.
+    """Compute the one-sided p-value of the rank-sum test that x tends to be larger than y.
 
     Raises:
         ValueError: a group `rank_sum` would refuse.
@@ -116,7 +116,7 @@ def p_greater(x: ArrayLike, y: ArrayLike) -> float:
 
 @lru_cache(maxsize=256)
 def u_distribution(n_x: int, n_y: int) -> NDArray[np.float64]:
-    """Exact probabilities of U = 0 ... n_x n_y without ties, shape [n_x n_y + 1].
+    """Compute the exact probabilities of U = 0 ... n_x n_y without ties, shape [n_x n_y + 1].
 
     The number of rankings with U = u is the coefficient of q^u in the Gaussian binomial coefficient, the product over
     i = 1 ... n_x of (1 - q^(n_y + i)) / (1 - q^i).
@@ -154,7 +154,7 @@ def _is_exact(x: NDArray[np.float64], y: NDArray[np.float64]) -> bool:
 
 
 def _null(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Exact probabilities of 2 U = 0 ... 2 n_x n_y, given which values are tied; shape [2 n_x n_y + 1]."""
+    """Compute the exact probabilities of 2 U = 0 ... 2 n_x n_y, given which values are tied; shape [2 n_x n_y + 1]."""
     sizes = np.unique(np.concatenate([x, y]), return_counts=True)[1]
     if sizes.max() > 1:
         return u_distribution_given_ties(x.size, tuple(sizes.tolist()))
@@ -165,7 +165,7 @@ def _null(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]
 
 @lru_cache(maxsize=256)
 def u_distribution_given_ties(n_x: int, sizes: tuple[int, ...]) -> NDArray[np.float64]:
-    """Exact probabilities of 2 U given the ties: every choice of n_x of the pooled mid-ranks is equally likely.
+    """Compute the exact probabilities of 2 U given the ties: every choice of n_x of the pooled mid-ranks is equally likely.
 
     Args:
         n_x: values of the first group.
@@ -195,7 +195,7 @@ def u_distribution_given_ties(n_x: int, sizes: tuple[int, ...]) -> NDArray[np.fl
 
 
 def _standard_deviation(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    """Of U under the null hypothesis, with the correction for ties."""
+    """Compute the standard deviation of U under the null hypothesis, with the correction for ties."""
     n = x.size + y.size
     ties = np.unique(np.concatenate([x, y]), return_counts=True)[1].astype(np.float64)
     correction = float(np.sum(ties**3 - ties)) / (n * (n - 1)) if n > 1 else 0.0
@@ -203,7 +203,7 @@ def _standard_deviation(x: NDArray[np.float64], y: NDArray[np.float64]) -> float
 
 
 def _tail(x: NDArray[np.float64], y: NDArray[np.float64], u: float, null: NDArray[np.float64] | None) -> float:
-    """P(U >= u) under the null hypothesis, by its exact distribution where there is one."""
+    """Compute P(U >= u) under the null hypothesis, by its exact distribution where there is one."""
     if null is not None:
         return float(min(1.0, null[round(2 * u) :].sum()))
     sd = _standard_deviation(x, y)
@@ -213,7 +213,7 @@ def _tail(x: NDArray[np.float64], y: NDArray[np.float64], u: float, null: NDArra
 
 
 def _shift_interval(n_x: int, n_y: int, differences: NDArray[np.float64], level: float) -> tuple[float, float] | None:
-    """Interval of the shift: the k-th smallest and largest of the pairwise differences, sorted; None where no k has the level.
+    """Bound the shift by the k-th smallest and largest of the pairwise differences, sorted; None where no k has the level.
 
     k is that of the distribution without ties. With ties the interval, its ends included, covers at least as often (Lehmann 1963).
     """

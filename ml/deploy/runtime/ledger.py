@@ -50,7 +50,7 @@ class Ledger:
         if latest is not None and now < latest - CLOCK_TOLERANCE and now.date() < latest.astimezone(now.tzinfo).date():
             raise NotAllowed(
                 Refusal.CLOCK,
-                f"the tablet's clock says {now:%Y-%m-%d %H:%M} and has said {latest.astimezone(now.tzinfo):%Y-%m-%d %H:%M} before: set it",
+                f"the tablet's clock says {now:%Y-%m-%d %H:%M} and showed {latest.astimezone(now.tzinfo):%Y-%m-%d %H:%M} before: set it",
             )
 
     def withdraw(self, withdrawn: Withdrawals) -> None:
@@ -67,7 +67,7 @@ class Ledger:
         except FileNotFoundError:
             return None
         except (ValueError, KeyError, TypeError) as error:
-            raise NotAllowed(Refusal.WITHDRAWN, f"{self.folder / _WITHDRAWN} is damaged: give the tablet the study's list anew") from error
+            raise NotAllowed(Refusal.WITHDRAWN, f"{self.folder / _WITHDRAWN} is damaged: give the tablet the study's list again") from error
 
     def check_unused(self, participant: str, slot: Slot) -> None:
         """Raise NotAllowed where the policy or schedule of a slot has decided already; says when, and how it ended."""

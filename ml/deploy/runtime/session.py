@@ -86,7 +86,7 @@ def check_allowed(manifest: Mapping[str, Any], tablet: Tablet, participant: str 
     """
     slot = slot_of(manifest)
     if not manifest.get("approvals"):
-        raise NotAllowed(Refusal.NOT_SIGNED, "nobody signed the plan of this bundle: it is not to be used on a participant")
+        raise NotAllowed(Refusal.NOT_SIGNED, "the plan of this bundle is not signed: it is not to be used on a participant")
     if participant is not None and participant != manifest["participant"]:
         message = f"the bundle is of participant {manifest['participant']}, not {participant}"
         raise NotAllowed(Refusal.OTHER_PARTICIPANT, message)

@@ -115,7 +115,7 @@ class Withdrawals:
         """Raise NotAllowed for a slot of a plan, or with a policy, that was taken back."""
         if policy_id is not None and policy_id in self.policies:
             which = f"policy {policy_id}" if slot.label is None else f"what session {slot.label} was to run"  # a blinded one is not named
-            raise NotAllowed(Refusal.WITHDRAWN, f"{which} was withdrawn; have the plan changed and signed anew")
+            raise NotAllowed(Refusal.WITHDRAWN, f"{which} was withdrawn; have the plan changed and signed again")
         if slot.plan_id in self.plans:
             raise NotAllowed(Refusal.WITHDRAWN, f"plan {slot.plan_id} was replaced or withdrawn; take a bundle of the present plan")
 

@@ -47,7 +47,7 @@ class GraspLog(OutcomeLog):
 
 
 def looks_like_grasps(headers: Sequence[str]) -> bool:
-    """Whether a table with these headers is a grasp test: times and hands, or nothing but times."""
+    """Check whether a table with these headers is a grasp test: times and hands, or nothing but times."""
     keys = [column_name(header)[0] for header in headers]
     if any(key in BETA_NAMES or key.startswith(("lfp", "amplitude")) for key in keys):
         return False

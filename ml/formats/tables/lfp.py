@@ -119,7 +119,7 @@ def _times(columns: Columns) -> NDArray[np.float64]:
     if (back := np.flatnonzero(np.diff(t_s) <= 0)).size:
         i = int(back[0]) + 1
         what = f"times must increase: {t_s[i]:g} s comes after {t_s[i - 1]:g} s"
-        raise columns.error(what, "t_s", "Sort the rows; write the times with enough decimals to tell samples apart.", i)
+        raise columns.error(what, "t_s", "Sort the rows; write the times with enough decimals to distinguish samples.", i)
     check_reach(t_s, columns)
     if t_s[-1] <= 0:
         raise columns.error("no row with t_s > 0", "t_s", "The session starts at 0; rows before it are its lead.")

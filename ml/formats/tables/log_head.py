@@ -52,7 +52,7 @@ class Ran:
         policy_id, network_sha256: the policy, by number and by the SHA-256 of its network; None where a schedule ran. side: hemisphere.
         min_ma, max_ma, cdbs_ma, ramp_ma_per_s: limits of the bundle.
     and from version 3 on:
-        purpose: `session` of a signed plan, `bench` (nobody was connected) or `replay` (of a recording or simulation).
+        purpose: `session` of a signed plan, `bench` (no participant connected) or `replay` (of a recording or simulation).
         participant: code. manifest_sha256: of the bundle. started_at: ISO 8601 with its offset.
         plan_id, slot_id, position, repeat, controller, visit_number, visit_date: the slot.
         simulated: whether the device side was a simulation; None where it was not.

@@ -68,7 +68,7 @@ class TremorLog(OutcomeLog):
 
 
 def looks_like_tremor(headers: Sequence[str]) -> bool:
-    """Whether a table with these headers holds minutes of tremor."""
+    """Check whether a table with these headers holds minutes of tremor."""
     keys = {_key(header) for header in headers}
     named = {"mild", "moderate", "strong"} <= keys or "severity" in keys
     return named or (bool(keys & set(CLASS_NAMES)) and bool(keys & set(TIME_NAMES)))
@@ -160,7 +160,7 @@ def _lengths(table: TextTable, columns: dict[str, int], time: int, start: NDArra
 
 
 def _by_class(table: TextTable, columns: dict[str, int], time: int, of_class: int, report: FileReport) -> TremorLog:
-    """One class per minute: that class has the whole minute."""
+    """Read one class per minute: that class has the whole minute."""
     start = _starts(table, time, report)
     fractions = np.zeros((start.size, len(TREMOR_CLASSES)))
     for i, (row, line) in enumerate(zip(table.rows, table.lines, strict=True)):
@@ -206,7 +206,7 @@ def _long(table: TextTable, columns: dict[str, int], time: int, report: FileRepo
 
 
 def _class_seconds(seconds: dict[str, float], name: str) -> float:
-    """Seconds of a class: no row for it means none, unless the minute states nothing but the sum and that is not 0."""
+    """Return the seconds of a class: no row for it means none, unless the minute states nothing but the sum and that is not 0."""
     if name in seconds:
         return seconds[name]
     only_sum = set(seconds) == {SUMMARY}

@@ -155,8 +155,8 @@ def session_noise(buffer: ReplayBuffer) -> dict[str, float]:
 def return_noise(buffer: ReplayBuffer, horizon_steps: int) -> float:
     """Estimate the standard deviation of a session's return from session to session under one controller at one visit, reward units.
 
-    Random sessions count only where the others have too few, as in `session_noise`; 0 where fewer than three degrees of freedom speak about
-    it all the same. A missing r_end leaves the session out where others have one; where no session has one, a return is its steps' part.
+    Random sessions count only where the others have too few, as in `session_noise`. The estimate is 0 with fewer than three degrees of
+    freedom. A missing r_end leaves the session out where others have one; where no session has one, a return is its steps' part.
     """
     found = [(s, actual_return(s, buffer.settings, horizon_steps)) for s in buffer.sessions]
     with_end = any(value.end_reward is not None for _, value in found)

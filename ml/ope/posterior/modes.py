@@ -1,4 +1,4 @@
-"""Beta's answer to the amplitude as low-passes of several speeds behind dose functions, shrunk as far as the data ask for.
+"""Response of beta to the amplitude as low-passes of several speeds behind dose functions, shrunk as far as the data ask for.
 
     y_t = mu + visit + session + sum over j, m of g_jm L_m[p_j(a)]_t + sum over k of h_k U_k[a]_t + sum over k of r_k F_k[a]_t + eta_t
     eta_t = sum over l <= W of phi_l eta_{t-l} + e_t

@@ -378,7 +378,7 @@ def student(
     `freed`: the contrasts that it is the average of, [V], where they are not those of `of`.
     """
     if not 0 < level < 1:
-        raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")
+        raise ValueError(f"the level of an interval must be between 0 and 1, not {level}")
     scale = NEGLIGIBLE * max(1.0, float(np.abs(of.contrast).max()))
     error, degrees = float(np.sqrt(variance)), min(of.visits - 1, at_most)
     if error <= scale:

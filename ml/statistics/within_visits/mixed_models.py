@@ -1,11 +1,11 @@
-"""Mixed models of a controller against cDBS. They have a level of each visit, an effect of the controller that differs between visits, and
-policies within it.
+"""Mixed models of a controller against cDBS, with a level of each visit, an effect that differs between visits, and policies within the
+controller.
 
 They use every session at once and say how far visits and policies differ. All are tested on t with one degree of freedom fewer than visits
 with both arms, never as a normal deviate: the spread between visits is what they know least. Where Satterthwaite's approximation has fewer
-degrees (policies that differ, and few of them), the linear model takes those. Metrics that are measured on a scale follow
-the linear model; a scale without equal steps follows ordered categories, and minutes are counts of those watched, with a level of each
-session because the minutes of one session resemble each other.
+degrees (policies that differ, and few of them), the linear model takes those. Metrics that are measured on a scale follow the linear model;
+a scale without equal steps follows ordered categories. Minutes are counts of those watched, with a level of each session because the
+minutes of one session resemble each other.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def linear_comparison(data: Measurements, policy: Integers | None = None, level:
 
 
 def ordinal_comparison(data: Measurements, policy: Integers | None = None, level: float = 0.95) -> MixedComparison | Unavailable:
-    """Proportional-odds mixed model of ordered categories; the effect is the log odds of a higher one.
+    """Fit the proportional-odds mixed model of ordered categories; the effect is the log odds of a higher one.
 
     Args:
         data, policy, level: as in `linear_comparison`.
@@ -112,7 +112,7 @@ def ordinal_comparison(data: Measurements, policy: Integers | None = None, level
 def minutes_comparison(
     data: Measurements, minutes: Floats, policy: Integers | None = None, level: float = 0.95
 ) -> MixedComparison | Unavailable:
-    """Binomial mixed model of counted minutes; the effect is the log odds of such a minute.
+    """Fit the binomial mixed model of counted minutes; the effect is the log odds of such a minute.
 
     Args:
         data: value is the number of counted minutes (or a share of them, summed over time). minutes: watched, [n], NaN or 0 where none.

@@ -123,7 +123,7 @@ def shift_interval(data: Measurements, level: float = 0.95, *, seed: int = 0) ->
         ValueError: a level outside (0, 1).
     """
     if not 0 < level < 1:
-        raise ValueError(f"the level of an interval lies between 0 and 1, not at {level}")
+        raise ValueError(f"the level of an interval must be between 0 and 1, not {level}")
     strata = _strata(data)
     if isinstance(strata, Unavailable):
         return strata

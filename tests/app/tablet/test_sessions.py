@@ -216,7 +216,7 @@ def test_a_bundle_of_tomorrow_waits_and_a_clock_that_is_set_back_opens_nothing(t
     with pytest.raises(Invalid, match=r"for the visit of 2026-03-03; today is 2026-03-02"):
         run(of_slot(tmp_path, slot=tomorrow), tmp_path)
     run(of_slot(tmp_path, slot=tomorrow), tmp_path, MORNING + timedelta(days=1))
-    with pytest.raises(Invalid, match="has said 2026-03-03 09:30 before"):
+    with pytest.raises(Invalid, match="showed 2026-03-03 09:30 before"):
         run(of_slot(tmp_path), tmp_path, MORNING, log="back.csv")
 
 
@@ -292,7 +292,7 @@ def test_a_plan_that_was_replaced_is_refused(tmp_path: Path) -> None:
 def test_what_nobody_signed_runs_on_the_bench_alone(tmp_path: Path) -> None:
     with pytest.raises(Invalid, match=r"for no session of a signed plan .* runs on the bench alone"):
         run(made(tmp_path), tmp_path)
-    with pytest.raises(Invalid, match="nobody signed the plan of this bundle"):
+    with pytest.raises(Invalid, match="the plan of this bundle is not signed"):
         run(made(tmp_path, slot=SLOT), tmp_path)
     assert not (tmp_path / "ledger").exists()
     bench = run(made(tmp_path), tmp_path, bench=True)

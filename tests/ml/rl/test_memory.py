@@ -92,5 +92,5 @@ def test_every_algorithm_learns_with_a_memory_and_its_training_is_stored_whole(n
 
 def test_a_memory_that_is_missing_is_asked_for() -> None:
     transitions, _ = delayed(50)
-    with pytest.raises(ValueError, match="beside the transitions"):
+    with pytest.raises(ValueError, match="with the transitions"):
         train_on(transitions, GAMMA, (0.0, 0.46), [ALGORITHMS["ddpg"].config(updates=1, critic_memory=True)])

@@ -160,7 +160,7 @@ def test_inputs_that_do_not_fit_together_are_refused_in_words():
         Measurements.of([np.inf], [1], [0])
     with pytest.raises(ValueError, match="resolution"):
         Measurements.of([1.0], [1], [0], resolution=-1)
-    with pytest.raises(ValueError, match="lies between 0 and 1"):
+    with pytest.raises(ValueError, match="must be between 0 and 1"):
         average(visit_contrasts(study()), 1.0)
 
 
