@@ -1,4 +1,4 @@
-"""What a caller may do for a participant, a site and a study, while they take part."""
+"""Permissions of a caller for a participant, a site and a study, while they take part."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ NOT_AFTER_WITHDRAWAL = frozenset(
 
 
 def withdrawn_codes(participants: Iterable[Participant]) -> frozenset[str]:
-    """Codes of those among participants who have withdrawn, for lists that mark them."""
+    """Return the codes of withdrawn participants, for lists that mark them."""
     return frozenset(p.code for p in participants if p.status == WITHDRAWN)
 
 
 def require(caller: Caller, permission: str, participant: Participant) -> None:
-    """Raises NotFound or Forbidden unless the caller holds the permission for this participant.
+    """Raise NotFound or Forbidden unless the caller holds the permission for this participant.
 
     Raises Conflict where it would be new work for a participant who has withdrawn.
     """
@@ -42,7 +42,7 @@ def require(caller: Caller, permission: str, participant: Participant) -> None:
 
 
 def refuse_withdrawn(participant: Participant) -> None:
-    """Raises Conflict for new work for a participant who has withdrawn."""
+    """Raise Conflict for new work for a participant who has withdrawn."""
     if participant.status == WITHDRAWN:
         raise Conflict(
             f"Participant {participant.code} has withdrawn from the study: nothing new is recorded, computed or planned.",
@@ -51,9 +51,9 @@ def refuse_withdrawn(participant: Participant) -> None:
 
 
 def require_still_taking_part(db: Session, participant: Participant) -> None:
-    """Raises Conflict where the participant has withdrawn, or the study has ended, since the caller was judged.
+    """Raise Conflict where the participant has withdrawn, or the study has ended, since the caller was judged.
 
-    Neither happens from here to the end of the transaction: whoever withdraws or ends waits for it, and sees what it made.
+    Neither happens from here to the end of the transaction: a withdrawal or an end waits for it, and sees what it made.
     """
     repository.hold_participation(db, participant)
     refuse_ended_study(participant.site)
@@ -61,23 +61,23 @@ def require_still_taking_part(db: Session, participant: Participant) -> None:
 
 
 def refuse_ended(site: Site) -> None:
-    """Raises Conflict for new participants and new data of a site or a study that has ended."""
+    """Raise Conflict for new participants and new data of a site or a study that has ended."""
     if site.ended_at is not None:
         raise Conflict(
-            f"Site '{site.code}' has ended: nobody is enrolled there and nothing is uploaded.",
+            f"Site '{site.code}' has ended: it takes no new participants and no uploads.",
             "An administrator of the study can open it again.",
         )
     refuse_ended_study(site)
 
 
 def refuse_ended_study(site: Site) -> None:
-    """Raises Conflict for any change in a study that has ended: to people it is refused with their roles (`Grant.holds`)."""
+    """Raise Conflict for any change in a study that has ended: to people it is refused with their roles (`Grant.holds`)."""
     if site.study.ended_at is not None:
         raise Conflict(f"Study '{site.study.code}' has ended: it is read and exported, and nothing in it changes.", can.STUDY_ENDED_HINT)
 
 
 def may(caller: Caller, permission: str, participant: Participant) -> bool:
-    """Whether the caller holds the permission for this participant: for pages that leave out what would be refused."""
+    """Check whether the caller holds the permission for this participant: for pages that hide what would be refused."""
     return caller.may(permission, participant.site.study_id, participant.site_id)
 
 
@@ -86,11 +86,11 @@ class Owned(Protocol):
 
     @property
     def participant_id(self) -> int | None:
-        """Whose it is."""
+        """Participant that owns the row."""
 
 
 def require_own(participant: Participant, row: Owned, name: str) -> None:
-    """Objects that are named together belong together.
+    """Require that objects named together belong to one participant.
 
     Args:
         participant: whose object it should be. row: the object. name: what to call it, e.g. "policy 7".

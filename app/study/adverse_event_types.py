@@ -68,7 +68,7 @@ HARM = (EventOutcome.LASTING_HARM, EventOutcome.FATAL)
 
 
 class AdverseEventFields(Model):
-    """What is known of an adverse event."""
+    """Facts of an adverse event."""
 
     kind: EventKind | None = Field(None, description="Null only where the severity is `none`: nothing was found.")
     severity: Severity
@@ -103,7 +103,7 @@ class AdverseEventIn(AdverseEventFields):
 
     session_id: Int | None = Field(None, ge=1)
     visit_id: Int | None = Field(None, ge=1)
-    policy_id: Int | None = Field(None, ge=1, description="What ran, where no session is there to tell.")
+    policy_id: Int | None = Field(None, ge=1, description="What ran, where no session is stated.")
     occurred_at: Moment | None = Field(None, description="Without an offset it is UTC.")
     entry_key: Text | None = Field(
         None, min_length=1, max_length=64, description="Name of the entry on the device it was made on: sent twice, it is one event."
@@ -111,14 +111,14 @@ class AdverseEventIn(AdverseEventFields):
 
 
 class AdverseEventChange(AdverseEventFields):
-    """What is known now, as a whole, and why it changed. It is not cleared any more."""
+    """New facts of an adverse event, as a whole, and the reason of the change. The event loses its clearance."""
 
     revision: Int = Field(ge=1, description="The one that the caller has read.")
     reason: Text = Field(min_length=1, max_length=1000, description="Kept with the revision and in the audit trail.")
 
 
 class ClearanceIn(Model):
-    """A clinician's word that a serious event does not stand against what ran."""
+    """A clinician's word that a serious event does not count against what ran."""
 
     revision: Int = Field(ge=1, description="The one that the caller has read.")
     reason: Text = Field(min_length=1, max_length=1000, description="Kept with the event and in the audit trail.")

@@ -27,7 +27,7 @@ from app.tables.visits import Visit
 
 
 def event(db: Session, event_id: int, caller: Caller) -> AdverseEvent:
-    """An event. Raises NotFound."""
+    """Load an event. Raises NotFound."""
     query = _events().join(AdverseEvent.participant).join(Participant.site).where(AdverseEvent.id == event_id, in_scope(caller))
     row = db.scalar(query)
     if row is None:
@@ -36,7 +36,7 @@ def event(db: Session, event_id: int, caller: Caller) -> AdverseEvent:
 
 
 def events_of_participant(db: Session, participant_id: int) -> Sequence[AdverseEvent]:
-    """A participant's events in the order in which they were entered."""
+    """Load a participant's events in the order in which they were entered."""
     return db.scalars(_events().where(AdverseEvent.participant_id == participant_id).order_by(AdverseEvent.id)).all()
 
 
@@ -55,7 +55,7 @@ def with_blocking_events(db: Session) -> Sequence[Participant]:
 
 
 def events_of_session(db: Session, session_id: int) -> Sequence[AdverseEvent]:
-    """The events of a session in the order in which they were entered."""
+    """Load the events of a session in the order in which they were entered."""
     return db.scalars(_events().where(AdverseEvent.session_id == session_id).order_by(AdverseEvent.id)).all()
 
 
@@ -76,13 +76,13 @@ def late_stops(db: Session, participant_ids: Collection[int]) -> frozenset[int]:
 
 
 def event_by_key(db: Session, participant_id: int, entry_key: str) -> AdverseEvent | None:
-    """A participant's event of the name that its entry had on a device."""
+    """Find a participant's event by the name that its entry had on a device."""
     mine = (AdverseEvent.participant_id == participant_id) & (AdverseEvent.entry_key == entry_key)
     return db.scalar(_events().where(mine))
 
 
 def lock_event(db: Session, row: AdverseEvent) -> None:
-    """Hold an event for this transaction and read its revisions again, so that two corrections at once are asked in turn."""
+    """Lock an event for this transaction and read its revisions again, so that two corrections at once are checked in turn."""
     db.execute(select(AdverseEvent.id).where(AdverseEvent.id == row.id).with_for_update())
     db.expire(row, ["revisions"])
 
@@ -148,7 +148,7 @@ def change_adverse_event(db: Session, event: AdverseEvent, change: AdverseEventC
     """Correct what is known of an event: a new revision, which a clinician has not cleared.
 
     Raises:
-        Forbidden: the caller may not correct the study's data. Conflict: somebody else changed it. Invalid: no reason.
+        Forbidden: the caller may not correct the study's data. Conflict: another person changed it. Invalid: no reason.
     """
     access.require(caller, can.WRITE_STUDY, event.participant)
     _require_order(event.occurred_at, change)
@@ -168,13 +168,13 @@ def take_back_entry(db: Session, event: AdverseEvent, reason: str, caller: Calle
 
 
 def clear_adverse_event(db: Session, event: AdverseEvent, revision: int, reason: str, caller: Caller) -> AdverseEvent:
-    """State as a clinician that a serious event, or a stop, does not stand against what ran.
+    """State as a clinician that a serious event, or a stop, does not count against what ran.
 
     Args:
         revision: the one that the caller has read.
 
     Raises:
-        Forbidden: the caller approves no plans of this participant. Conflict: it does not block, or somebody changed it.
+        Forbidden: the caller approves no plans of this participant. Conflict: it does not block, or another person changed it.
         Invalid: no reason.
     """
     access.require(caller, can.CLEAR_EVENT, event.participant)
@@ -185,7 +185,7 @@ def clear_adverse_event(db: Session, event: AdverseEvent, revision: int, reason:
 
 
 def policy_of(event: AdverseEvent, caller: Caller) -> int | None:
-    """What ran when it happened: the session's policy, else the one that was stated; None where it is hidden or none did."""
+    """Return the policy that ran when it happened: the session's policy, else the stated one; None where it is hidden or none ran."""
     visit = event.session.visit if event.session is not None else event.visit
     if visit is not None and not blinding.may_know(visit, caller):
         return None
@@ -228,7 +228,7 @@ def _checked_visit(db: Session, participant: Participant, draft: AdverseEventIn,
         access.require_own(participant, session.visit, f"session {draft.session_id}")
     if session.status == "proposed":
         raise Conflict(
-            f"Session {session.id} is a proposal that nobody has confirmed yet.",
+            f"Session {session.id} is a proposal that is not confirmed yet.",
             "Confirm it first, or name the visit alone.",
             field="session_id",
         )
@@ -237,7 +237,7 @@ def _checked_visit(db: Session, participant: Participant, draft: AdverseEventIn,
             f"Session {session.id} is not of visit {draft.visit_id}.", "Leave the visit out, or correct one of them.", field="visit_id"
         )
     if draft.policy_id is not None:
-        raise Invalid("A session tells itself what ran.", "Leave the policy out; correct the session if it names the wrong one.")
+        raise Invalid("The session itself states what ran.", "Leave the policy out; correct the session if it names the wrong one.")
     return session.visit_id
 
 
@@ -289,7 +289,7 @@ def _revision(number: int, values: AdverseEventFields | AdverseEventRevision, ca
 
 
 def event_out(event: AdverseEvent, caller: Caller) -> AdverseEventOut:
-    """An event as it is known now; what ran comes through the blinding gate."""
+    """Convert the newest facts of an event; what ran comes through the blinding gate."""
     now = event.now
     return AdverseEventOut(
         id=event.id,

@@ -37,7 +37,7 @@ from app.tables.participants import Participant
 
 
 def current_event(event_id: RowId, db: Db, caller: CurrentCaller) -> AdverseEvent:
-    """The event that the path names."""
+    """Load the event that the path names."""
     return adverse_events_rules.event(db, event_id, caller)
 
 
@@ -51,7 +51,7 @@ api = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
 @api.get("/participants/{code}/adverse-events", dependencies=[ResultsViewed])
 def list_adverse_events(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> list[AdverseEventOut]:
-    """A participant's adverse events in the order in which they were entered."""
+    """List a participant's adverse events in the order in which they were entered."""
     return [event_out(row, caller) for row in adverse_events_rules.events_of_participant(db, participant.id)]
 
 
@@ -71,7 +71,7 @@ def change_adverse_event(event: CurrentEvent, change: AdverseEventChange, db: Db
 
 @api.post("/adverse-events/{event_id}/clearance", responses=problems(409))
 def clear_adverse_event(event: CurrentEvent, given: ClearanceIn, db: Db, caller: CurrentCaller) -> AdverseEventOut:
-    """State that a serious event does not stand against what ran. Those who approve plans alone."""
+    """State that a serious event does not count against what ran. Only for those who approve plans."""
     row = adverse_events_rules.clear_adverse_event(db, event, given.revision, given.reason, caller)
     return event_out(row, caller)
 
@@ -103,7 +103,7 @@ def all_adverse_events(request: Request, db: Db, caller: CurrentCaller, paging: 
 
 @pages.get("/participants/{code}/adverse-events", dependencies=[ResultsViewed])
 def adverse_events(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """All events of a participant, what waits for a clinician first, and a form for a new one."""
+    """Show all events of a participant, those that wait for a clinician first, and a form for a new one."""
     return _page(request, participant, db, caller, {})
 
 
@@ -160,7 +160,7 @@ def _page(
     error: BetaloopError | None = None,
     form: str = "event",
 ) -> HTMLResponse:
-    """The page; `form` is the one that was sent: `event` for a new one, `correct-3`, `clear-3`, as the ids of its fields begin."""
+    """Render the page; `form` is the one that was sent: `event` for a new one, `correct-3`, `clear-3`, as the ids of its fields begin."""
     found = adverse_events_rules.events_of_participant(db, participant.id)
     visits, _ = study_repository.visits(db, participant.id, 500, 0)
     page = render(

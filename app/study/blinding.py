@@ -1,8 +1,8 @@
 """The one gate through which pages, exports and analyses learn which controller a session had.
 
-Blinding hangs on this place: who may not know an arm is refused here or told that it is hidden, and nowhere else is the column read. It
-holds for two things: a person's role (blinded assessor), and a visit under a blinded plan whose key is sealed, of which nobody knows more
-than letters (`app.planning.plans.sign_off`).
+Blinding depends on this module: nowhere else is the column read. A user who may not know an arm is refused here, or sees that it is hidden.
+The gate checks two things. One is a person's role (blinded assessor). The other is a visit under a blinded plan whose key is sealed: only
+letters are known of it (`app.planning.plans.sign_off`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CONTROLLER_NAMES: dict[Controller, str] = {
 
 @dataclass(frozen=True)
 class Arm:
-    """What drove a session, as far as the asker may know."""
+    """Arm that drove a session, as far as the caller may know."""
 
     controller: Controller
     policy_id: int | None
@@ -44,10 +44,10 @@ class Arm:
 
 
 def arm(session: StudySession, user: Caller) -> Arm:
-    """The arm of a session for this user.
+    """Return the arm of a session for this user.
 
     Raises:
-        Conflict: the session is a proposal, and nobody has stated its controller yet.
+        Conflict: the session is a proposal without a stated controller.
         Forbidden: the user may not know it (`may_know`).
     """
     stated = stated_arm(session, user)
@@ -57,32 +57,32 @@ def arm(session: StudySession, user: Caller) -> Arm:
 
 
 def stated_arm(session: StudySession, user: Caller) -> Arm | None:
-    """The arm of a session that may still be a proposal; None where its controller is open. Raises Forbidden as `arm`."""
+    """Return the arm of a session that may still be a proposal; None where its controller is open. Raises Forbidden as `arm`."""
     require_known(session.visit, user)
     return None if session._controller is None else Arm(Controller(session._controller), session._policy_id)
 
 
 def is_stated(session: StudySession) -> bool:
-    """Whether a controller stands with a session, whichever it is."""
+    """Check whether a controller is stated for a session, whichever it is."""
     return session._controller is not None
 
 
 def visible_arm(session: StudySession, user: Caller) -> Arm | None:
-    """For lists: the arm, or None where it is hidden from this user or open."""
+    """Return the arm for a list, or None where it is hidden from this user or open."""
     return stated_arm(session, user) if may_know(session.visit, user) else None
 
 
 def visible_arms(sessions: Sequence[StudySession], user: Caller) -> list[Arm | None]:
-    """The same of many sessions, asking once for each of their visits."""
+    """Return the arms of many sessions for a list, checking each of their visits once."""
     known = {i: may_know(visit, user) for i, visit in {s.visit_id: s.visit for s in sessions}.items()}
     return [Arm(Controller(s._controller), s._policy_id) if known[s.visit_id] and s._controller is not None else None for s in sessions]
 
 
 def may_know(visit: Visit, user: Caller) -> bool:
-    """Whether the user may know the arms of a visit.
+    """Check whether the user may know the arms of a visit.
 
-    While the key of its blinded plan is sealed no person may, whoever drafted or signed it; machines may, and show nobody what they read.
-    Else everybody but a blinded assessor, and these once the visit is locked.
+    While the key of its blinded plan is sealed no person may, not even its author or signer. Machines may, and show what they read to no
+    person. Otherwise everybody may; a blinded assessor may once the visit is locked.
     """
     site = visit.participant.site
     user.require(can.READ, site.study_id, site.id)
@@ -92,7 +92,7 @@ def may_know(visit: Visit, user: Caller) -> bool:
 
 
 def require_known(visit: Visit, user: Caller) -> None:
-    """Raises Forbidden where the user may not know the arms of a visit, nor see what gives them away."""
+    """Raise Forbidden where the user may not know the arms of a visit, nor see what gives them away."""
     if may_know(visit, user):
         return
     if visit.sealed:
@@ -107,12 +107,12 @@ def require_known(visit: Visit, user: Caller) -> None:
 
 
 def unsealed(sessions: Iterable[StudySession]) -> list[StudySession]:
-    """Those whose visit's key is not sealed: what compares sessions by controller leaves the others out, whoever asks, jobs too."""
+    """Select sessions whose visit's key is not sealed: comparisons by controller exclude the others, for every caller, jobs too."""
     return [s for s in sessions if not s.visit.sealed]
 
 
 def sights(db: Session, participants: Sequence[Participant], user: Caller) -> list[Hashable]:
-    """What the user may know of each participant's arms: equal sights, equal arms. The visits that are hidden from the user."""
+    """Return what the user may know of each participant's arms: equal sights, equal arms. The visits that are hidden from the user."""
     for p in participants:
         user.require(can.READ, p.site.study_id, p.site.id)
     hidden = repository.hidden_visits(db, [p.id for p in participants])

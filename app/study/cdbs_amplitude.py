@@ -14,7 +14,7 @@ from app.tables.visits import Visit
 
 
 def stated_at(visit: Visit, hemisphere: Hemisphere | None, program: int | None = 0) -> float | None:
-    """The cDBS amplitude that a visit states for a hemisphere and program, mA; None where it states none.
+    """Return the cDBS amplitude that a visit states for a hemisphere and program, mA; None where it states none.
 
     A program of which the visit says nothing has the amplitude of program 0, under which an amplitude without a program is stored.
 
@@ -36,7 +36,7 @@ def stated_at(visit: Visit, hemisphere: Hemisphere | None, program: int | None =
 
 
 def in_force(visit: Visit, hemisphere: Hemisphere | None, settings: SettingsVersion, program: int = 0, alone: bool = True) -> float | None:
-    """The cDBS amplitude of a visit's hemisphere and program, mA, else the settings' shorthand; None where nobody stated one.
+    """Return the cDBS amplitude of a visit's hemisphere and program, mA, else the settings' shorthand; None where none is stated.
 
     Args:
         settings: the participant's present ones. alone: no other program of this side stimulates; else the amplitude stated for another
@@ -55,7 +55,7 @@ def in_force(visit: Visit, hemisphere: Hemisphere | None, settings: SettingsVers
 
 
 def held_settings(visit: Visit, settings: SettingsVersion) -> SettingsVersion:
-    """The settings whose cDBS amplitude a visit goes by where it states none: a locked one by those at its lock.
+    """Return the settings whose cDBS amplitude a visit uses where it states none: a locked one uses those at its lock.
 
     A new amplitude says nothing of days that are closed; the fractions, energies and signatures of those stay as they were.
 
@@ -68,17 +68,17 @@ def held_settings(visit: Visit, settings: SettingsVersion) -> SettingsVersion:
 
 
 def of_session(session: StudySession, settings: SettingsVersion, program: int = 0, alone: bool = True) -> float | None:
-    """The cDBS amplitude in force for a session, mA, as `in_force`; None where nobody stated one. Raises Invalid as `stated_at`."""
+    """Return the cDBS amplitude in force for a session, mA, as `in_force`; None where none is stated. Raises Invalid as `stated_at`."""
     return in_force(session.visit, session.hemisphere, settings, program, alone)
 
 
 def in_force_now(participant: Participant, hemisphere: Hemisphere | None) -> float:
-    """The cDBS amplitude of the newest visit that states one (of this hemisphere), mA, else the settings' shorthand.
+    """Return the cDBS amplitude of the newest visit that states one (of this hemisphere), mA, else the settings' shorthand.
 
     The newest is that of the latest date: an earlier day that was entered late has a higher number.
 
     Raises:
-        Invalid: as `stated_at`, or nobody has stated one.
+        Invalid: as `stated_at`, or none is stated.
     """
     for visit in _newest_first(participant.visits):
         stated = stated_at(visit, hemisphere, None)
@@ -91,7 +91,7 @@ def in_force_now(participant: Participant, hemisphere: Hemisphere | None) -> flo
 
 
 def _newest_first(visits: Iterable[Visit]) -> list[Visit]:
-    """Visits by date, the latest first; one without a date stands where its number puts it."""
+    """Sort visits by date, the latest first; one without a date keeps the place of its number."""
     day, found = date.min, []
     for visit in sorted(visits, key=lambda v: v.number):
         # a day before that of a lower number is its own, and not that of the visits after it
@@ -107,7 +107,7 @@ def plausible(amplitude_ma: None, who: str) -> None: ...
 @overload
 def plausible(amplitude_ma: float | None, who: str) -> float | None: ...
 def plausible(amplitude_ma: float | None, who: str) -> float | None:
-    """A stated cDBS amplitude, mA. Raises Invalid for one that earlier versions let in: fractions of it would be no numbers."""
+    """Return a stated cDBS amplitude, mA. Raises Invalid for one that earlier versions accepted: fractions of it would be no numbers."""
     if amplitude_ma is None or CDBS_MA.low <= amplitude_ma <= CDBS_MA.high:
         return amplitude_ma
     raise Invalid(

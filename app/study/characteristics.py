@@ -26,7 +26,7 @@ ClockTime = Annotated[str, StringConstraints(pattern=r"^([01][0-9]|2[0-3]):[0-5]
 
 
 class Target(StrEnum):
-    """Where a lead lies."""
+    """Target structure of a lead."""
 
     STN = "stn"
     GPI = "gpi"
@@ -76,9 +76,9 @@ class CharacteristicsFields(Model):
     @model_validator(mode="after")
     def _each_once(self) -> CharacteristicsFields:
         if len(set(self.symptoms)) < len(self.symptoms):
-            raise PydanticCustomError("twice", "a symptom stands twice in the list")
+            raise PydanticCustomError("twice", "a symptom is twice in the list")
         if len({(d.drug, d.at) for d in self.medication}) < len(self.medication):
-            raise PydanticCustomError("twice", "the same drug stands twice at one time: give both together")
+            raise PydanticCustomError("twice", "the same drug is listed twice at one time: give both together")
         return self
 
 
@@ -119,7 +119,7 @@ MEDICATION = "Medication of a visit day"
 
 
 def characteristics_words(known: CharacteristicsFields) -> dict[str, str]:
-    """Characteristics in words, by label; empty where nothing is stated."""
+    """Write characteristics in words, by label; empty where nothing is stated."""
     leads = "; ".join(
         f"{lead.hemisphere} {TARGETS[lead.target]}"
         + (f", {lead.model}" if lead.model else "")
@@ -139,12 +139,12 @@ def characteristics_words(known: CharacteristicsFields) -> dict[str, str]:
 
 
 def fields_of(row: CharacteristicsVersion | None) -> CharacteristicsFields:
-    """What a version says; nothing where there is none yet."""
+    """Convert a version to fields; all empty where there is no version yet."""
     return CharacteristicsFields.model_validate({n: getattr(row, n) for n in CharacteristicsFields.model_fields} if row else {})
 
 
 def suggested_hand(db: Session, participant: Participant) -> Hemisphere | None:
-    """The hand contralateral to the hemisphere that was stimulated; None where that is not one hemisphere. A person decides."""
+    """Suggest the hand contralateral to the stimulated hemisphere; None where that is not one hemisphere. A person decides."""
     sides = {Hemisphere(s.hemisphere) for s in study_repository.sessions_of_participant(db, participant.id) if s.hemisphere}
     if not sides:
         leads = fields_of(participant.current_characteristics).leads

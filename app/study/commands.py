@@ -19,7 +19,7 @@ participant_app = typer.Typer(no_args_is_help=True, help="Participants.")
 
 @participant_app.callback()
 def _participants() -> None:
-    """Participants."""
+    """Group the commands for participants."""
 
 
 @participant_app.command("status", epilog="Example: betaloop participant status P1 withdrawn --reason 'moved away'")
@@ -41,7 +41,7 @@ def status_(
 # Commands `betaloop study end` and `betaloop study reopen`.
 
 StudyCode = Annotated[str, typer.Argument(help="Code of the study.")]
-SiteCode = Annotated[str | None, typer.Option("--site", help="Code of a site; the whole study when left out.")]
+SiteCode = Annotated[str | None, typer.Option("--site", help="Code of a site; the whole study by default.")]
 
 
 def end(code: StudyCode, reason: Why, site: SiteCode = None, as_json: AsJson = False) -> None:

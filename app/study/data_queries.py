@@ -1,4 +1,4 @@
-"""Data queries: a monitor or coordinator asks about a value, somebody answers, and the one who may ask closes it."""
+"""Data queries: a monitor or coordinator asks about a value, a person answers, and the one who may ask closes it."""
 
 from __future__ import annotations
 
@@ -70,10 +70,10 @@ ASKED_ABOUT = {name: said[:1].lower() + said[1:] if said[:2] not in ("cD", "r_")
 """The same within a sentence."""
 
 
-# Values that may be asked about, by what they stand in; and what each is at the moment.
+# Values that may be asked about, by their record, and the present value of each.
 
 OTHER = "other"
-"""Anything else, said in the text."""
+"""Anything else, described in the text."""
 FIELDS: Mapping[Subject, tuple[str, ...]] = {
     Subject.SESSION: (*OUTCOME_FIELDS, "controller", "started_at", "hemisphere", "medication_h", "stopped_reason", OTHER),
     Subject.UPLOAD: ("file", OTHER),
@@ -84,13 +84,13 @@ FIELDS: Mapping[Subject, tuple[str, ...]] = {
     Subject.CHARACTERISTICS: (*CharacteristicsFields.model_fields, OTHER),
 }
 NOT_KEPT = frozenset({"controller", "file", OTHER})
-"""Of these no value is kept with an entry: controllers are told by the blinding gate alone, and the others are not one value."""
+"""Values that are not kept with an entry: controllers come only through the blinding gate, and the others are not one value."""
 
 Found = StudySession | Visit | Dose | AdverseEvent | Participant | None
 
 
 def value_of(subject: Subject, field: str, found: Found) -> str | None:
-    """A value as it stands now, as text; None where there is none, where it is not kept, and of a dose that was taken back.
+    """Return a present value as text; None where there is none, where it is not kept, and of a removed dose.
 
     Args:
         found: the row that holds it; of settings and characteristics the participant.
@@ -148,7 +148,9 @@ class DataQueryIn(Model):
     dose_id: Int | None = Field(None, ge=1)
     event_id: Int | None = Field(None, ge=1, description="Of an adverse event.")
     record: Literal["settings", "characteristics"] | None = Field(None, description="Of the participant: the present version.")
-    field: Text = Field(min_length=1, max_length=40, description="Which value, by its name: " + _NAMED + ". `other` is said in the text.")
+    field: Text = Field(
+        min_length=1, max_length=40, description="Which value, by its name: " + _NAMED + ". `other` is described in the text."
+    )
     text: Text = Field(min_length=1, max_length=2000, description="What is asked, without names or dates.")
 
     @model_validator(mode="after")
@@ -169,7 +171,7 @@ class DataQueryIn(Model):
 
     @property
     def subject(self) -> Subject:
-        """What the value stands in."""
+        """Kind of record with the value."""
         return self._stated()[0]
 
 
@@ -182,7 +184,7 @@ class DataQueryEntryIn(Model):
 
 
 class DataQueryEntryOut(Model):
-    """What was said."""
+    """Entry of a data query."""
 
     state: QueryState
     text: str
@@ -192,7 +194,7 @@ class DataQueryEntryOut(Model):
 
 
 class DataQueryOut(Model):
-    """A data query with all that was said."""
+    """Data query with all its entries."""
 
     id: int
     participant: CodeOf
@@ -211,7 +213,7 @@ class DataQueryOut(Model):
 
 
 def data_query(db: Session, query_id: int, caller: Caller) -> DataQuery:
-    """A query. Raises NotFound."""
+    """Load a query. Raises NotFound."""
     mine = _queries().join(DataQuery.participant).join(Participant.site).where(DataQuery.id == query_id, in_scope(caller))
     row = db.scalar(mine)
     if row is None:
@@ -220,35 +222,35 @@ def data_query(db: Session, query_id: int, caller: Caller) -> DataQuery:
 
 
 def queries_of_participant(db: Session, participant_id: int) -> Sequence[DataQuery]:
-    """A participant's queries in the order in which they were asked."""
+    """Load a participant's queries in the order in which they were asked."""
     return db.scalars(_queries().where(DataQuery.participant_id == participant_id).order_by(DataQuery.id)).all()
 
 
 def numbers_of_session(db: Session, session_id: int) -> list[int]:
-    """The numbers of all queries about a session, closed ones too."""
+    """List the numbers of all queries about a session, closed ones too."""
     return list(db.scalars(select(DataQuery.id).where(DataQuery.session_id == session_id).order_by(DataQuery.id)))
 
 
 def not_closed_of_session(db: Session, session_id: int) -> int:
-    """How many queries about a session are not closed."""
+    """Count the queries about a session that are not closed."""
     newest = select(func.max(DataQueryEntry.id)).join(DataQuery).where(DataQuery.session_id == session_id).group_by(DataQuery.id)
     waiting = select(func.count()).where(DataQueryEntry.id.in_(newest), DataQueryEntry.state != QueryState.CLOSED)
     return db.scalar(waiting) or 0
 
 
 def lock_query(db: Session, row: DataQuery) -> None:
-    """Hold a query for this transaction and read its entries again, so that two answers at once are taken in turn."""
+    """Lock a query for this transaction and read its entries again, so that two answers at once are taken in turn."""
     db.execute(select(DataQuery.id).where(DataQuery.id == row.id).with_for_update())
     db.expire(row, ["entries"])
 
 
 def dose_of(db: Session, participant_id: int, dose_id: int) -> Dose | None:
-    """A dose of the participant; None without one, or where it was taken back."""
+    """Find a dose of the participant; None without one, or where it was removed."""
     return db.scalar(select(Dose).join(Visit, Visit.id == Dose.visit_id).where(Dose.id == dose_id, Visit.participant_id == participant_id))
 
 
 def visit_number(db: Session, visit_id: int | None) -> int | None:
-    """The number that people give a visit."""
+    """Return the number that people give a visit."""
     return db.scalar(select(Visit.number).where(Visit.id == visit_id))
 
 
@@ -265,7 +267,7 @@ def _queries() -> Select[DataQuery]:
 
 # Rules of data queries. The caller commits.
 #
-# Whoever may ask (monitors, coordinators, those above them) opens, closes and opens again; whoever enters data answers. A locked visit
+# Those who may ask (monitors, coordinators, those above them) open, close and open again; those who enter data answer. A locked visit
 # can be asked about too: a query changes no value. Each entry keeps the value as it stood, so that what was corrected stays readable.
 
 _FOLLOWS: dict[QueryState, frozenset[QueryState]] = {
@@ -298,13 +300,13 @@ def follow(db: Session, query: DataQuery, given: DataQueryEntryIn, caller: Calle
     """Answer a query, close it, or open it again.
 
     Raises:
-        Forbidden: the caller may not. Conflict: somebody said something meanwhile, or the query is closed or answered already.
-        Invalid: nothing was said.
+        Forbidden: the caller may not. Conflict: another person answered meanwhile, or the query is closed or answered already.
+        Invalid: the text is empty.
     """
     access.require(caller, can.WRITE_STUDY if given.state is QueryState.ANSWERED else can.ASK_QUERIES, query.participant)
     lock_query(db, query)
     if len(query.entries) != given.entries:
-        raise Conflict(f"{query.entries[-1].entered_by} said something to data query {query.id} after you opened it.", "Load it again.")
+        raise Conflict(f"{query.entries[-1].entered_by} wrote to data query {query.id} after you opened it.", "Load it again.")
     if given.state not in _FOLLOWS[query.state]:
         raise Conflict(f"Data query {query.id} is {query.state.value}, and cannot become {given.state.value}.", "Load it again.")
     query.entries.append(_entry(given.state, given.text, query, _found(db, query, caller), caller))
@@ -314,13 +316,13 @@ def follow(db: Session, query: DataQuery, given: DataQueryEntryIn, caller: Calle
 
 def _entry(state: QueryState, said: str, query: DataQuery, found: Found, caller: Caller) -> DataQueryEntry:
     if not said.strip():
-        raise Invalid("Nothing is said.", "Write what you ask, answer, or why the query is closed.", field="text")
+        raise Invalid("The text is empty.", "Write what you ask, answer, or why the query is closed.", field="text")
     value = value_of(query.subject, query.field, found)
     return DataQueryEntry(state=state, text=said.strip(), value=value, entered_by=caller.label)
 
 
 def _found(db: Session, query: DataQuery, caller: Caller) -> Found:
-    """The row that holds the value; None of an upload, and of a dose that was taken back. Raises NotFound for another participant's."""
+    """Find the row that holds the value; None of an upload, and of a removed dose. Raises NotFound for another participant's."""
     participant, number = query.participant, query.subject_id
     if number is None:
         return participant

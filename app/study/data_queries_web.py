@@ -29,7 +29,7 @@ from app.tables.participants import Participant
 
 
 def current_query(query_id: RowId, db: Db, caller: CurrentCaller) -> DataQuery:
-    """The query that the path names."""
+    """Load the query that the path names."""
     return data_queries_rules.data_query(db, query_id, caller)
 
 
@@ -43,7 +43,7 @@ api = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
 @api.get("/participants/{code}/data-queries", response_model=list[DataQueryOut])
 def list_data_queries(participant: CurrentParticipant, db: Db, state: QueryState | None = None) -> list[DataQuery]:
-    """A participant's data queries in the order in which they were asked; of one state where it is named."""
+    """List a participant's data queries in the order in which they were asked; of one state where it is named."""
     found = data_queries_rules.queries_of_participant(db, participant.id)
     return [row for row in found if state in (None, row.state)]
 
@@ -56,7 +56,7 @@ def ask_data_query(participant: CurrentParticipant, draft: DataQueryIn, db: Db, 
 
 @api.post("/data-queries/{query_id}/entries", response_model=DataQueryOut, status_code=201, responses=problems(409))
 def follow_data_query(query: CurrentDataQuery, given: DataQueryEntryIn, db: Db, caller: CurrentCaller) -> DataQuery:
-    """Answer a query, close it, or open it again. Corrections are made where the value stands; the query keeps the old one."""
+    """Answer a query, close it, or open it again. Corrections are made on the page of the value; the query keeps the old one."""
     return data_queries_rules.follow(db, query, given, caller)
 
 
@@ -85,7 +85,7 @@ _ORDER = {QueryState.OPEN: 0, QueryState.ANSWERED: 1, QueryState.CLOSED: 2}
 
 @pages.get("/participants/{code}/data-queries")
 def data_queries(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """A participant's queries, open ones first, and a form to ask. A subject in the address (`visit=3`) makes it a form about that."""
+    """Show a participant's queries, open ones first, and a form to ask. A subject in the address (`visit=3`) makes it a form about that."""
     linked = {s: request.query_params.get(s.value, "")[:10] for s in Subject}
     typed = {f"{s.value}_id": number for s, number in linked.items() if s not in OF_PARTICIPANT and number}
     record = request.query_params.get("record", "")
@@ -152,7 +152,7 @@ def _page(
 
 
 def _subject(typed: dict[str, str]) -> Subject | None:
-    """What the form is about, where it names one thing that is neither a session nor an upload typed by its number."""
+    """Return the subject of the form, where it names one thing that is neither a session nor an upload typed by its number."""
     if (record := typed.get("record", "")) in OF_PARTICIPANT:
         return Subject(record)
     named = [s for s in Subject if s not in OF_PARTICIPANT and re.fullmatch("[0-9]{1,9}", typed.get(f"{s.value}_id", ""))]
@@ -160,7 +160,7 @@ def _subject(typed: dict[str, str]) -> Subject | None:
 
 
 def _named(db: Session, subject: Subject, typed: dict[str, str]) -> str:
-    """What the form is about; a visit by the number that people give it."""
+    """Name the subject of the form; a visit by the number that people give it."""
     number: int | str | None = typed.get(f"{subject.value}_id")
     if subject is Subject.VISIT and number is not None:
         number = data_queries_rules.visit_number(db, int(number))
@@ -168,7 +168,7 @@ def _named(db: Session, subject: Subject, typed: dict[str, str]) -> str:
 
 
 def _place(participant: Participant, db: Session, query: DataQuery) -> tuple[str, str]:
-    """What a query is about, and the page where its value stands."""
+    """Name the subject of a query, and the page of its value."""
     subject, number, home = query.subject, query.subject_id, f"/participants/{participant.code}"
     if subject is Subject.DOSE and number is not None:
         dose = data_queries_rules.dose_of(db, participant.id, number)

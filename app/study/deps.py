@@ -1,9 +1,9 @@
-"""FastAPI dependencies: the participant, visit or session that a path names, within what the caller may read; and who looked at results.
+"""FastAPI dependencies: the participant, visit or session that a path names, if the caller may read it; and records of views.
 
 Every route that shows outcomes by controller, or opens controllers to blinded assessors once a visit is locked, depends on one of
-`ResultsViewed`, `VisitViewed` and `SessionViewed`. They write the trail before the answer leaves, and not where there was nothing to
-see: addresses of nothing would fill it. Looks at one thing within a quarter of an hour are one row; each table or figure that is taken is
-its own.
+`ResultsViewed`, `VisitViewed` and `SessionViewed`. They write the trail before the response is sent. Where there was nothing to see they
+write nothing: wrong addresses would fill it. Looks at one thing within a quarter of an hour are one row; each table or figure that is taken
+is its own.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ def mark_synthetic(request: Request, participant: Participant) -> None:
 def current_participant(
     request: Request, code: Annotated[str, Path(max_length=40, pattern=r"^[^\x00]*$")], db: Db, caller: CurrentCaller
 ) -> Participant:
-    """The participant that the path names."""
+    """Load the participant that the path names."""
     found = repository.participant_by_code(db, code, caller)
     mark_synthetic(request, found)
     return found
 
 
 def current_visit(request: Request, visit_id: RowId, db: Db, caller: CurrentCaller) -> Visit:
-    """The visit that the path names."""
+    """Load the visit that the path names."""
     found = repository.visit(db, visit_id, caller)
     mark_synthetic(request, found.participant)
     return found
 
 
 def current_session(request: Request, session_id: RowId, db: Db, caller: CurrentCaller) -> StudySession:
-    """The session that the path names."""
+    """Load the session that the path names."""
     found = repository.session(db, session_id, caller)
     mark_synthetic(request, found.visit.participant)
     return found
@@ -66,8 +66,9 @@ FILE_FORMS = ("csv", "svg")
 
 
 def results_viewed(request: Request, db: Db, caller: CurrentCaller) -> Iterator[None]:
-    """For routes of a participant, or of all, that show results by controller. Of a blinded assessor nothing is written while nothing that
-    the route tells of was unblinded for them."""
+    """Record a view of results by controller, of a participant or of all. For a blinded assessor nothing is written while everything that
+    the route shows is hidden from them.
+    """
     yield
     if request.method != "GET" or (caller.is_blinded and not repository.tells_some_arm(db, caller, request.path_params.get("code"))):
         return
@@ -80,21 +81,21 @@ def results_viewed(request: Request, db: Db, caller: CurrentCaller) -> Iterator[
 
 
 def visit_viewed(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Iterator[None]:
-    """For routes that show what ran at a visit and what came of it. Nothing is written while that is hidden from the caller."""
+    """Record a view of what ran at a visit and its results. Nothing is written while that is hidden from the caller."""
     yield
     if request.method == "GET" and blinding.may_know(visit, caller):
         record_view(db, "visit", visit.id)
 
 
 def session_viewed(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller) -> Iterator[None]:
-    """The same for routes of a session."""
+    """Record a view of what ran in a session and its results."""
     yield
     if request.method == "GET" and blinding.may_know(session.visit, caller):
         record_view(db, "session", session.id)
 
 
 def _file_form(request: Request) -> str | None:
-    """Which of FILE_FORMS the answer has; None of a page or of JSON."""
+    """Return the file form of FILE_FORMS that the response has; None of a page or of JSON."""
     stated = request.scope["path"].rpartition(".")[2], request.query_params.get("format", "")
     return next((form for form in FILE_FORMS if form in stated), None)
 

@@ -26,15 +26,14 @@ from app.tables.visits import Dose, Drug, Visit
 # The drugs that can be named: a fixed list, so that no free text of a prescription enters.
 #
 # Levodopa equivalents per mg: Tomlinson et al. 2010 (Movement Disorders 25, 2649), where they give one. What Jost et al. 2023 (Movement
-# Disorders 38, 1236) propose for drugs that came later, safinamide among them, is not taken up: such a drug has no equivalent here. A
-# form that these names leave out (prolonged-release agonists, whose effect hardly wanes within a visit; selegiline under the tongue,
-# which counts eight times as much; tolcapone; levodopa gel) is `other`: no equivalent, and no time since it, rather than those of another
-# form.
+# Disorders 38, 1236) propose for later drugs such as safinamide is not used: such a drug has no equivalent here. Forms without a name of
+# their own are `other`: no equivalent, and no time since it, rather than those of another form. They are prolonged-release agonists, whose
+# effect hardly wanes within a visit; selegiline under the tongue, which counts eight times as much; tolcapone; levodopa gel.
 
 
 @dataclass(frozen=True)
 class DrugFacts:
-    """What is known of a drug.
+    """Facts of a drug.
 
     Attributes:
         name: as pages show it.
@@ -67,7 +66,7 @@ DRUGS: dict[Drug, DrugFacts] = {
 
 
 def levodopa_equivalent_mg(drug: Drug, mg: float) -> float | None:
-    """What a dose counts as, mg of levodopa; None where no equivalent is stated."""
+    """Convert a dose to mg of levodopa; None where no equivalent is stated."""
     factor = DRUGS[drug].equivalent
     return None if factor is None else factor * mg
 
@@ -78,7 +77,7 @@ DRUG_NAMES = {drug.value: facts.name for drug, facts in DRUGS.items()}
 
 
 def doses_words(doses: Iterable[Dose]) -> str:
-    """Doses that were taken, by time."""
+    """Write taken doses in words, by time."""
     return "; ".join(f"{d.taken_at:%Y-%m-%d %H:%M} {DRUGS[Drug(d.drug)].name} {d.mg:g} mg" for d in doses)
 
 
@@ -94,7 +93,7 @@ class DoseIn(Model):
 
 
 class DoseRemoval(Model):
-    """Why a dose that was written down is taken back."""
+    """Reason why a recorded dose is removed."""
 
     reason: Text = Field(min_length=1, max_length=1000, description="Kept in the audit trail, as is the dose.")
 
@@ -117,7 +116,7 @@ class DoseOut(Model):
 
 
 def dose_with_visit(db: Session, dose_id: int, caller: Caller) -> tuple[Dose, Visit]:
-    """A dose that was not removed, and its visit. Raises NotFound."""
+    """Load a dose that was not removed, and its visit. Raises NotFound."""
     row = db.scalar(select(Dose).where(Dose.id == dose_id, Dose.removed_at.is_(None)))
     gone = f"There is no dose {dose_id}, or you have no access to it."
     if row is None:
@@ -131,9 +130,9 @@ def dose_with_visit(db: Session, dose_id: int, caller: Caller) -> tuple[Dose, Vi
 # Rules of doses. The caller commits.
 
 _BEFORE, _AFTER = timedelta(days=3), timedelta(hours=36)
-"""A dose lies between three days before the visit's day and that day's end in the westernmost time zone, in UTC."""
+"""Range of a dose's time: from three days before the visit's day to that day's end in the westernmost time zone, in UTC."""
 _AHEAD = timedelta(minutes=10)
-"""By how much the clock of whoever enters a dose may be ahead."""
+"""Time by which the clock of the person who enters a dose may be ahead."""
 
 
 def add_dose(db: Session, visit: Visit, draft: DoseIn, caller: Caller) -> Dose:
@@ -197,7 +196,7 @@ def _check_time(visit: Visit, taken_at: datetime) -> None:
 
 LONGEST_H = 72.0
 APART_H = 0.25
-"""How far a stated time and the doses may lie apart before somebody is asked, h."""
+"""Difference between a stated time and the doses above which a question is asked, h."""
 
 
 class SinceDose(NamedTuple):
@@ -208,7 +207,7 @@ class SinceDose(NamedTuple):
 
 
 def since_last_dose(session: StudySession) -> SinceDose | None:
-    """What counts: what a person stated of the session, else what the visit's doses give; None where neither is known."""
+    """Return the time since the last dose that counts: the stated one, else the one by the visit's doses; None where neither is known."""
     if session.medication_h is not None:
         return SinceDose(session.medication_h, "stated")
     hours = hours_by_doses(session)
@@ -216,13 +215,13 @@ def since_last_dose(session: StudySession) -> SinceDose | None:
 
 
 def hours_since_dose(session: StudySession) -> float | None:
-    """The hours alone."""
+    """Return only the hours since the last dose."""
     found = since_last_dose(session)
     return found.hours if found else None
 
 
 def hours_by_doses(session: StudySession) -> float | None:
-    """Hours from the newest dose before a session's start, of those whose effect comes and goes within hours.
+    """Return the hours from the newest dose before a session's start, of those whose effect comes and goes within hours.
 
     None where the start is not known, or no such dose was taken within 72 h before it. A dose at the very start counts as 0 h.
     """
@@ -235,7 +234,7 @@ def hours_by_doses(session: StudySession) -> float | None:
 
 
 def disagreement_h(session: StudySession) -> tuple[float, float] | None:
-    """Stated hours and those of the doses, where they lie more than a quarter of an hour apart."""
+    """Return stated hours and those of the doses, where they differ by more than a quarter of an hour."""
     by_doses = hours_by_doses(session)
     if session.medication_h is None or by_doses is None or abs(session.medication_h - by_doses) <= APART_H:
         return None
@@ -246,7 +245,7 @@ def disagreement_h(session: StudySession) -> tuple[float, float] | None:
 
 
 def dose_out(row: Dose) -> DoseOut:
-    """A dose with its levodopa equivalent."""
+    """Convert a dose with its levodopa equivalent."""
     drug = Drug(row.drug)
     return DoseOut(
         levodopa_equivalent_mg=levodopa_equivalent_mg(drug, row.mg),

@@ -50,7 +50,7 @@ class MarginsFields(StatedMargins):
 
 
 class MarginsIn(MarginsFields):
-    """Margins and levels; what is left out keeps its present value."""
+    """Margins and levels; omitted ones keep their present value."""
 
     model_config = ConfigDict(json_schema_extra=published(BOUNDS))
 
@@ -77,14 +77,14 @@ class MarginsChange(Model):
 
 
 class MarginsLockFields(Model):
-    """Which margins to lock, and why."""
+    """Margins to lock, and the reason."""
 
     version: Int = Field(ge=1, le=100_000, description="Of the present margins, as the caller has read them.")
     reason: Text = Field(max_length=1000, description="What the margins rest on; kept with the lock and in the audit trail.")
 
 
 class MarginsLockIn(MarginsLockFields, Signing):
-    """Which margins to lock, why, and who signs."""
+    """Margins to lock, the reason, and the signature."""
 
 
 class MarginsLockOut(Model):
@@ -98,7 +98,7 @@ class MarginsLockOut(Model):
     signature_state: SignatureState = Field(description="`broken`: a value was changed since. `not_kept`: locked by an earlier version.")
 
 
-# What a clinician signs when margins are locked, and whether the signatures still stand. The caller commits.
+# What a clinician signs when margins are locked, and whether the signatures are still valid. The caller commits.
 
 KIND: Final = "margins_lock"
 MEANING: Final = "margins fixed before the sessions that they judge"
@@ -111,9 +111,9 @@ def sign_lock(db: Session, participant: Participant, lock: MarginsLock, caller: 
 
 
 def signatures_of_locks(db: Session, participant: Participant) -> dict[int, tuple[SignatureState, Signature | None]]:
-    """For each lock of a participant's margins, by its number: whether its signature stands, and the signature.
+    """Return, for each lock of a participant's margins by its number, the state of its signature, and the signature.
 
-    Earlier locks are held against their values too: visits that began under them keep their verdict.
+    Earlier locks are checked against their values too: visits that began under them keep their verdict.
     """
     locks = participant.margins_locks
     found = signatures.newest_of_each(db, KIND, [lock.id for lock in locks])
@@ -121,7 +121,7 @@ def signatures_of_locks(db: Session, participant: Participant) -> dict[int, tupl
 
 
 def signed_content(participant: Participant, lock: MarginsLock) -> dict[str, Any]:
-    """All that a signature under a lock covers: whose margins, each value and level, who stated and who locked them, and why."""
+    """Build the signed content of a lock: whose margins, each value and level, who stated and who locked them, and why."""
     version = lock.margins
     return {
         "participant": participant.code,
@@ -137,7 +137,7 @@ def signed_content(participant: Participant, lock: MarginsLock) -> dict[str, Any
 
 
 def margins_of(version: MarginsVersion) -> Margins:
-    """The margins of a version, for science."""
+    """Convert a version to margins for the analyses."""
     return Margins(**{o.margin.field: getattr(version, o.margin.field) for o in OUTCOMES})
 
 
@@ -145,7 +145,7 @@ def change_margins(db: Session, participant: Participant, change: MarginsIn, rea
     """Make a new version of what the change names. No change, no version.
 
     Raises:
-        Invalid: no reason. Forbidden: the caller approves no plans of this participant. Conflict: somebody else was faster.
+        Invalid: no reason. Forbidden: the caller approves no plans of this participant. Conflict: another person was faster.
     """
     access.require(caller, can.SET_MARGINS, participant)
     current = participant.current_margins
@@ -163,21 +163,21 @@ def change_margins(db: Session, participant: Participant, change: MarginsIn, rea
         db.flush()
     except IntegrityError as error:
         db.rollback()
-        raise Conflict("Somebody else changed these margins at the same time.", "Load them again and repeat your change.") from error
+        raise Conflict("Another person changed these margins at the same time.", "Load them again and repeat your change.") from error
     return row
 
 
 def lock_margins(
     db: Session, participant: Participant, version: int, reason: str, caller: Caller, password: str, code: str = ""
 ) -> MarginsLock:
-    """Fix the present margins, signed over their values: sessions recorded from now on are judged by them, earlier ones only explore.
+    """Lock the present margins, signed over their values: sessions recorded from now on are judged by them, earlier ones only explore.
 
     Args:
-        version: of the margins that the caller looked at. password: of the caller, asked for again; empty where a fresh sign-on stands
-            for it. code: of the second factor.
+        version: of the margins that the caller looked at. password: of the caller, asked for again; empty where a fresh sign-on replaces
+            it. code: of the second factor.
 
     Raises:
-        Invalid: no reason. Forbidden: the caller approves no plans of this participant, or as `app.accounts.sign_on`, as TooMany is.
+        Invalid: no reason. Forbidden: the caller approves no plans of this participant. Forbidden, TooMany: as `app.accounts.sign_on`.
             Conflict: newer margins are there, or these are locked already.
     """
     access.require(caller, can.SET_MARGINS, participant)
@@ -200,7 +200,7 @@ def lock_margins(
 
 
 def lock_rows(db: Session, participant: Participant) -> list[MarginsLockOut]:
-    """The locks of a participant's margins, oldest first, each with the version that it locked and what became of its signature."""
+    """List the locks of a participant's margins, oldest first, each with the version that it locked and the state of its signature."""
     found = signatures_of_locks(db, participant)
     return [
         MarginsLockOut(

@@ -41,20 +41,20 @@ api = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
 @api.get("/participants/{code}/margins")
 def list_margins(participant: CurrentParticipant) -> list[MarginsOut]:
-    """All versions of the margins within which an outcome counts as no worse than under cDBS, oldest first; the last one holds."""
+    """List all versions of the margins within which an outcome counts as no worse than under cDBS, oldest first; the last one applies."""
     return [MarginsOut.model_validate(version) for version in participant.margins]
 
 
 @api.put("/participants/{code}/margins", responses=problems(409))
 def change_margins(participant: CurrentParticipant, change: MarginsChange, db: Db, caller: CurrentCaller) -> MarginsOut:
-    """Change margins or levels: a new version; members left out keep their value. Those who approve plans alone."""
+    """Change margins or levels: a new version; omitted members keep their value. Only for those who approve plans."""
     row = margins_rules.change_margins(db, participant, change.margins, change.reason, caller)
     return MarginsOut.model_validate(row)
 
 
 @api.get("/participants/{code}/margins/locks")
 def list_margins_locks(participant: CurrentParticipant, db: Db) -> list[MarginsLockOut]:
-    """When margins were locked, oldest first; the last one holds. Verdicts confirm with sessions recorded after it alone."""
+    """List the locks of the margins, oldest first; the last one applies. Verdicts confirm only with sessions recorded after it."""
     return lock_rows(db, participant)
 
 

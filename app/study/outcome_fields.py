@@ -63,7 +63,7 @@ if TYPE_CHECKING:
         """A field per outcome: its value, null where not measured."""
 
     class StatedMargins(Model):
-        """A field per margin, the default where left out."""
+        """A field per margin, the default where omitted."""
 
     class VersionOfMargins(Model):
         """A version of margins: its number, and a field per margin."""
@@ -87,7 +87,7 @@ SURE = (
 
 
 class Why(StrEnum):
-    """What is unusual about a value."""
+    """Reason why a value is unusual."""
 
     BELOW = "below_usual"
     ABOVE = "above_usual"
@@ -98,7 +98,7 @@ class Why(StrEnum):
 
 
 class Usual(NamedTuple):
-    """From where to where a value lies as a rule, both included."""
+    """Range in which a value usually is, both ends included."""
 
     low: float
     high: float
@@ -119,7 +119,7 @@ class Question:
     Attributes:
         field: of the request. value: what was given, in `unit`. low, high: what is usual.
         hemisphere, program: of an amplitude that a visit states.
-        confirmed: whether a person has said that it is right.
+        confirmed: whether a person has confirmed it.
     """
 
     field: str
@@ -134,7 +134,7 @@ class Question:
 
 
 def question(name: str, value: float | None, others: Sequence[float] = ()) -> Question | None:
-    """What to ask about one value; None where it is usual.
+    """Return the question about one value; None where it is usual.
 
     Args:
         name: the field of an outcome, or `cdbs_amplitude_ma`. value: in its unit.
@@ -160,7 +160,7 @@ UNUSUAL_HINT = "Correct them, or say that they are right; nothing was saved yet.
 
 
 def unusual(asked: Question) -> str:
-    """What is asked about one value."""
+    """Write the question about one value."""
     value = f"{stated(asked.value, 4)} {asked.unit}".strip()
     usual = f"{asked.low:g} to {asked.high:g} {asked.unit}".strip()
     match asked.code:
@@ -175,7 +175,7 @@ def unusual(asked: Question) -> str:
 
 
 def _ends(field: str) -> str:
-    """Which end of an outcome's scale is the worst, and which the best."""
+    """Describe which end of an outcome's scale is the worst, and which the best."""
     outcome = BY_FIELD[field]
     best = outcome.high if outcome.higher_is_better else outcome.low
     return f"{outcome.worst_possible:g} is worst, {best:g} is best"
@@ -192,7 +192,7 @@ class Unusual(Invalid):
 def require_sure(
     given: Mapping[str, Any], sure: Collection[str] | None, known: object = None, others: Mapping[str, Sequence[float]] | None = None
 ) -> None:
-    """Raise Unusual for values outside the usual that nobody has confirmed; those that stand already are not asked about again.
+    """Raise Unusual for values outside the usual that are not confirmed; stored ones are not questioned again.
 
     Args:
         given: name to value. known: the row with the present values.

@@ -30,11 +30,11 @@ from app.study.settings_types import SettingsIn
 from app.tables.accounts import Site, Study
 from app.tables.participants import MarginsVersion, Participant
 
-# Study codes that may tell who somebody is. A code is questioned, never refused: only a person knows what it stands for.
+# Study codes that may reveal a person. A code is questioned, never refused: only a person knows what it means.
 
 
 class CodeQuestion(StrEnum):
-    """What a code looks like."""
+    """Resemblance of a code to an identity."""
 
     NAME = "name"
     BIRTH_YEAR = "birth_year"
@@ -52,10 +52,10 @@ _DIGITS = re.compile(r"\d+")
 
 
 def questions(code: str, today: date) -> tuple[CodeQuestion, ...]:
-    """What there is to ask about a code; empty for one that tells nothing.
+    """List the questions about a code; empty for one that reveals nothing.
 
     A word with small letters after a capital (`JSmith`, `Lee`) or of four letters (`smith`, `ANNA`) looks like a name unless studies use it
-    (STUDY_WORDS); four digits that can be the year somebody living was born in look like one (`P-1961`), and so do eight that are such a
+    (STUDY_WORDS). Four digits that can be the birth year of a living person look like one (`P-1961`). So do eight digits that are such a
     date (`19610412`, `12041961`).
 
     Args:
@@ -73,7 +73,7 @@ def questions(code: str, today: date) -> tuple[CodeQuestion, ...]:
 
 
 def _names(code: str) -> list[str]:
-    """Runs of letters that can be names; a capital begins a new word within small letters, as in `JSmith`."""
+    """Find runs of letters that can be names; a capital begins a new word within small letters, as in `JSmith`."""
     words = []
     for run in re.findall(r"[A-Za-z]+", code):
         if run.lower() in STUDY_WORDS:
@@ -94,7 +94,7 @@ def _is_birth_date(digits: str, today: date) -> bool:
 
 
 def _written_date(code: str, today: date) -> bool:
-    """Whether three numbers that follow each other are a date, as in `12-04-1961`."""
+    """Check whether three numbers that follow each other are a date, as in `12-04-1961`."""
     parts = re.split(r"[-_]", code)
     triples = zip(pairwise(parts), parts[2:], strict=False)
     written = ("".join([*pair, last]) for pair, last in triples)
@@ -123,7 +123,7 @@ CODE_CONFIRMED = "looked at by a person: a study code"
 
 
 def code_questions(code: str, found: Iterable[CodeQuestion]) -> str:
-    """What a study code looks like."""
+    """Write the questions about a study code."""
     return f"The code '{code}' may tell who the participant is: {' and '.join(CODE_QUESTIONS[q] for q in found)}."
 
 
@@ -154,9 +154,9 @@ def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
     """Add a participant with its first settings version and the default margins.
 
     Raises:
-        Invalid: the code is a page's address, lacks the prefix of the study's codes or has another's, or looks like somebody's identity and
-            nobody said that it is a study code (the problem's `questions` say what it looks like).
-        Unusual: the cDBS amplitude is outside the usual, and nobody is sure of it. Conflict: the code is taken, or the site has ended.
+        Invalid: the code is a page's address, or has not the prefix of the study's codes. Or it looks like a person's identity and is not
+            confirmed as a study code (see the problem's `questions`).
+        Unusual: the cDBS amplitude is outside the usual, and not confirmed. Conflict: the code is taken, or the site has ended.
         NotFound: no such site. Forbidden: not the caller's to enrol.
     """
     if draft.code.lower() in RESERVED_CODES:
@@ -187,7 +187,7 @@ def enrol(db: Session, draft: ParticipantIn, caller: Caller) -> Participant:
 
 
 def _site(db: Session, code: str | None, caller: Caller) -> Site:
-    """The site of a code, or the only one at which the caller enrols."""
+    """Find the site of a code, or the only one at which the caller enrols."""
     readable = [s for s in repository.sites(db, caller) if code in (None, s.code, in_study(s))]
     if not readable:
         raise NotFound(f"There is no site '{code}', or you have no access to it.")
@@ -198,7 +198,7 @@ def _site(db: Session, code: str | None, caller: Caller) -> Site:
 
 
 def in_study(site: Site) -> str:
-    """A site by its study, for two studies may have sites of one code."""
+    """Name a site by its study, for two studies may have sites of one code."""
     return f"{site.study.code}/{site.code}"
 
 
@@ -208,7 +208,7 @@ Status = Literal["active", "completed", "withdrawn"]
 
 
 class StatusChange(Model):
-    """Whether a participant takes part, and why that changes."""
+    """New status of a participant, and the reason."""
 
     status: Status
     reason: Text = Field(min_length=1, max_length=1000, description="Why; kept in the audit trail.")
@@ -220,8 +220,8 @@ class StatusChange(Model):
 def change_status(db: Session, participant: Participant, change: StatusChange, caller: Caller) -> Participant:
     """Say that a participant has completed the study, has withdrawn, or takes part again.
 
-    Nothing is deleted. Who has withdrawn is no longer listed among those who take part, takes neither data nor plans nor jobs nor
-    controllers, and the jobs that run for them are cancelled.
+    Nothing is deleted. A withdrawn participant is no longer listed among those who take part. New data, plans, jobs and controllers are
+    refused, and running jobs are cancelled.
 
     Raises:
         NotFound, Forbidden: as `require`.

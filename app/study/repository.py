@@ -38,7 +38,7 @@ _OF_ONE_VISIT = (joinedload(Visit.cdbs_amplitudes), joinedload(Visit.doses), joi
 
 
 def in_scope(caller: Caller) -> ColumnElement[bool]:
-    """Condition on `Site`: the sites that some grant of the caller covers."""
+    """Build the condition on `Site`: the sites that some grant of the caller covers."""
     if caller.is_system:
         return true()
     conditions = [(Site.study_id == g.study_id) & (Site.id == g.site_id if g.site_id else true()) for g in caller.grants]
@@ -46,7 +46,7 @@ def in_scope(caller: Caller) -> ColumnElement[bool]:
 
 
 def participant_by_code(db: Session, code: str, caller: Caller) -> Participant:
-    """The participant of a code. Raises NotFound."""
+    """Load the participant of a code. Raises NotFound."""
     query = select(Participant).join(Participant.site).where(Participant.code == code, in_scope(caller))
     few = joinedload(Participant.site), joinedload(Participant.margins), joinedload(Participant.margins_locks)
     if (row := db.scalars(query.options(*few, selectinload(Participant.settings))).unique().one_or_none()) is None:
@@ -55,18 +55,18 @@ def participant_by_code(db: Session, code: str, caller: Caller) -> Participant:
 
 
 def sites(db: Session, caller: Caller) -> Sequence[Site]:
-    """Sites that the caller may see, by code."""
+    """List sites that the caller may see, by code."""
     return db.scalars(select(Site).where(in_scope(caller)).order_by(Site.code)).all()
 
 
 def hold_participation(db: Session, participant: Participant) -> None:
-    """Read again whether the participant takes part and the study goes on, and let nobody end either before this transaction ends."""
+    """Read again whether the participant takes part and the study goes on, and block the end of either until this transaction ends."""
     db.refresh(participant.site.study, ["ended_at"], with_for_update={"read": True, "of": Study})
     db.refresh(participant, ["status"], with_for_update={"of": Participant})
 
 
 def participants_of_study(db: Session, study_id: int) -> Sequence[int]:
-    """Numbers of a study's participants."""
+    """List the numbers of a study's participants."""
     return db.scalars(select(Participant.id).join(Participant.site).where(Site.study_id == study_id).order_by(Participant.id)).all()
 
 
@@ -82,7 +82,7 @@ def participants(db: Session, caller: Caller, limit: int | None, offset: int, wi
 
 
 def next_visits(db: Session, caller: Caller, today: date, withdrawn: bool = True) -> Sequence[Participant]:
-    """Every participant with a visit dated today or later: whose first such visit is soonest, first, then by code."""
+    """List every participant with a visit dated today or later: whose first such visit is soonest, first, then by code."""
     first = select(Visit.participant_id, func.min(Visit.date).label("day")).where(Visit.date >= today)
     days = first.group_by(Visit.participant_id).subquery()
     query = _participants(caller, withdrawn).join(days, days.c.participant_id == Participant.id)
@@ -97,14 +97,14 @@ def _participants(caller: Caller, withdrawn: bool) -> Select[Participant]:
 
 
 def visits(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[Visit], int]:
-    """A page of a participant's visits by number."""
+    """Load a page of a participant's visits by number."""
     query = select(Visit).where(Visit.participant_id == participant_id)
     rows = db.scalars(query.order_by(Visit.number).limit(limit).offset(offset).options(selectinload(Visit.cdbs_amplitudes))).all()
     return rows, count(db, query)
 
 
 def visit(db: Session, visit_id: int, caller: Caller) -> Visit:
-    """A visit. Raises NotFound."""
+    """Load a visit. Raises NotFound."""
     query = select(Visit).join(Visit.participant).join(Participant.site).where(Visit.id == visit_id, in_scope(caller))
     of_participant = joinedload(Visit.participant).joinedload(Participant.site)
     if (row := db.scalars(query.options(of_participant, *_OF_ONE_VISIT)).unique().one_or_none()) is None:
@@ -113,7 +113,7 @@ def visit(db: Session, visit_id: int, caller: Caller) -> Visit:
 
 
 def visit_by_number(db: Session, participant_id: int, number: int) -> Visit | None:
-    """A participant's visit of a number."""
+    """Find a participant's visit by its number."""
     query = select(Visit).where(Visit.participant_id == participant_id, Visit.number == number)
     return db.scalars(query.options(*_OF_ONE_VISIT)).unique().one_or_none()
 
@@ -124,16 +124,16 @@ class HiddenVisits(NamedTuple):
     rows: Mapping[int, Sequence[tuple[int, bool, bool]]]
 
     def sealed(self, participant_id: int) -> frozenset[int]:
-        """A participant's visits under a blinded plan whose key is sealed."""
+        """Return a participant's visits under a blinded plan whose key is sealed."""
         return frozenset(visit for visit, sealed, _ in self.rows.get(participant_id, ()) if sealed)
 
     def unlocked(self, participant_id: int) -> frozenset[int]:
-        """A participant's visits that are not locked now."""
+        """Return a participant's visits that are not locked now."""
         return frozenset(visit for visit, _, locked in self.rows.get(participant_id, ()) if not locked)
 
 
 def hidden_visits(db: Session, participant_ids: Collection[int]) -> HiddenVisits:
-    """Visits of participants, each with whether its key is sealed and whether it is locked."""
+    """Load the visits of participants, each with whether its key is sealed and whether it is locked."""
     newest = select(VisitLock.locked).where(VisitLock.visit_id == Visit.id).order_by(VisitLock.id.desc()).limit(1)
     locked = func.coalesce(newest.correlate(Visit).scalar_subquery(), false())
     query = select(Visit.participant_id, Visit.id, Visit.sealed, locked).where(Visit.participant_id.in_(participant_ids))
@@ -144,9 +144,9 @@ def hidden_visits(db: Session, participant_ids: Collection[int]) -> HiddenVisits
 
 
 def tells_some_arm(db: Session, caller: Caller, code: str | None) -> bool:
-    """Whether a blinded assessor is told what ran at some visit: of the participant with a code, or without one of all that they may read.
+    """Check whether a blinded assessor may know what ran at some visit: of the participant with a code, else of all that they may read.
 
-    At sites where they have a role that tells them at once, every visit whose key is not sealed counts.
+    At sites where another role shows arms at once, every visit whose key is not sealed counts.
     """
     told = [(Site.study_id == g.study_id) & (Site.id == g.site_id if g.site_id else true()) for g in caller.grants_with(READ_ARMS)]
     newest = select(VisitLock.locked).where(VisitLock.visit_id == Visit.id).order_by(VisitLock.id.desc()).limit(1)
@@ -156,13 +156,13 @@ def tells_some_arm(db: Session, caller: Caller, code: str | None) -> bool:
 
 
 def lock_row(db: Session, visit: Visit) -> None:
-    """Hold a visit for this transaction and read its locks again, so that two people at once are asked in turn."""
+    """Lock a visit's row for this transaction and read its locks again, so that two people at once are checked in turn."""
     db.execute(select(Visit.id).where(Visit.id == visit.id).with_for_update())
     db.expire(visit, ["locks"])
 
 
 def session(db: Session, session_id: int, caller: Caller) -> StudySession:
-    """A session with its QoCs, segments and visit. Raises NotFound."""
+    """Load a session with its QoCs, segments and visit. Raises NotFound."""
     query = _sessions(*_OF_ONE_VISIT).join(Participant.site).where(StudySession.id == session_id, in_scope(caller))
     if (row := db.scalars(query).unique().one_or_none()) is None:
         raise NotFound(f"There is no session {session_id}, or you have no access to it.")
@@ -170,14 +170,14 @@ def session(db: Session, session_id: int, caller: Caller) -> StudySession:
 
 
 def sessions_of_visit(db: Session, visit_id: int, limit: int = 500, offset: int = 0) -> tuple[Sequence[StudySession], int]:
-    """A page of a visit's confirmed sessions in order."""
+    """Load a page of a visit's confirmed sessions in order."""
     mine = (StudySession.visit_id == visit_id) & CONFIRMED
     rows = db.scalars(_sessions().where(mine).order_by(StudySession.ordinal).limit(limit).offset(offset)).all()
     return rows, count(db, select(StudySession.id).where(mine))
 
 
 def sessions_of_participant(db: Session, participant_id: int, with_proposals: bool = False, afresh: bool = False) -> Sequence[StudySession]:
-    """Confirmed sessions of a participant by visit and order, with QoCs, segments and recordings; proposals only where asked for.
+    """Load confirmed sessions of a participant by visit and order, with QoCs, segments and recordings; proposals only on request.
 
     `afresh`: what this transaction has read of them before is read again, for what is kept under the rows' present versions.
     """
@@ -187,27 +187,27 @@ def sessions_of_participant(db: Session, participant_id: int, with_proposals: bo
 
 
 def sessions_without_data(db: Session, participant_ids: Collection[int]) -> Sequence[StudySession]:
-    """Confirmed sessions of several participants with their visits, and nothing else of them: for counts and arms."""
+    """Load confirmed sessions of several participants with their visits, and nothing else of them: for counts and arms."""
     query = select(StudySession).join(StudySession.visit).where(Visit.participant_id.in_(participant_ids), CONFIRMED)
     visit = contains_eager(StudySession.visit).options(lazyload(Visit.cdbs_amplitudes), lazyload(Visit.doses))
     return db.scalars(query.options(visit).order_by(Visit.participant_id, Visit.number)).all()
 
 
 def sessions_for_lists(db: Session, participant_id: int) -> Sequence[StudySession]:
-    """Confirmed sessions of a participant by visit and order, with their visits and QoCs, and nothing of their recordings."""
+    """Load confirmed sessions of a participant by visit and order, with their visits and QoCs, and nothing of their recordings."""
     query = select(StudySession).join(StudySession.visit).where(Visit.participant_id == participant_id, CONFIRMED)
     query = query.options(contains_eager(StudySession.visit), selectinload(StudySession.qocs))
     return db.scalars(query.order_by(Visit.number, StudySession.ordinal)).all()
 
 
 def proposals_of_participant(db: Session, participant_id: int) -> Sequence[StudySession]:
-    """Sessions that wait for a person's confirmation, by visit and start."""
+    """Load sessions that wait for a person's confirmation, by visit and start."""
     query = _sessions().where(Visit.participant_id == participant_id, StudySession.status == "proposed")
     return db.scalars(query.order_by(Visit.number, StudySession.started_at, StudySession.id)).all()
 
 
 def next_ordinal(db: Session, visit_id: int) -> int:
-    """The next free place in a visit."""
+    """Return the next free place in a visit."""
     return (db.scalar(select(func.max(StudySession.ordinal)).where(StudySession.visit_id == visit_id)) or 0) + 1
 
 
@@ -227,7 +227,7 @@ _READING = Trace.decode_version * 1_000_000 + Trace.reading
 
 
 def traces_of_recording(db: Session, recording_id: int) -> Sequence[Trace]:
-    """The traces of a recording in its newest decode version."""
+    """Load the traces of a recording in its newest decode version."""
     known: dict[int, Sequence[Trace]] = db.info.get(_TRACES, {})
     if recording_id not in known:
         newest = select(func.max(_READING)).where(Trace.recording_id == recording_id).scalar_subquery()
@@ -237,7 +237,7 @@ def traces_of_recording(db: Session, recording_id: int) -> Sequence[Trace]:
 
 
 def traces_of_recordings(db: Session, recording_ids: Collection[int]) -> dict[int, list[Trace]]:
-    """The same of many recordings at once, by recording; read only, and not the session's own rows."""
+    """Load the traces of many recordings at once, by recording; read only, and not the session's own rows."""
     columns = [c for c in Trace.__table__.columns if c.name != "details"]
     wanted = any_(cast(list(recording_ids), ARRAY(Integer)))  # one parameter, where `in` has one for each
     query = select(*columns).where(Trace.recording_id == wanted).order_by(Trace.stream, Trace.channel)
@@ -266,7 +266,7 @@ class TraceHead:
 
 
 def trace_heads(db: Session, recording_ids: Collection[int]) -> dict[int, list[TraceHead]]:
-    """The traces of recordings in their newest reading, by recording, in the order of `traces_of_recording`; no values are read."""
+    """Load the heads of traces by recording, in their newest reading and in the order of `traces_of_recording`."""
     columns = (Trace.id, Trace.recording_id, Trace.stream, Trace.channel, Trace.decode_version, Trace.reading)
     wanted = any_(cast(list(recording_ids), ARRAY(Integer)))  # one parameter, where `in` has one for each
     query = select(*columns).where(Trace.recording_id == wanted).order_by(Trace.stream, Trace.channel)
@@ -277,22 +277,22 @@ def trace_heads(db: Session, recording_ids: Collection[int]) -> dict[int, list[T
 
 
 def recording_by_fingerprint(db: Session, participant_id: int, fingerprint: str) -> Recording | None:
-    """A participant's recording of a fingerprint."""
+    """Find a participant's recording by its fingerprint."""
     return db.scalar(select(Recording).where(Recording.participant_id == participant_id, Recording.fingerprint == fingerprint))
 
 
 def session_ids_of_recording(db: Session, recording_id: int) -> Sequence[int]:
-    """Sessions that a recording belongs to."""
+    """List sessions that a recording belongs to."""
     return db.scalars(select(SessionSegment.session_id).where(SessionSegment.recording_id == recording_id).distinct()).all()
 
 
 def qoc_revision(db: Session, session_id: int) -> int:
-    """How many revisions a session's QoCs have."""
+    """Count the revisions of a session's QoCs."""
     return db.scalar(select(func.count()).select_from(QocRevision).where(QocRevision.session_id == session_id)) or 0
 
 
 def last_editor(db: Session, entity: str, row_id: int) -> str:
-    """Who changed a session or a visit (with its amplitudes) last, by the audit trail; empty where nobody did."""
+    """Return who changed a session or a visit (with its amplitudes) last, by the audit trail; empty where there was no change."""
     mine = (AuditEvent.entity == entity) & (AuditEvent.entity_id == str(row_id))
     if entity == "visit":
         row = func.coalesce(AuditEvent.after, AuditEvent.before)
@@ -324,12 +324,12 @@ def policy_id(db: Session, participant_id: int, name_or_id: str) -> int | None:
 
 
 def policy_names(db: Session, participant_id: int) -> Sequence[str]:
-    """Names of a participant's policies."""
+    """List the names of a participant's policies."""
     return db.scalars(select(Policy.name).where(Policy.participant_id == participant_id).order_by(Policy.name)).all()
 
 
 def policy_name(db: Session, policy_id: int | None) -> str | None:
-    """Name of a policy, by its number."""
+    """Return the name of a policy, by its number."""
     return None if policy_id is None else db.scalar(select(Policy.name).where(Policy.id == policy_id))
 
 
@@ -339,7 +339,7 @@ def has_policy(db: Session, participant_id: int, policy_id: int) -> bool:
 
 
 class PolicyHead(NamedTuple):
-    """What sessions need of a policy."""
+    """Facts of a policy that sessions need."""
 
     id: int
     name: str
@@ -347,7 +347,7 @@ class PolicyHead(NamedTuple):
 
 
 def policies_of_network(db: Session, participant_id: int, sha256: str) -> Sequence[PolicyHead]:
-    """The participant's policies whose network file has this SHA-256, the newest first."""
+    """List the participant's policies whose network file has this SHA-256, the newest first."""
     query = select(Policy.id, Policy.name, Policy.kind).where(Policy.participant_id == participant_id, Policy.onnx_sha256 == sha256)
     return [PolicyHead(*row) for row in db.execute(query.order_by(Policy.id.desc()))]
 
@@ -369,12 +369,12 @@ def planned_designs(db: Session, visit_id: int) -> list[dict[str, Any]]:
 
 
 def settings_version(db: Session, settings_version_id: int) -> SettingsVersion:
-    """A settings version by its row number."""
+    """Load a settings version by its row number."""
     return db.get_one(SettingsVersion, settings_version_id)
 
 
 def count(db: Session, query: Select[Any]) -> int:
-    """Rows of a query without its page."""
+    """Count the rows of a query without its page."""
     return db.scalar(select(func.count()).select_from(query.order_by(None).subquery())) or 0
 
 

@@ -47,7 +47,7 @@ class CdbsAmplitudeModel(CdbsAmplitudeOut):
         Number, AfterValidator(CDBS_MA.check), Field(json_schema_extra={"minimum": CDBS_MA.low, "maximum": CDBS_MA.high})
     ]
     sure: Bool | None = Field(
-        None, description="True: a person has looked at an amplitude outside the usual. False: ask about one (422). Left out: keep it."
+        None, description="True: a person has looked at an amplitude outside the usual. False: ask about one (422). Omitted: keep it."
     )
 
 
@@ -61,7 +61,7 @@ class VisitIn(Model):
 
 
 class VisitChange(Model):
-    """What a person may correct of a visit; what is left out stays. A list of amplitudes replaces the whole list."""
+    """Correction of a visit; omitted fields stay. A list of amplitudes replaces the whole list."""
 
     date: Day | None = None
     note: Text | None = Field(None, max_length=4000)
@@ -81,7 +81,7 @@ class VisitOut(Model):
 
 
 class QocIn(EnteredOutcomes):
-    """End-of-session QoCs; a value left out keeps what is known, null takes it back."""
+    """End-of-session QoCs; an omitted value keeps what is known, null takes it back."""
 
     reason: Text | None = Field(None, max_length=1000, description="Why, when values are corrected.")
     sure: list[OutcomeField] | None = Field(None, max_length=len(OUTCOMES), description=SURE)
@@ -122,8 +122,8 @@ class SessionOut(Model):
     participant: str
     ordinal: int
     controller: Controller | None = Field(
-        description="Null of a proposal whose controller nobody has stated yet, and where it is hidden: from a blinded assessor, and from "
-        "everybody while the key of the visit's blinded plan is sealed."
+        description="Null of a proposal without a stated controller, and where it is hidden: from a blinded assessor, and from all "
+        "while the key of the visit's blinded plan is sealed."
     )
     policy_id: int | None
     letter: str | None = Field(description="What the visit's blinded plan calls it; null of sessions of no blinded plan.")
@@ -143,7 +143,7 @@ class SessionOut(Model):
 
 
 class SessionChange(Model):
-    """What a person may correct of a session; what is left out stays."""
+    """Correction of a session; omitted fields stay."""
 
     controller: Controller | None = None
     policy_id: Int | None = None
@@ -159,13 +159,13 @@ class SessionChange(Model):
 
 
 class VisitUnlockIn(Model):
-    """Why a visit is unlocked."""
+    """Reason why a visit is unlocked."""
 
     reason: Text = Field(min_length=1, max_length=1000, description="Kept with the lock and in the audit trail.")
 
 
 class VisitLockIn(Signing):
-    """Why a visit is locked, and who signs that its data are complete and reviewed."""
+    """Reason why a visit is locked, and the signature that its data are complete and reviewed."""
 
     reason: Text = Field(min_length=1, max_length=1000, description="Kept with the lock and in the audit trail.")
 
@@ -184,7 +184,7 @@ class VisitLockOut(Model):
 
 
 class HoldModel(Model):
-    """One amplitude that a design held."""
+    """Amplitude that a design kept for some steps."""
 
     start: Int = Field(ge=0, le=1_000_000, description="First step.")
     steps: Int = Field(ge=1, le=1_000_000)
@@ -193,7 +193,7 @@ class HoldModel(Model):
 
 
 class DesignParameters(Model):
-    """What a design drew for one session."""
+    """Draws of a design for one session."""
 
     level: Number | None = Field(None, ge=0, le=1, description="Of the session, fraction of the cDBS amplitude; null where it has none.")
     holds: list[HoldModel] = Field(default_factory=list, max_length=10_000, description="In order, without gaps, the first from step 0.")
@@ -222,7 +222,7 @@ class ProgramModel(Model):
 
 
 class ConditionsFields(Model):
-    """What a session ran under."""
+    """Conditions of a session."""
 
     lower_bound: Number = Field(description="B in force, fraction: random amplitudes were drawn from [B, 1].")
     window: Int = Field(description="W, beta amplitudes in a state.")
@@ -231,7 +231,7 @@ class ConditionsFields(Model):
     min_ma: Number | None = Field(description="Lowest amplitude that limits allowed, mA.")
     max_ma: Number | None = Field(description="Highest amplitude that limits allowed, mA.")
     seed: Int | None = Field(description="Of the design.")
-    design: SessionDesign | None = Field(description="Of a random session; null where nobody stated one.")
+    design: SessionDesign | None = Field(description="Of a random session; null where none is stated.")
     design_parameters: DesignParameters
     lead_amplitude_ma: Number | None = Field(description="Amplitude in force just before the session, mA.")
     cdbs_amplitude_ma: Number | None = Field(description="cDBS amplitude when the session was confirmed, mA; for the record.")
@@ -243,7 +243,7 @@ class ConditionsOut(ConditionsFields):
 
     revision: int
     origin: Literal["stated", "settings", "assumed"] = Field(
-        description="Who tells B, W, period and threshold: a person or plan, the settings in force when the session ran, or neither."
+        description="Source of B, W, period and threshold: a person or plan, the settings in force when the session ran, or neither."
     )
     entered_by: str
     reason: str | None
@@ -251,7 +251,7 @@ class ConditionsOut(ConditionsFields):
 
 
 class ConditionsChange(Model):
-    """What is stated of a session's conditions; what is left out stays."""
+    """Statement of a session's conditions; omitted fields stay."""
 
     lower_bound: Number | None = Field(None, ge=0, lt=1)
     window: Int | None = Field(None, ge=1, le=500)

@@ -48,7 +48,7 @@ def change_settings(
 
 
 def add_settings(db: Session, participant: Participant, values: dict[str, Any], caller: Caller, reason: str | None) -> SettingsVersion:
-    """Store the next settings version. Raises Invalid for settings that contradict each other, Conflict where somebody was faster."""
+    """Store the next settings version. Raises Invalid for settings that contradict each other, Conflict where another person was faster."""
     try:
         MdpSettings(xi_beta=values["xi_beta"] if values["xi_beta"] is not None else 0.0, **{n: values[n] for n in MDP_FIELDS})
     except ValueError as error:
@@ -72,7 +72,7 @@ def add_settings(db: Session, participant: Participant, values: dict[str, Any], 
         db.flush()
     except IntegrityError as error:
         db.rollback()
-        raise Conflict("Somebody else changed these settings at the same time.", "Load them again and repeat your change.") from error
+        raise Conflict("Another person changed these settings at the same time.", "Load them again and repeat your change.") from error
     return row
 
 
@@ -91,7 +91,7 @@ class SuggestedThreshold:
 
 
 def mdp_settings(settings: SettingsVersion, suggestion: SuggestedThreshold | None = None) -> MdpSettings:
-    """The MDP of a settings version.
+    """Build the MDP of a settings version.
 
     Raises:
         Invalid: xi_beta is not set; names the suggestion from the data where there is one.
@@ -106,11 +106,11 @@ def mdp_settings(settings: SettingsVersion, suggestion: SuggestedThreshold | Non
     return MdpSettings(xi_beta=settings.xi_beta, **{name: getattr(settings, name) for name in MDP_FIELDS})
 
 
-# The beta threshold: whether it can be held against a session's beta, in the settings of the MDP, and suggested from what sessions had.
+# The beta threshold: whether it can be compared with a session's beta, in the settings of the MDP, and suggested from what sessions had.
 
 
 def mismatch(settings: SettingsVersion, trace: Trace | None) -> str:
-    """Why a threshold says nothing about a trace of beta; empty where it does, or where there is no threshold or trace.
+    """Explain why a threshold does not apply to a trace of beta; empty where it does, or where there is no threshold or trace.
 
     Units and sources are never mixed.
     """
@@ -132,10 +132,11 @@ def mismatch(settings: SettingsVersion, trace: Trace | None) -> str:
 
 
 def suggest_xi_beta(db: Session, participant: Participant, caller: Caller) -> SuggestedThreshold | None:
-    """A threshold from the data: midway between the median beta of cDBS sessions and that of no-DBS sessions, else the median of all.
+    """Suggest a threshold from the data: midway between the median beta of cDBS sessions and that of no-DBS sessions, else the median of
+    all.
 
-    Of confirmed sessions that are not excluded nor of a blinded plan whose key is sealed, with beta in the settings' unit and from their
-    source; None where these leave it open and the sessions have several, which are never mixed.
+    Used are confirmed sessions that are neither excluded nor sealed, with beta in the settings' unit and from their source. None where
+    these leave it open and the sessions have several, which are never mixed.
     """
     settings = participant.current_settings
     groups: dict[Controller, list[np.ndarray[Any, Any]]] = {}

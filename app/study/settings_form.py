@@ -1,4 +1,4 @@
-"""What a person changed of what a form showed, so that an old form takes back nothing that it did not touch."""
+"""Changes of a person to what a form showed, so that an old form takes back nothing that it did not touch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ml.outcomes import END_WEIGHTS
 
 @dataclass(frozen=True)
 class Shown:
-    """What a form shows of one revision.
+    """Content of a form at one revision.
 
     Attributes:
         number: of the revision.
@@ -30,22 +30,22 @@ class Shown:
 
 @dataclass(frozen=True)
 class OwnChanges:
-    """What a person changed of what the form showed.
+    """Changes of a person to what the form showed.
 
     Attributes:
         fields: field name to typed text, where it differs from what the form showed and from what is stored now.
-        conflicts: of those, the ones that somebody else changed after the form was opened: `where` and `what`.
+        conflicts: of those, the ones that another person changed after the form was opened: `where` and `what`.
     """
 
     fields: dict[str, str]
     conflicts: list[dict[str, str]]
 
     def refuse_conflicts(self) -> None:
-        """Raises Conflict where two people changed the same field."""
+        """Raise Conflict where two people changed the same field."""
         if self.conflicts:
             raise Conflict(
-                "Somebody else changed the same values after this form was opened; nothing was saved.",
-                "What you typed still stands in the form: save again to replace what is stored, or load the page again to keep it.",
+                "Another person changed the same values after this form was opened; nothing was saved.",
+                "What you typed is still in the form: save again to replace what is stored, or load the page again to keep it.",
                 errors=self.conflicts,
             )
 
@@ -55,7 +55,7 @@ def own_changes(values: Mapping[str, Any], seen: str | None, revisions: Sequence
 
     Args:
         values: the posted form; a field that it does not have is not changed.
-        seen: number of the revision that the form showed; None for a post that names none: it is held against the newest one.
+        seen: number of the revision that the form showed; None for a post that names none: it is compared with the newest one.
             A number that does not exist makes every change a conflict.
         revisions: all of them, oldest first.
         labels: names of the fields as the page shows them.
@@ -77,7 +77,7 @@ def own_changes(values: Mapping[str, Any], seen: str | None, revisions: Sequence
 
 
 def reason_of(values: Mapping[str, Any]) -> str | None:
-    """The reason that a posted form gives, if any."""
+    """Return the reason that a posted form gives, if any."""
     return str(values.get("reason", "")).strip()[:1000] or None
 
 
@@ -213,14 +213,14 @@ GROUPS = (
 
 _AT_ENROLMENT = ("cdbs_amplitude_ma",)
 AT_ENROLMENT = tuple(f for group in GROUPS for f in group.fields if f.name in _AT_ENROLMENT)
-"""What whoever enrols a participant knows of the settings."""
+"""Settings that are known at enrolment."""
 LATER = tuple(SettingGroup(group.title, tuple(f for f in group.fields if f.name not in _AT_ENROLMENT)) for group in GROUPS)
 """What has a default, or comes from the data."""
 LABELS = {f.name: f.label for group in GROUPS for f in group.fields}
 
 
 def texts(source: object, names: Iterable[str] = LABELS) -> dict[str, str]:
-    """The settings (or other named values of a row or API type) as the form's text."""
+    """Write the settings (or other named values of a row or API type) as the form's text."""
     return {name: _text(getattr(source, name)) for name in names}
 
 
@@ -233,12 +233,12 @@ class VersionChange(Generic[Row]):
 
 
 def history(versions: Sequence[Row], labels: Mapping[str, str] = LABELS) -> list[VersionChange[Row]]:
-    """All versions, newest first, with their changes; the first one is the enrolment's."""
+    """List all versions, newest first, with their changes; the first one is the enrolment's."""
     return history_of([(row, {labels[n]: text for n, text in texts(row, labels).items()}) for row in versions])
 
 
 def history_of(versions: Sequence[tuple[Row, Mapping[str, str]]], first_tells: bool = False) -> list[VersionChange[Row]]:
-    """Versions with what each says, by label, newest first, with their changes; with `first_tells` the first one is a change of nothing."""
+    """List versions with changes by label, newest first; with `first_tells` the first one is a change of nothing."""
     found = [VersionChange(row, [(n, "—", text) for n, text in said.items() if text and first_tells]) for row, said in versions[:1]]
     for (_, old), (after, new) in pairwise(versions):
         found.append(VersionChange(after, [(n, old[n] or "—", new[n] or "—") for n in new if old[n] != new[n]]))

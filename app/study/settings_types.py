@@ -15,7 +15,7 @@ from ml.outcomes import END_WEIGHTS
 
 
 def _one_spelling(unit: str) -> str:
-    """Micro signs are `u` and a raised two is `2`, as in decoded traces, so that one unit has one name."""
+    """Write micro signs as `u` and a raised two as `2`, as in decoded traces, so that one unit has one name."""
     return " ".join(unit.translate({0xB5: "u", 0x3BC: "u", 0xB2: "2"}).split())
 
 
@@ -25,7 +25,7 @@ BetaSource = Literal["time_domain", "device_power", "percept_lfp", "table"]
 
 
 class Bound(NamedTuple):
-    """What a number may be: from `low` to `high` in `unit`, both allowed; where it is not 0, its magnitude is `least` at the least."""
+    """Range of a number: from `low` to `high` in `unit`, both allowed; where it is not 0, its magnitude is `least` at the least."""
 
     low: float
     high: float
@@ -33,7 +33,7 @@ class Bound(NamedTuple):
     least: float = 0.0
 
     def check(self, value: float) -> float:
-        """The value. Raises PydanticCustomError, which a form and the interface tell as it stands, outside the bounds."""
+        """Return the value. Raises PydanticCustomError outside the bounds; a form and the interface show its text unchanged."""
         if self.low <= value <= self.high and (value == 0 or abs(value) >= self.least):
             return value
         words = f"must lie between {self.low:g} and {self.high:g} {self.unit}".rstrip()
@@ -63,11 +63,11 @@ SETTING_BOUNDS = {
     "most_imputed": Bound(0, 10, "steps"),
     "early_visits": Bound(1, 20, "visits"),
 }
-"""Clinical bounds of what may be set from now on; versions of before may lie outside of them, and are shown as they are."""
+"""Clinical bounds of what may be set from now on; older versions may be outside of them, and are shown unchanged."""
 
 
 def published(bounds: Mapping[str, Bound]) -> Callable[[dict[str, Any]], None]:
-    """What puts the bounds of a model's fields into its JSON schema."""
+    """Return a function that puts the bounds of a model's fields into its JSON schema."""
 
     def publish(schema: dict[str, Any]) -> None:
         for name, bound in bounds.items():
@@ -107,8 +107,8 @@ class SettingsFields(Model):
     )
     design: Literal["stratified", "paper"] = Field(
         "stratified",
-        description="How random sessions try amplitudes: 'stratified' levels with draws held 10-60 s, or 'paper', a new uniform draw every "
-        "step. Settings of before there was a choice have 'paper'.",
+        description="How random sessions try amplitudes: 'stratified' levels with draws of 10-60 s, or 'paper', a new uniform draw every "
+        "step. Settings of older versions have 'paper'.",
     )
     design_ladder: Bool = Field(False, description="Stratified design: the first random session of a visit is a titration ladder.")
     early_visits: Int = Field(3, description="Stratified design: visits over which the levels of random sessions are spread.")
@@ -117,13 +117,13 @@ class SettingsFields(Model):
     )
     pool_shapes: Bool = Field(
         False,
-        description="Rankings take the shape of an outcome's answer to the dose from the site's other participants too, where leaving each "
-        "participant out shows that it helps; never its size, sign or level.",
+        description="Rankings also use the site's other participants for the shape of an outcome's answer to the dose, where leaving each "
+        "participant out shows that it helps. They never use its size, sign or level.",
     )
 
 
 class SettingsIn(SettingsFields):
-    """Settings of a participant; what is left out keeps its present value (for a new participant: its default)."""
+    """Settings of a participant; omitted ones keep their present value (for a new participant: its default)."""
 
     model_config = ConfigDict(json_schema_extra=published(SETTING_BOUNDS))
 

@@ -63,8 +63,9 @@ def settings_page(
     reason: str | None = None,
     taking_part: dict[str, str] | None = None,
 ) -> HTMLResponse:
-    """The page; `values` stand in its form, `error` says why it was refused, or, where `taking_part` has what was typed there, the form
-    that says whether the participant takes part."""
+    """Render the page; `values` are in its form, `error` says why it was refused. With `taking_part`, the text typed there, the refused
+    form is the one on taking part.
+    """
     page = render(
         request,
         "study/settings.html",

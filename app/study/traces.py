@@ -38,7 +38,7 @@ class StepTable:
         amplitude_ma: milliamperes, shape [n]; NaN where unknown or where the source gave fractions and no cDBS amplitude is known.
         fraction: amplitude fraction of the cDBS amplitude in force, shape [n]; NaN where unknown. May exceed 1.
         beta_trace, amplitude_trace: the rows of `trace` that it was read from; None where the session has none.
-        cdbs_ma: the cDBS amplitude in force, mA, or None when nobody stated it.
+        cdbs_ma: the cDBS amplitude in force, mA, or None where not stated.
     """
 
     t_s: NDArray[np.float64]
@@ -56,12 +56,12 @@ class StepTable:
 
 
 def pack(values: NDArray[np.floating], valid: NDArray[np.bool_]) -> tuple[bytes, bytes]:
-    """Columns `values_f32` and `valid_bits` of a trace."""
+    """Pack the columns `values_f32` and `valid_bits` of a trace."""
     return values.astype("<f4").tobytes(), np.packbits(valid).tobytes()
 
 
 def unpack(trace: Trace) -> NDArray[np.float64]:
-    """Values of a trace, shape [n], NaN where invalid."""
+    """Unpack the values of a trace, shape [n], NaN where invalid."""
     values = np.frombuffer(trace.values_f32, dtype="<f4").astype(np.float64)
     valid = np.unpackbits(np.frombuffer(trace.valid_bits, dtype=np.uint8), count=trace.n)
     if not valid.all():
@@ -74,18 +74,18 @@ TracesOf = Callable[[int], Sequence[Trace]]
 
 
 def traces_of(db: Session, sessions: Sequence[StudySession]) -> TracesOf:
-    """The traces of all recordings of these sessions, read at once; read only and without details."""
+    """Load the traces of all recordings of these sessions at once; read only and without details."""
     found = repository.traces_of_recordings(db, {g.recording_id for s in sessions for g in s.segments})
     return lambda recording_id: found.get(recording_id, [])
 
 
 def step_table(db: Session, session: StudySession, settings: SettingsVersion) -> StepTable:
-    """Beta and amplitude of a session's control channel, with up to W rows before its start; errors as in `laid_out`."""
+    """Build beta and amplitude of a session's control channel, with up to W rows before its start; errors as in `laid_out`."""
     return laid_out(session, settings, lambda recording_id: repository.traces_of_recording(db, recording_id))
 
 
 def laid_out(session: StudySession, settings: SettingsVersion, traces: TracesOf) -> StepTable:
-    """The step table from traces that somebody else read.
+    """Build the step table from traces that are already loaded.
 
     Raises:
         Invalid: a session of more than MOST_STEPS, traces of one recording that do not share a grid, or two segments that claim the same
@@ -113,7 +113,7 @@ def laid_out(session: StudySession, settings: SettingsVersion, traces: TracesOf)
 
 @dataclass(frozen=True)
 class Sources:
-    """What the step table of a session is read from; the numbers of its traces and the cDBS amplitude in force, mA."""
+    """Sources of a session's step table; the numbers of its traces and the cDBS amplitude in force, mA."""
 
     beta_trace_id: int | None
     amplitude_trace_id: int | None
@@ -121,7 +121,7 @@ class Sources:
 
 
 def sources(session: StudySession, settings: SettingsVersion, heads: Mapping[int, Sequence[repository.TraceHead]]) -> Sources:
-    """What `step_table` would read now; no trace is read for it.
+    """Find what `step_table` would read now; no trace is read for it.
 
     Args:
         session, settings: as for `step_table`. heads: of `repository.trace_heads`, by recording.
@@ -150,7 +150,7 @@ def shown_table(
     recording: Recording | None = None,
     alone: bool = True,
 ) -> StepTable:
-    """Any trace of a session's recordings on the session's grid, with an amplitude of the same recording; `beta` holds its values.
+    """Place any trace of a session's recordings on the session's grid, with an amplitude of the same recording; `beta` holds its values.
 
     `recording` is the trace's own, where the caller has it at hand. `alone`: its recording has no other program's amplitude.
 
@@ -171,7 +171,7 @@ def shown_table(
 
 
 def beta_of_part(trace: Trace, settings: SettingsVersion, start_s: float, stop_s: float) -> NDArray[np.float64]:
-    """A trace between two times of its recording on the grid of steps, with the W rows before, shape [W + T]; NaN where invalid.
+    """Place a trace between two times of its recording on the grid of steps, with the W rows before, shape [W + T]; NaN where invalid.
 
     Raises:
         Invalid: a part of more than MOST_STEPS, or a trace that is not on the participant's grid.
@@ -193,7 +193,7 @@ class RecordedTrace:
 
 
 def recorded_traces(db: Session, session: StudySession, settings: SettingsVersion) -> list[RecordedTrace]:
-    """Every trace of every recording of a session, the control recording first, from the state window before the session on.
+    """List every trace of every recording of a session, the control recording first, from the state window before the session on.
 
     Rows stay where the recording has them; the grid of the session's steps is not asked.
     """
@@ -212,13 +212,13 @@ def recorded_traces(db: Session, session: StudySession, settings: SettingsVersio
 
 
 def amplitude_program(trace: Trace | repository.TraceHead) -> int:
-    """The stimulation program of an amplitude trace; 0 where it names none."""
+    """Return the stimulation program of an amplitude trace; 0 where it names none."""
     word, _, number = trace.channel.rpartition(" ")
     return int(number) if word == "program" and number.isdecimal() else 0
 
 
 def _grid(session: StudySession, settings: SettingsVersion) -> NDArray[np.float64]:
-    """Ends of the session's rows, with W rows before its start, s. Raises Invalid for a session of more than MOST_STEPS."""
+    """Return the ends of the session's rows, with W rows before its start, s. Raises Invalid for a session of more than MOST_STEPS."""
     return _rows(f"Session {session.id}", session.duration_s, settings)
 
 
@@ -226,7 +226,7 @@ def _rows(named: str, duration_s: float, settings: SettingsVersion) -> NDArray[n
     steps = int(np.floor(duration_s / settings.period_s + 1e-6))
     if steps > MOST_STEPS:
         raise Invalid(
-            f"{named} is said to last {stated(duration_s, 9)} s: {steps} steps of {stated(settings.period_s)} s, "
+            f"{named} is stated to last {stated(duration_s, 9)} s: {steps} steps of {stated(settings.period_s)} s, "
             f"where {MOST_STEPS} are the most.",
             "Exclude it, or drop its proposal. Send a table whose times are Unix times again, with seconds from the session's start.",
         )
@@ -250,12 +250,12 @@ def _table(
 
 
 def session_offset_s(session: StudySession, recording_id: int) -> float:
-    """Where the session's start lies in a recording's clock, seconds: the start of its first segment in that recording."""
+    """Return the session's start in a recording's clock, seconds: the start of its first segment in that recording."""
     return min(s.start_s for s in session.segments if s.recording_id == recording_id)
 
 
 def _chosen(session: StudySession, traces: Sequence[AnyTrace]) -> tuple[AnyTrace | None, AnyTrace | None]:
-    """The trace of the session's control channel and that of its amplitude, among those of one recording."""
+    """Choose the trace of the session's control channel and that of its amplitude, among those of one recording."""
     candidates = [t for t in traces if t.stream == session.control_stream]
     if session.control_channel is not None:
         candidates = [t for t in candidates if t.channel == session.control_channel]
@@ -263,19 +263,19 @@ def _chosen(session: StudySession, traces: Sequence[AnyTrace]) -> tuple[AnyTrace
 
 
 def driving(session: StudySession, traces: Sequence[AnyTrace]) -> AnyTrace | None:
-    """The amplitude that the session's controller set, among the traces of one recording."""
+    """Return the amplitude that the session's controller set, among the traces of one recording."""
     amplitudes = [t for t in traces if t.stream == AMPLITUDE_STREAM]
     return next((t for t in amplitudes if session.control_program in (None, amplitude_program(t))), None)
 
 
 def control_programs(db: Session, session: StudySession) -> list[int]:
-    """Programs whose amplitude the session's control recordings hold."""
+    """List programs whose amplitude the session's control recordings hold."""
     control = {s.recording_id for s in session.segments if s.is_control}
     return sorted({amplitude_program(t) for i in control for t in repository.traces_of_recording(db, i) if t.stream == AMPLITUDE_STREAM})
 
 
 def _cdbs(session: StudySession, settings: SettingsVersion, amplitude: AnyTrace | None, traces: Sequence[AnyTrace]) -> float | None:
-    """What the controlled amplitude is a fraction of, mA; beside other programs only what is stated of this one. Raises Invalid."""
+    """Return the reference of the controlled amplitude, mA; with other programs only what is stated of this one. Raises Invalid."""
     alone = sum(t.stream == AMPLITUDE_STREAM for t in traces) <= 1
     return cdbs_amplitude.of_session(session, settings, amplitude_program(amplitude) if amplitude else 0, alone)
 

@@ -40,7 +40,7 @@ Day = tuple[Visit, list[tuple[StudySession, Arm | None]]]
 
 
 def days_of(visits: Sequence[Visit], sessions: Sequence[StudySession], caller: Caller) -> list[Day]:
-    """Visits with their sessions in order, each with its arm as far as the caller may know it."""
+    """Group sessions by visit in order, each with its arm as far as the caller may know it."""
     found: dict[int, list[tuple[StudySession, Arm | None]]] = {v.id: [] for v in visits}
     for session, arm in zip(sessions, visible_arms(sessions, caller), strict=True):
         found.get(session.visit_id, []).append((session, arm))
@@ -51,7 +51,7 @@ def lock(db: Session, visit: Visit, reason: str, caller: Caller, password: str, 
     """Close the data of a visit, signed over what they are.
 
     Args:
-        password: of the caller, asked for again; empty where a fresh sign-on stands for it. code: of the second factor.
+        password: of the caller, asked for again; empty where a fresh sign-on replaces it. code: of the second factor.
 
     Raises:
         Conflict: it is locked already, or sessions wait for confirmation. Invalid: no reason. Forbidden, TooMany: as
@@ -60,7 +60,7 @@ def lock(db: Session, visit: Visit, reason: str, caller: Caller, password: str, 
     waiting = [s for s in repository.proposals_of_participant(db, visit.participant_id) if s.visit_id == visit.id]
     if waiting:
         raise Conflict(
-            f"Visit {visit.number} has {len(waiting)} proposed session(s) that nobody has confirmed.", "Confirm or discard them, then lock."
+            f"Visit {visit.number} has {len(waiting)} proposed session(s) that are not confirmed.", "Confirm or discard them, then lock."
         )
     row = _set(db, visit, True, reason, caller)
     sign_lock(db, visit, row, caller, password, code)
@@ -73,7 +73,7 @@ def unlock(db: Session, visit: Visit, reason: str, caller: Caller) -> VisitLock:
 
 
 def require_unlocked(visit: Visit) -> None:
-    """Raises Conflict where a visit is locked."""
+    """Raise Conflict where a visit is locked."""
     if visit.locked:
         last = visit.locks[-1]
         raise Conflict(
@@ -110,7 +110,7 @@ def blinded_page(
     refused: StudySession | None = None,
     typed: Mapping[str, str] | None = None,
 ) -> HTMLResponse:
-    """The page; `refused` is the session whose form was, and `typed` what it said."""
+    """Render the page; `refused` is the session whose form was refused, and `typed` its content."""
     sessions, _ = repository.sessions_of_visit(db, visit.id)
     page = render(
         request,
@@ -127,7 +127,7 @@ def blinded_page(
     return HTMLResponse(page, error.status if error else 200)
 
 
-# What a clinician signs when a visit is locked, and whether the signature under the lock in force still stands. The caller commits.
+# What a clinician signs when a visit is locked, and whether the signature under the lock in force is still valid. The caller commits.
 
 KIND: Final = "visit_lock"
 MEANING: Final = "data of this visit are complete and reviewed"
@@ -149,9 +149,9 @@ def sign_lock(db: Session, visit: Visit, lock: VisitLock, caller: Caller, passwo
 
 
 def signatures_of_locks(db: Session, visit: Visit) -> dict[int, tuple[SignatureState, Signature | None]]:
-    """For each lock and unlock of a visit, by its number: whether its signature stands, and the signature.
+    """Return, for each lock and unlock of a visit by its number, the state of its signature, and the signature.
 
-    Only the lock in force can stand or be broken: after an unlock the data may change.
+    Only the lock in force can be valid or broken: after an unlock the data may change.
     """
     found = signatures.newest_of_each(db, KIND, [row.id for row in visit.locks if row.locked])
     states: dict[int, tuple[SignatureState, Signature | None]] = {}
@@ -171,11 +171,11 @@ def _present(db: Session, visit: Visit, lock: VisitLock, signature: Signature | 
 
 
 def signed_content(db: Session, visit: Visit, lock: VisitLock) -> dict[str, Any]:
-    """All that a signature under a lock covers: the visit, its doses, and of every session who says what, what it counts, and its samples.
+    """Build the signed content of a lock: the visit, its doses, and of every session its source, its counts and its samples.
 
-    Samples are covered by the SHA-256 of what the newest reading of each recording gives, so that reading a file again with the same
-    values changes nothing. The cDBS amplitude in force is covered beside the stated ones: where the visit states none it is that of the
-    settings, and every fraction, energy and verdict goes by it.
+    Samples are covered by the SHA-256 of each recording's newest reading: reading a file again with the same values changes nothing. The
+    cDBS amplitude in force is covered besides the stated ones. Where the visit states none it is that of the settings, and every fraction,
+    energy and verdict uses it.
     """
     sessions, _ = repository.sessions_of_visit(db, visit.id, 1000)
     used = {segment.recording_id for session in sessions for segment in session.segments}
@@ -210,7 +210,7 @@ def _session(session: StudySession, read: dict[int, str]) -> dict[str, Any]:
 
 
 def _cdbs_ma(session: StudySession, heads: Mapping[int, Sequence[repository.TraceHead]]) -> float | None:
-    """What the session's amplitude is a fraction of, mA; None where nobody stated it, or nothing says which of several it is."""
+    """Return the reference of the session's amplitude, mA; None where none is stated, or where several are and none is chosen."""
     try:
         return sources(session, session.visit.participant.current_settings, heads).cdbs_ma
     except Invalid:
@@ -218,7 +218,7 @@ def _cdbs_ma(session: StudySession, heads: Mapping[int, Sequence[repository.Trac
 
 
 def _digest(traces: list[Any]) -> str:
-    """SHA-256 of the traces of one reading of a recording."""
+    """Hash the traces of one reading of a recording by SHA-256."""
     return content_hash(
         {
             "traces": [
@@ -243,7 +243,7 @@ def _plain(value: Any) -> Any:
 
 
 def add_visit(db: Session, participant: Participant, draft: VisitIn, caller: Caller) -> Visit:
-    """Add a visit. Raises Conflict when its number is taken, Unusual for an amplitude outside the usual that nobody has confirmed."""
+    """Add a visit. Raises Conflict when its number is taken, Unusual for an amplitude outside the usual that is not confirmed."""
     require(caller, can.WRITE_STUDY, participant)
     if repository.visit_by_number(db, participant.id, draft.number):
         raise Conflict(f"Participant {participant.code} already has a visit {draft.number}.", "Choose the next number.", field="number")
@@ -287,11 +287,11 @@ def change_visit(db: Session, visit: Visit, change: VisitChange, caller: Caller)
 def _each_once(amplitudes: Sequence[CdbsAmplitudeModel]) -> None:
     keys = [(a.hemisphere, a.program) for a in amplitudes]
     if len(set(keys)) < len(keys):
-        raise Invalid("The same hemisphere and program stand twice in cdbs_amplitudes.", "Give each once.")
+        raise Invalid("The same hemisphere and program are twice in cdbs_amplitudes.", "Give each once.")
 
 
 def _asked(amplitude: CdbsAmplitudeModel) -> Question | None:
-    """What there is to ask about an amplitude of a visit; None where it is usual, or nobody can be asked."""
+    """Return the question about an amplitude of a visit; None where it is usual, or no person can be asked."""
     asked = question("cdbs_amplitude_ma", amplitude.amplitude_ma)
     if asked is None or amplitude.sure is None:
         return None

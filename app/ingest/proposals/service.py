@@ -237,7 +237,7 @@ def locked(db: Session, session: StudySession, version: int, caller: Caller) -> 
         raise Conflict(f"Session {session.id} was confirmed meanwhile.", "Correct it on its own page.")
     if proposal.version != version:
         what = f"Proposed session {session.id} was changed by {proposal.changed_by} after this form was opened; nothing was saved."
-        way = "What you typed still stands in the form: send it again to replace what is stored, or load the page again to keep that."
+        way = "What you typed is still in the form: send it again to replace what is stored, or load the page again to keep that."
         raise Conflict(what, way, version=proposal.version)
     return proposal
 

@@ -24,7 +24,7 @@ _SYMBOLS = {"left": "circle", "right": "square", None: "diamond"}
 
 
 def tremor_chart(outcome: TremorOutcome, uploads: dict[int, int]) -> Chart:
-    """The minutes over a session, share per class; what a minute gives to no class, or all tremor together, has bars of its own."""
+    """Plot the minutes over a session, share per class; unclassified time, or only the sum of all tremor, has bars of its own."""
     m, reading = outcome.minutes.minutes, outcome.reading
     begin = (m.start_unix_s - outcome.start_unix_s) / 60
     width = m.duration_s / 60
@@ -63,7 +63,7 @@ def tremor_chart(outcome: TremorOutcome, uploads: dict[int, int]) -> Chart:
 
 
 def grasp_chart(outcome: GraspOutcome) -> Chart:
-    """Every interval between open fists, implausible ones marked; tests that do not count are drawn thin."""
+    """Plot every interval between open fists, implausible ones marked; tests that do not count are drawn thin."""
     traces: list[dict[str, Any]] = []
     rows: list[list[Cell]] = []
     for test in outcome.tests:

@@ -22,7 +22,7 @@ from app.tables.visits import Visit
 
 
 def sessions_with_grasp_tests(db: Session, participant_id: int) -> Sequence[StudySession]:
-    """Confirmed sessions of a participant that have a grasp test from a file, by number."""
+    """Load confirmed sessions of a participant that have a grasp test from a file, by number."""
     tested = select(GraspTest.session_id).where(GraspTest.removed_at.is_(None))
     mine = (Visit.participant_id == participant_id) & (StudySession.status == "confirmed") & StudySession.id.in_(tested)
     return db.scalars(select(StudySession).join(StudySession.visit).where(mine).order_by(StudySession.id)).all()
@@ -31,19 +31,19 @@ def sessions_with_grasp_tests(db: Session, participant_id: int) -> Sequence[Stud
 def change_characteristics(
     db: Session, participant: Participant, seen: int, wanted: CharacteristicsFields, reason: str, caller: Caller
 ) -> CharacteristicsVersion:
-    """Store a version of what is wanted; the present one where nothing differs. Another hand derives grasp frequencies anew.
+    """Store a version of what is wanted; the present one where nothing differs. Another hand derives grasp frequencies again.
 
     Args:
         seen: version that the caller has read, 0 for none.
 
     Raises:
-        Forbidden: the caller enters no data of this participant. Conflict: somebody else was faster.
+        Forbidden: the caller enters no data of this participant. Conflict: another person was faster.
         Invalid: no reason, or nothing was ever stated.
     """
     access.require(caller, can.WRITE_STUDY, participant)
     current = participant.current_characteristics
     if seen != (current.version if current else 0):
-        raise Conflict("Somebody else changed these characteristics after you opened them; nothing was saved.", "Load them again.")
+        raise Conflict("Another person changed these characteristics after you opened them; nothing was saved.", "Load them again.")
     wanted = wanted.model_copy(update={"medication": sorted(wanted.medication, key=lambda d: (d.at, d.drug))})
     if wanted == fields_of(current):
         if current is None:
@@ -60,7 +60,7 @@ def change_characteristics(
         db.flush()
     except IntegrityError as error:
         db.rollback()
-        raise Conflict("Somebody else changed these characteristics at the same time.", "Load them again.") from error
+        raise Conflict("Another person changed these characteristics at the same time.", "Load them again.") from error
     if row.hand != (current.hand if current else None):
         for session in sessions_with_grasp_tests(db, participant.id):
             derive_for_session(db, session)

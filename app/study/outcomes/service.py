@@ -35,7 +35,7 @@ from ml.qoc import TREMOR_CLASSES
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A QoC that a person typed (or took back) and that the files tell otherwise.
+    """A QoC that a person typed (or took back) and that differs from the files.
 
     Attributes:
         name: of the QoC. typed: the person's value, None where it was taken back. author: who entered it.
@@ -58,7 +58,7 @@ def store_tremor(
 ) -> list[str]:
     """Keep all minutes of tremor of a file, and derive the tremor of every confirmed session that they overlap.
 
-    The same file again replaces its own minutes, so that decoding anew changes nothing but what the decoder reads otherwise. What was
+    The same file again replaces its own minutes, so that decoding again changes nothing but what the decoder reads otherwise. What was
     replaced stays as a removed row.
 
     Args:
@@ -112,8 +112,8 @@ def store_grasp(
 
     Args:
         db: the caller commits.
-        session: whose test it was. upload_file_id: the file; the same file and hand again replace what it gave before, and a file that
-            belonged to another session no longer counts there. What was replaced stays as a removed row.
+        session: whose test it was. upload_file_id: the file; the same file and hand again replace its earlier test. A file that belonged to
+            another session no longer counts there. What was replaced stays as a removed row.
         hand: `left`, `right`, or None where the file does not say.
         open_fist_s: times of open fists, s, strictly increasing, shape [n].
         implausible: intervals too short or too long for a grasp, shape [n - 1]; they are kept and marked.
@@ -176,14 +176,14 @@ def derive_for_session(db: Session, session: StudySession) -> list[str]:
 
 
 def give_up(db: Session, session: StudySession) -> None:
-    """The grasp tests of a proposal that is about to be deleted stay as removed rows."""
+    """Keep the grasp tests of a proposal that is about to be deleted, as removed rows."""
     for row in of_files.grasp_tests(db, session.id):
         row.removed_at = now()
     db.flush()
 
 
 def disagreements(session: StudySession, found: Sequence[Derived]) -> list[Disagreement]:
-    """Where a person's value stands against what the files give; a value that the files cannot give disagrees with none."""
+    """List values of a person that differ from what the files give; a value that the files cannot give disagrees with none."""
     clashes = []
     for derived in found:
         author = person_behind(session, derived.name)
@@ -194,7 +194,7 @@ def disagreements(session: StudySession, found: Sequence[Derived]) -> list[Disag
 
 
 def person_behind(session: StudySession, name: str) -> str | None:
-    """Who typed, or took back, the present value of a QoC; None where nobody did or where it was derived."""
+    """Return who typed, or took back, the present value of a QoC; None where no person did or where it was derived."""
     known = session.qoc
     if known is None or name in known.derived or name in known.from_day:
         return None
@@ -278,7 +278,7 @@ def add_revision(
 
 
 def _add_revision(db: Session, session: StudySession, changed: Sequence[Derived], author: str | None = None) -> QocRevision:
-    """A revision with derived values; the other QoCs stay."""
+    """Add a revision with derived values; the other QoCs stay."""
     files = sorted({i for d in changed for i in d.upload_file_ids})
     uploads = ", ".join(str(i) for i in sorted(set(repository.uploads_of_files(db, files).values())))
     reason = "; ".join(d.sentence for d in changed)
@@ -293,7 +293,7 @@ def _add_revision(db: Session, session: StudySession, changed: Sequence[Derived]
 
 
 def _take_from_other_sessions(db: Session, session: StudySession, upload_file_id: int) -> list[str]:
-    """A file that was attached to the wrong session leaves no value behind there."""
+    """Remove the values of a file from other sessions that it was attached to by mistake."""
     said = []
     elsewhere = [t for t in of_files.grasp_tests_of_file(db, upload_file_id) if t.session_id != session.id]
     for row in elsewhere:

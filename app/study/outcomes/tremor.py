@@ -35,15 +35,15 @@ class Minutes:
         return self.start_unix_s + self.duration_s
 
     def at(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Minutes:
-        """The chosen minutes."""
+        """Select the chosen minutes."""
         return Minutes(self.start_unix_s[chosen], self.duration_s[chosen], self.fractions[chosen], self.any_tremor[chosen])
 
     def equal(self, i: int, other: Minutes, j: int) -> bool:
-        """Whether two minutes say the same, to the precision that is stored."""
+        """Compare two minutes, to the precision that is stored."""
         return bool(self.at(np.array([i])).equals(other.at(np.array([j])))[0])
 
     def equals(self, other: Minutes) -> NDArray[np.bool_]:
-        """Whether each of these minutes says the same as the other's, to the precision that is stored, shape [n]."""
+        """Compare each of these minutes with the other's, to the precision that is stored, shape [n]."""
         fractions = np.isclose(self.fractions, other.fractions, atol=1e-6, equal_nan=True).all(axis=1)
         return np.asarray(fractions & np.isclose(self.any_tremor, other.any_tremor, atol=1e-6, equal_nan=True))
 
@@ -75,13 +75,13 @@ def pack(row: TremorSeries, minutes: Minutes) -> None:
 
 
 def same_values(one: TremorSeries, other: TremorSeries) -> bool:
-    """Whether two rows hold the same minutes, to the last bit."""
+    """Check whether two rows contain the same minutes, to the last bit."""
     arrays = ("n", "start_unix_s_f64", "duration_s_f64", "fractions_f32", "any_tremor_f32")
     return all(getattr(one, name) == getattr(other, name) for name in arrays)
 
 
 def unpack(row: TremorSeries) -> Minutes:
-    """The minutes of a row."""
+    """Unpack the minutes of a row."""
     return Minutes(
         np.frombuffer(row.start_unix_s_f64, "<f8").astype(np.float64),
         np.frombuffer(row.duration_s_f64, "<f8").astype(np.float64),
@@ -91,10 +91,10 @@ def unpack(row: TremorSeries) -> Minutes:
 
 
 def within(series: Sequence[TremorSeries], start_unix_s: float, stop_unix_s: float, names: Mapping[int, str]) -> SessionMinutes:
-    """The minutes of a stretch of time from all files; `names` says what a person calls each file, by its number.
+    """Collect the minutes of a stretch of time from all files; `names` has the name that a person gave each file, by its number.
 
-    Of minutes that two files tell, the newer file's count (a later export holds what the watch computed meanwhile). Minutes of one file
-    that claim the same time and say different things are left out, all of them: nobody can know which is right.
+    Of minutes in two files, the newer file's count (a later export holds what the watch computed meanwhile). Minutes of one file
+    that claim the same time and say different things are all excluded: which one is right cannot be known.
     """
     kept: list[tuple[float, int, Minutes, int]] = []
     notes: list[str] = []
@@ -126,7 +126,7 @@ def within(series: Sequence[TremorSeries], start_unix_s: float, stop_unix_s: flo
 
 
 def compare(minutes: Minutes, others: Sequence[TremorSeries]) -> tuple[int, int]:
-    """How many minutes of a file begin when a minute of other files does and say the same, and how many say something else."""
+    """Count the minutes of a file that begin with a minute of other files and agree, and those that differ."""
     same = different = 0
     begins, unseen = np.rint(minutes.start_unix_s), np.ones(minutes.start_unix_s.size, dtype=np.bool_)
     for row in reversed(others):  # one at a time, for each may be a year; of several files the last one counts
@@ -142,7 +142,7 @@ def compare(minutes: Minutes, others: Sequence[TremorSeries]) -> tuple[int, int]
 
 
 def _told_once(minutes: Minutes) -> tuple[list[int], int]:
-    """Minutes of one file (in time order) that have their time for themselves, and how many contradict another one."""
+    """Find minutes of one file (in time order) that overlap no other, and count those that contradict another one."""
     single: list[int] = []
     contested: set[int] = set()
     for i in range(minutes.start_unix_s.size):

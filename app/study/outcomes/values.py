@@ -1,4 +1,4 @@
-"""What uploaded files say of a session's QoCs, with everything that it rests on. Reads only; `app.study.outcomes.service` stores."""
+"""QoCs of a session from uploaded files, with everything that they rest on. Reads only; `app.study.outcomes.service` stores."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ml.qoc import PLAUSIBLE_INTERVAL_S, TremorReading, grasp_frequency, read_tr
 def tremor_series(
     db: Session, participant_id: int, start: datetime, stop: datetime, but_file_id: int | None = None
 ) -> Sequence[TremorSeries]:
-    """Files of minutes of tremor that reach into a stretch of time, oldest first; one of them can be left out, for each may be a year."""
+    """Load tremor files that reach into a stretch of time, oldest first. One file can be excluded: each may be a year."""
     reaching = (TremorSeries.last_end_at > start) & (TremorSeries.first_start_at < stop)
     own = select(TremorSeries).where(TremorSeries.participant_id == participant_id, reaching, TremorSeries.removed_at.is_(None))
     if but_file_id is not None:
@@ -37,25 +37,26 @@ def tremor_series(
 
 
 def tremor_series_of_file(db: Session, participant_id: int, upload_file_id: int) -> TremorSeries | None:
-    """The minutes of tremor that a file gave."""
+    """Load the minutes of tremor that a file gave."""
     own = (TremorSeries.participant_id == participant_id) & (TremorSeries.upload_file_id == upload_file_id)
     return db.scalar(select(TremorSeries).where(own, TremorSeries.removed_at.is_(None)))
 
 
 def grasp_tests(db: Session, session_id: int) -> Sequence[GraspTest]:
-    """The grasp tests of a session, oldest file first."""
+    """Load the grasp tests of a session, oldest file first."""
     mine = (GraspTest.session_id == session_id) & GraspTest.removed_at.is_(None)
     return db.scalars(select(GraspTest).where(mine).order_by(GraspTest.upload_file_id, GraspTest.id)).all()
 
 
 def grasp_tests_of_file(db: Session, upload_file_id: int) -> Sequence[GraspTest]:
-    """The grasp tests that a file gave, of whatever session."""
+    """Load the grasp tests that a file gave, of any session."""
     return db.scalars(select(GraspTest).where(GraspTest.upload_file_id == upload_file_id, GraspTest.removed_at.is_(None))).all()
 
 
 MIN_COVERAGE = 0.9
-"""Share of a session that minutes must cover. What they do not cover counts as time without tremor (the paper divides by the whole
-session), so that with less the QoC would say too little."""
+"""Share of a session that minutes must cover. The rest counts as time without tremor, since the paper divides by the whole session: with
+less, the QoC would be too low.
+"""
 
 MAX_UNKNOWN = 0.5
 """Share of a session that the watch may call unknown (active movement). It counts as time without tremor too, by the same division."""
@@ -139,12 +140,12 @@ class GraspOutcome:
 
 
 def derive(db: Session, session: StudySession) -> list[Derived]:
-    """The QoCs that files speak of; empty where none does."""
+    """Derive the QoCs that files contain; empty where none does."""
     return [o.derived for o in (tremor_outcome(db, session), grasp_outcome(db, session)) if o is not None]
 
 
 def tremor_outcome(db: Session, session: StudySession) -> TremorOutcome | None:
-    """Tremor from the minutes over a session (eq:tremor_severity); None where no minute lies in it, or its start is not known."""
+    """Derive tremor from the minutes over a session (eq:tremor_severity); None where no minute is in it, or its start is not known."""
     if session.started_at is None or session.duration_s <= 0:
         return None
     start = session.started_at.timestamp()
@@ -164,7 +165,7 @@ def tremor_outcome(db: Session, session: StudySession) -> TremorOutcome | None:
 
 
 def _tremor_value(reading: TremorReading) -> tuple[float | None, str]:
-    """The reading that counts, where the minutes suffice, and what it rests on."""
+    """Return the reading that counts, where the minutes suffice, and what it rests on."""
     whole = reading.session_s
     covered = f"{reading.covered_s / 60:.1f} of {whole / 60:.1f} min covered"
     if reading.undivided_s:
@@ -181,11 +182,11 @@ def _tremor_value(reading: TremorReading) -> tuple[float | None, str]:
 
 
 def grasp_outcome(db: Session, session: StudySession) -> GraspOutcome | None:
-    """Grasp frequency from a session's tests (eq:grasp_speed); None where there is no test.
+    """Derive the grasp frequency from a session's tests (eq:grasp_speed); None where there is no test.
 
-    Of several tests of one hand the newest counts. The hand is the participant's, as their characteristics state it: the one that goes
-    with the symptoms, as in the paper. A test of the other hand alone gives no value until a person enters it. Only where nobody has
-    stated the hand, the one contralateral to the session's hemisphere is taken, else the mean of both.
+    Of several tests of one hand the newest counts. The hand is the participant's, as their characteristics state it: the one that goes with
+    the symptoms, as in the paper. A test of the other hand alone gives no value until a person enters it. Only where no hand is stated, the
+    one contralateral to the session's hemisphere is taken, else the mean of both.
     """
     rows = grasp_tests(db, session.id)
     if not rows:
@@ -203,7 +204,7 @@ def grasp_outcome(db: Session, session: StudySession) -> GraspOutcome | None:
 
 
 def _of_own_hand(views: Mapping[Hemisphere | None, GraspView], known: CharacteristicsVersion) -> tuple[list[GraspView], str]:
-    """The test of the participant's hand, or one whose file names no hand; none where the other hand alone was tested, and why."""
+    """Select the test of the participant's hand, or one whose file names no hand; none where only the other hand was tested, and why."""
     hand = Hemisphere(known.hand)  # type: ignore[arg-type]
     if hand in views:
         return [views[hand]], f"{hand} hand, the participant's by the characteristics (version {known.version})"
@@ -217,7 +218,7 @@ def _of_own_hand(views: Mapping[Hemisphere | None, GraspView], known: Characteri
 
 
 def _which_hands(views: Mapping[Hemisphere | None, GraspView], hemisphere: Hemisphere | None) -> tuple[list[GraspView], str]:
-    """The tests that count, and why these."""
+    """Select the tests that count, and say why these."""
     if len(views) == 1:
         view = next(iter(views.values()))
         if hemisphere is not None and view.row.hand == hemisphere:

@@ -1,1 +1,1 @@
-"""What recordings hold besides the traces of sessions, and their charts."""
+"""Contents of recordings besides the traces of sessions, and their charts."""

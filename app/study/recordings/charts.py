@@ -35,7 +35,7 @@ class Stretch:
 
 
 def trace_charts(recording: Recording, traces: Sequence[Trace], stretch: Stretch) -> list[Chart]:
-    """All traces of a recording, one chart per unit and length of step; what is missing stays a gap."""
+    """Plot all traces of a recording, one chart per unit and length of step; what is missing stays a gap."""
     charts = []
     kinds = sorted({(t.unit, t.dt_s) for t in traces})
     for number, (unit, dt_s) in enumerate(kinds):
@@ -71,7 +71,7 @@ def trace_charts(recording: Recording, traces: Sequence[Trace], stretch: Stretch
 
 
 def spectrum_charts(recording: Recording, low_hz: float, high_hz: float) -> list[Chart]:
-    """Power spectral density per channel over the whole recording, one chart per unit; the beta band is shaded."""
+    """Plot the power spectral density per channel over the whole recording, one chart per unit; the beta band is shaded."""
     spectra = [s for s in recording.details.get("spectra") or [] if s.get("hz")]
     charts = []
     for number, unit in enumerate(sorted({str(s["unit"]) for s in spectra})):
@@ -109,7 +109,7 @@ def spectrum_charts(recording: Recording, low_hz: float, high_hz: float) -> list
 
 
 def clock_chart(recording: Recording) -> Chart | None:
-    """What is left of PacketGenTime over the implant's ticks, and where a clock was set; None where nothing is known of it."""
+    """Plot the residuals of PacketGenTime over the implant's ticks, and where a clock was set; None where nothing is known of it."""
     fit = clock_fit(recording)
     if fit is None or not fit.residual_ms:
         return None
@@ -154,7 +154,7 @@ def clock_chart(recording: Recording) -> Chart | None:
 
 
 def _windows(rows: Sequence[Sequence[Cell]]) -> str:
-    """Valid windows of each trace in words, from rows (name, valid, windows, …)."""
+    """Describe valid windows of each trace in words, from rows (name, valid, windows, …)."""
     valid, windows = (_span([int(row[i] or 0) for row in rows]) for i in (1, 2))
     return (
         f"n = {valid} of {windows} windows valid"
@@ -168,7 +168,7 @@ def _span(counts: Sequence[int]) -> str:
 
 
 def trace_name(trace: Trace) -> str:
-    """A trace as a page names it."""
+    """Name a trace for a page."""
     return f"{trace.stream} {trace.channel}".strip().replace("_", " ")
 
 
@@ -189,7 +189,7 @@ def _line(name: str, x: NDArray[np.float64], y: NDArray[np.float64], i: int, uni
 
 
 def _height(base: int, lines: Sequence[Any]) -> int:
-    """Space for a legend of several rows."""
+    """Return the height for a legend of several rows."""
     return base + 20 * max(0, (len(lines) - 1) // 4)
 
 

@@ -23,7 +23,7 @@ CONTROLLER_OF_KIND = {"distilled": Controller.DISTILLED, "baseline": Controller.
 
 @dataclass(frozen=True)
 class Logged:
-    """What ran, by the controller's own log.
+    """Policy that ran, by the controller's own log.
 
     Attributes:
         policy_id, policy_name, controller: of the participant's policy with the logged network; None where the participant has none.
@@ -41,7 +41,7 @@ class Logged:
 
 
 def of_recording(db: Session, recording: Recording) -> Logged | None:
-    """What a recording says of its controller; None where it is no log, or a log that does not tell."""
+    """Read the controller of a recording; None where it is no log, or a log that does not name one."""
     said = limits_and_policy(recording)
     if said is None or said["network_sha256"] is None:  # a schedule has no policy
         return None
@@ -59,13 +59,13 @@ def of_recording(db: Session, recording: Recording) -> Logged | None:
 
 
 def limits_and_policy(recording: Recording) -> Mapping[str, Any] | None:
-    """What stands at the head of a log (`ml.formats.tables.log_head.Ran`); None as in `of_recording`."""
+    """Return the head of a log (`ml.formats.tables.log_head.Ran`); None as in `of_recording`."""
     said = recording.details.get("settings", {}).get("controller")
     return said if isinstance(said, Mapping) else None
 
 
 class SlotHead(NamedTuple):
-    """One session of a plan as it stands: where it is, what it runs, and whether its plan is still signed (`plan_status` approved).
+    """Present state of one session of a plan: where it is, what it runs, and whether its plan is still signed (`plan_status` approved).
 
     `sealed`: whether the plan was signed blinded, and its key never opened.
     """
@@ -93,8 +93,8 @@ class LoggedSlot:
     """The session of a signed plan that a log says it is of.
 
     Attributes:
-        slot_id, plan_id, position, visit_number, visit_date (ISO 8601): as they stood when the bundle was made.
-        planned: the session of the plan as it stands; None where this participant has none such.
+        slot_id, plan_id, position, visit_number, visit_date (ISO 8601): at the time when the bundle was made.
+        planned: the present session of the plan; None where this participant has none such.
     """
 
     slot_id: int
@@ -106,7 +106,7 @@ class LoggedSlot:
 
 
 def slot_of_recording(db: Session, recording: Recording) -> LoggedSlot | None:
-    """The slot that a recording ran in; None where it is no log, and of trials on a bench and replays, at which nobody was connected."""
+    """Return the slot that a recording ran in; None where it is no log, and of trials on a bench and replays, without a participant."""
     said = limits_and_policy(recording)
     if said is None or said.get("purpose") != "session" or said.get("slot_id") is None:
         return None
@@ -127,19 +127,19 @@ def policy_share(recording: Recording) -> float | None:
 
 
 def rehearsed(recording: Recording) -> bool:
-    """Whether a log is of a trial on a bench: a controller ran, and no participant was connected."""
+    """Check whether a log is of a trial on a bench: a controller ran, and no participant was connected."""
     said = limits_and_policy(recording)
     return said is not None and said.get("purpose") == "bench"
 
 
 def simulated(recording: Recording) -> bool:
-    """Whether the device side of a log was a simulation."""
+    """Check whether the device side of a log was a simulation."""
     said = limits_and_policy(recording)
     return said is not None and bool(said.get("simulated"))
 
 
 def design_of_session(session: StudySession) -> dict[str, Any] | None:
-    """How a random session's amplitudes were drawn, by the log of the schedule that ran, as members of its conditions.
+    """Return the design of a random session's amplitudes, by the log of the schedule that ran, as members of its conditions.
 
     None where no such log is its control recording, or where the session does not begin where the schedule took over.
     """

@@ -1,4 +1,4 @@
-"""What a recording says of itself besides its traces: data quality per stream, the clinician's amplitude limits, its clock."""
+"""Facts of a recording besides its traces: data quality per stream, the clinician's amplitude limits, its clock."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from app.tables.visits import Visit
 from ml.formats import lead_in_words
 from ml.formats.rejection import REJECTED_WORDS, Rejected
 
-# API types of what a device keeps beside sessions.
+# API types of what a device keeps besides sessions.
 
 
 class TrendOut(Model):
@@ -45,7 +45,7 @@ class DeviceSpectrumOut(Model):
 
 
 class TherapyProgramOut(Model):
-    """One side's program of a therapy group; null where the report does not tell."""
+    """One side's program of a therapy group; null where the report does not say."""
 
     side: str
     amplitude_ma: float | None
@@ -76,7 +76,7 @@ class DeviceEventOut(Model):
 
 
 class DeviceHistoryOut(Model):
-    """What one report tells of its device's own history; what it does not hold is empty."""
+    """Device's own history in one report; what it does not hold is empty."""
 
     recording_id: int
     device: str = Field(description="Pseudonym of the device.")
@@ -90,18 +90,18 @@ class DeviceHistoryOut(Model):
     battery_months: float | None
 
 
-# Queries of what recordings say beside their traces.
+# Queries of what recordings contain besides their traces.
 
 
 def histories(db: Session, participant_id: int) -> Sequence[Recording]:
-    """What devices of a participant told of their own history, the newest first."""
+    """Load reports of a participant's devices on their own history, the newest first."""
     query = select(Recording).options(joinedload(Recording.device)).where(Recording.participant_id == participant_id)
     query = query.where(Recording.details["settings"]["section"].astext == "history")
     return db.scalars(query.order_by(Recording.started_at.desc().nulls_last(), Recording.id.desc())).all()
 
 
 def sealed_days(db: Session, participant_id: int) -> frozenset[dt.date]:
-    """Days (UTC) of a participant's visits whose blinded plan's key is sealed, and those on which their sessions were held."""
+    """Return the days (UTC) of a participant's visits whose blinded plan's key is sealed, and the days of their sessions."""
     sealed = (Visit.participant_id == participant_id) & Visit.sealed
     dated = db.scalars(select(Visit.date).where(sealed, Visit.date.is_not(None)))
     began = db.scalars(select(StudySession.started_at).join(Visit).where(sealed, StudySession.started_at.is_not(None)))
@@ -109,7 +109,7 @@ def sealed_days(db: Session, participant_id: int) -> frozenset[dt.date]:
 
 
 def with_battery(db: Session, participant_id: int) -> Sequence[Recording]:
-    """Recordings and reports that tell the charge or voltage of the stimulator's battery, the newest first."""
+    """Load recordings and reports with the charge or voltage of the stimulator's battery, the newest first."""
     query = select(Recording).options(joinedload(Recording.device)).where(Recording.participant_id == participant_id)
     query = query.where(Recording.details["settings"]["battery"].astext.is_not(None), Recording.superseded_by_id.is_(None))
     return db.scalars(query.order_by(Recording.started_at.desc().nulls_last(), Recording.id.desc())).all()
@@ -150,12 +150,12 @@ _KNOWN = {
     *("rate_hz", "paused_s", "reordered", "late", "moved"),
 }
 _APART = {"valid_fraction", "clock"}
-"""Parts of the quality that stand elsewhere on the page."""
+"""Parts of the quality that are elsewhere on the page."""
 
 
 @dataclass(frozen=True)
 class StreamQuality:
-    """One stream of a recording; None where its file does not tell.
+    """One stream of a recording; None where its file does not say.
 
     Attributes:
         name: of the stream. what: whether `count` and `missing` are packets or samples.
@@ -180,7 +180,7 @@ class StreamQuality:
 
 
 def quality_rows(recording: Recording) -> list[StreamQuality]:
-    """Data quality of each stream, in the order of the decoder."""
+    """List the data quality of each stream, in the order of the decoder."""
     rows = []
     for name, stored in recording.details.get("quality", {}).items():
         if not isinstance(stored, Mapping) or name in _APART or not _is_stream(stored):
@@ -193,7 +193,7 @@ def quality_rows(recording: Recording) -> list[StreamQuality]:
 
 
 def quality_remarks(recording: Recording) -> list[tuple[str, str]]:
-    """What the quality says that belongs to no stream: of what, and what."""
+    """List remarks of the quality that belong to no stream: of what, and what."""
     quality = recording.details.get("quality", {})
     return [
         (_words(name), _plain(value))
@@ -204,7 +204,7 @@ def quality_remarks(recording: Recording) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class SensingConfiguration:
-    """What the device sensed from a moment of the recording on.
+    """Sensing of the device from a moment of the recording on.
 
     Attributes:
         from_s: in the recording's seconds. channels: contacts and sampling rate of each channel. bands: of its own power, where on.
@@ -216,7 +216,7 @@ class SensingConfiguration:
 
 
 def sensing_configurations(recording: Recording) -> list[SensingConfiguration]:
-    """Sensing as it changed within the recording; what only repeats the one before is left out."""
+    """List the changes of sensing within the recording; repetitions of the one before are ignored."""
     found: list[SensingConfiguration] = []
     for state in recording.details.get("settings", {}).get("sensing") or []:
         contacts = state.get("contacts") or []
@@ -232,22 +232,22 @@ def sensing_configurations(recording: Recording) -> list[SensingConfiguration]:
 
 
 def adaptive_states(recording: Recording) -> list[tuple[float, int]]:
-    """Changes of the adaptive state: time in the recording (s), state."""
+    """List changes of the adaptive state: time in the recording (s), state."""
     events = recording.details.get("events") or []
     return [(float(e["t_s"]), int(e["data"]["state"])) for e in events if e.get("kind") == "adaptive_state"]
 
 
 def leads(recording: Recording) -> str:
-    """Where the leads are, as the device's settings say."""
+    """Name the leads, as the device's settings state them."""
     return ", ".join(str(x) for x in recording.details.get("settings", {}).get("leads") or [] if x)
 
 
 @dataclass(frozen=True)
 class ClockFit:
-    """How the PC's clock lay against the implant's ticks, over one recording.
+    """Fit of the PC's clock against the implant's ticks, over one recording.
 
     Attributes:
-        drift_ppm: how fast the implant's clock runs against the PC's; None where the recording is too short to tell.
+        drift_ppm: how fast the implant's clock runs against the PC's; None where the recording is too short.
         pc_steps, implant_steps: where a clock was set: time in the recording, and by how much, s.
         residual_t_s, residual_ms: PacketGenTime minus the fitted clock, the extremes of pieces of the recording.
         sd_ms: of all residuals. beyond_50_ms: share of packets whose residual is larger than 50 ms.
@@ -263,7 +263,7 @@ class ClockFit:
 
 
 def clock_fit(recording: Recording) -> ClockFit | None:
-    """The fit of the clocks; None for recordings without one (tables, Percept, decode versions up to 4)."""
+    """Read the fit of the clocks; None for recordings without one (tables, Percept, decode versions up to 4)."""
     stored = recording.details.get("quality", {}).get("clock")
     if not isinstance(stored, Mapping):
         return None
@@ -283,7 +283,7 @@ def clock_fit(recording: Recording) -> ClockFit | None:
 
 
 def valid_shares(recording: Recording) -> dict[str, float]:
-    """Share of valid windows per trace over the whole recording, 0 to 1."""
+    """Return the share of valid windows per trace over the whole recording, 0 to 1."""
     stored = recording.details.get("quality", {}).get("valid_fraction", {})
     return (
         {_words(name): float(value) for name, value in stored.items() if isinstance(value, int | float)}
@@ -293,7 +293,7 @@ def valid_shares(recording: Recording) -> dict[str, float]:
 
 
 def amplitude_limits(recording: Recording) -> list[tuple[str, str]]:
-    """The clinician's limits that the device holds: where, and from to in mA."""
+    """List the clinician's limits that the device stores: where, and from to in mA."""
     found = []
     for group, programs in (recording.details.get("limits") or {}).items():
         for program, limit in _limit_rows(programs):
@@ -302,7 +302,7 @@ def amplitude_limits(recording: Recording) -> list[tuple[str, str]]:
 
 
 def _is_stream(stored: Mapping[str, Any]) -> bool:
-    """Whether a part of the quality is a stream's, or has one of these per channel."""
+    """Check whether a part of the quality is a stream's, or has one of these per channel."""
     return bool(_KNOWN & stored.keys()) or (bool(stored) and all(isinstance(v, Mapping) and _KNOWN & v.keys() for v in stored.values()))
 
 
@@ -352,11 +352,11 @@ def _row(name: str, stored: Mapping[str, Any], clock: str) -> StreamQuality:
 
 
 _SHOWN = {"latency_median_ms": "median latency (ms)", "flat_share": "share of samples that stand still"}
-"""Names of further numbers of a stream that their own words do not tell."""
+"""Names of further numbers of a stream that their own words do not explain."""
 
 
 def _rejected(stored: str) -> Rejected:
-    """Why packets were left out, as stored."""
+    """Read why packets were rejected, as stored."""
     return Rejected(stored)
 
 

@@ -1,4 +1,5 @@
-"""What a device keeps beside sessions: trends, snapshots and surveys of spectra, therapy groups and events; from a recording's details.
+"""Data that a device keeps besides sessions: trends, snapshots and surveys of spectra, therapy groups and events; from a recording's
+details.
 
 Everything in it was reduced to numbers, times and known words before it was stored (`ml.formats.percept.details`).
 """
@@ -19,12 +20,12 @@ from app.study.recordings.controller_log import limits_and_policy, policy_share
 from app.tables.recordings import Recording
 from app.tables.sessions import Controller
 
-# What stimulators told of their batteries: read from the device, and no assumption.
+# Readings of stimulators' batteries: from the device, no assumption.
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One reading; None for what the device does not tell.
+    """One reading; None for what the device does not report.
 
     Attributes:
         recording_id: the recording or report that holds it. at: its start. device: its kind and pseudonym. hemisphere: of the recording.
@@ -41,7 +42,7 @@ class Reading:
 
 
 def readings(db: Session, participant_id: int) -> list[Reading]:
-    """Readings of a participant's stimulators, the newest first."""
+    """List readings of a participant's stimulators, the newest first."""
     found = []
     for recording in facts.with_battery(db, participant_id):
         battery = recording.details["settings"]["battery"]
@@ -54,7 +55,7 @@ def readings(db: Session, participant_id: int) -> list[Reading]:
 # What the tablet took for its decisions, and of its battery, by the logs of its controller: measured there, and uploaded with the log.
 
 LEAST_FALL = 1.0
-"""Charge, %, that must have gone for a whole charge's hours to be told: what operating systems tell a charge in."""
+"""Charge, %, that must be used before the hours of a whole charge are estimated: operating systems report charge in whole per cent."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Latency:
     """Time that one whole decision takes on the tablet, ms, as the paper's table has it.
 
     Attributes:
-        mean, sd: over decisions. decisions: timed. sessions: with a log that tells.
+        mean, sd: over decisions. decisions: timed. sessions: with a log that has it.
     """
 
     mean: float
@@ -81,14 +82,14 @@ class Battery:
 
     @property
     def hours_of_a_charge(self) -> float | None:
-        """What a whole charge would last if it went on falling as in this session, hours; None where it hardly fell."""
+        """Hours of a whole charge if it went on falling as in this session; None where it hardly fell."""
         fall = self.first - self.last
         return self.minutes / 60 * 100 / fall if fall >= LEAST_FALL else None
 
 
 @dataclass(frozen=True)
 class Runtime:
-    """One session on its tablet: time and battery, and the share of decisions by policy or schedule; None where the log does not tell."""
+    """One session on its tablet: time and battery, and the share of decisions by policy or schedule; None where the log does not say."""
 
     latency: Latency | None
     battery: Battery | None
@@ -96,7 +97,7 @@ class Runtime:
 
 
 def of_recording(recording: Recording) -> Runtime | None:
-    """What a controller's log tells of its tablet; None for other recordings and for logs of before it was measured."""
+    """Read the tablet's time and battery from a controller's log; None for other recordings and for older logs without them."""
     said = limits_and_policy(recording)
     if said is None:
         return None
@@ -108,7 +109,7 @@ def of_recording(recording: Recording) -> Runtime | None:
 
 
 def by_controller(found: Iterable[tuple[Controller, Runtime | None]]) -> dict[Controller, Latency]:
-    """Latency by controller over sessions: the mean of all timed decisions, and their standard deviation, within and between sessions."""
+    """Summarise latency by controller: mean of all timed decisions, and standard deviation within and between sessions."""
     each: Mapping[Controller, list[Latency]] = defaultdict(list)
     for controller, runtime in found:
         if runtime is not None and runtime.latency is not None:
@@ -125,12 +126,12 @@ def _pooled(own: list[Latency]) -> Latency:
 
 
 _CLOCKS = (timedelta(hours=-12), timedelta(0), timedelta(hours=14))
-"""The latest, the middle and the earliest clock on earth against UTC: a day lies within what they call it."""
+"""The latest, the middle and the earliest clock on earth against UTC: a day is within what they call it."""
 
 
 @dataclass(frozen=True)
 class Trend:
-    """Averages over ten minutes of one side: times (Unix s), power (device units) and amplitude (mA), all [n]; None where not told."""
+    """Averages over ten minutes of one side: times (Unix s), power (device units) and amplitude (mA), all [n]; None where not reported."""
 
     side: str
     unix_s: list[float]
@@ -153,7 +154,7 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class Program:
-    """One side's program of a therapy group; None where not told. `sensing_hz`: the frequency that the side was sensed at."""
+    """One side's program of a therapy group; None where not reported. `sensing_hz`: the frequency that the side was sensed at."""
 
     side: str
     amplitude_ma: float | None
@@ -187,7 +188,7 @@ class Marked:
 
 @dataclass(frozen=True)
 class History:
-    """The history of one device as one report told it; what the report did not hold is empty. Battery: percent and months left."""
+    """The history of one device in one report; what the report did not hold is empty. Battery: percent and months left."""
 
     recording: Recording
     trends: list[Trend]
@@ -210,10 +211,10 @@ class History:
 
 
 def history_of(recording: Recording, hidden: Collection[date] = ()) -> History:
-    """The history that a recording holds.
+    """Read the history that a recording holds.
 
     Args:
-        hidden: days of which neither trends nor programs are told, as any clock on earth has them: of visits whose plan's key is sealed.
+        hidden: days of which neither trends nor programs are shown, by any clock on earth has them: of visits whose plan's key is sealed.
     """
     kept = recording.details.get("settings", {})
     battery = kept.get("battery") or {}
@@ -257,7 +258,7 @@ def _group(stored: Mapping[str, Any], at: datetime | None) -> Group:
 
 
 def _events(recording: Recording) -> list[Marked]:
-    """In time order; the stored seconds count from the recording's start, or from its first event where it has none."""
+    """List the events in time order; the stored seconds count from the recording's start, or from its first event where it has none."""
     begin = recording.started_at
     if begin is None:
         return []

@@ -26,7 +26,7 @@ MOST_SPECTRA = 12
 
 
 def charts_of(history: History) -> list[Chart]:
-    """All pictures that a history has anything for."""
+    """Plot everything that a history has."""
     number = history.recording.id
     found = [*_trend_charts(history, number), _group_chart(history, number)]
     for name, title, spectra in (("snapshot", "Spectra at events", history.snapshots), ("survey", "Survey of spectra", history.surveys)):
@@ -38,7 +38,7 @@ def charts_of(history: History) -> list[Chart]:
 
 
 def _trend_charts(history: History, number: int) -> list[Chart]:
-    """Power and amplitude over weeks, with the patient's events; the tables have a row per day."""
+    """Plot power and amplitude over weeks, with the patient's events; the tables have a row per day."""
     if not history.trends:
         return []
     every = [t for trend in history.trends for t in trend.unix_s]
@@ -68,13 +68,13 @@ def _trend_charts(history: History, number: int) -> list[Chart]:
 
 
 def _window_s(trends: Sequence[Trend]) -> float:
-    """Width of the windows of which a line shows the lowest and the highest average, s; 0 where it shows all."""
+    """Return the width of the windows of which a line shows the lowest and the highest average, s; 0 where it shows all."""
     most = max(len(t.unix_s) for t in trends)
     return 0.0 if most <= MOST_POINTS else 2 * AVERAGE_S * -(-most // MOST_POINTS)
 
 
 def _line(trend: Trend, values: Sequence[float | None], unit: str, window_s: float) -> dict[str, Any]:
-    """One side; a gap stands where averages are missing."""
+    """Draw one side; missing averages are a gap."""
     shown: list[tuple[float, float | None]] = []
     held: list[tuple[float, float]] = []
     before = None
@@ -100,7 +100,7 @@ def _line(trend: Trend, values: Sequence[float | None], unit: str, window_s: flo
 
 
 def _extremes(held: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The lowest and the highest of a window's averages in their order, one where all are equal: a spike is not averaged away."""
+    """Return the lowest and the highest of a window's averages in their order, one where all are equal: a spike is not averaged away."""
     if not held:
         return []
     low, high = min(held, key=lambda p: p[1]), max(held, key=lambda p: p[1])
@@ -130,7 +130,7 @@ def _daily(trends: Sequence[Trend], what: str) -> list[list[Cell]]:
 
 
 def _group_chart(history: History, number: int) -> Chart | None:
-    """Amplitude of the active group by side, from visit to visit."""
+    """Plot the amplitude of the active group by side, from visit to visit."""
     active = sorted((g for g in history.groups if g.active and g.at is not None), key=lambda g: str(g.at))
     lines, rows = [], []
     for side in ("left", "right"):
@@ -161,7 +161,7 @@ def _group_chart(history: History, number: int) -> Chart | None:
 
 
 def _spectra_chart(identity: str, title: str, side: str, spectra: Sequence[Spectrum]) -> Chart:
-    """Spectra of one side, the newest where there are many."""
+    """Plot spectra of one side, the newest where there are many."""
     shown = sorted(spectra, key=lambda s: str(s.at or ""))[-MOST_SPECTRA:]
     names = [_named(s) for s in shown]
     lines = [

@@ -1,4 +1,4 @@
-"""HTML page of what devices keep beside sessions."""
+"""HTML page of the data that devices keep besides sessions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from app.study.recordings.history_charts import charts_of
 
 
 def history_out(history: History) -> DeviceHistoryOut:
-    """Everything of one report."""
+    """Convert one report to the schema."""
     return DeviceHistoryOut(
         recording_id=history.recording.id,
         device=history.recording.device.pseudonym,
@@ -35,14 +35,14 @@ def history_out(history: History) -> DeviceHistoryOut:
     )
 
 
-# REST route of what devices keep beside sessions.
+# REST route of what devices keep besides sessions.
 
 api = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
 
 @api.get("/participants/{code}/device-history")
 def device_history(participant: CurrentParticipant, db: Db) -> list[DeviceHistoryOut]:
-    """Trends, snapshots and surveys of spectra, therapy groups and events that the participant's devices told, the newest report first."""
+    """Return trends, spectra, therapy groups and events from the participant's devices, the newest report first."""
     hidden = facts.sealed_days(db, participant.id)
     return [history_out(history_of(r, hidden)) for r in facts.histories(db, participant.id)]
 
@@ -52,7 +52,7 @@ pages = APIRouter()
 
 @pages.get("/participants/{code}/device-history")
 def device_history_page(request: Request, participant: CurrentParticipant, db: Db, report: str = "") -> HTMLResponse:
-    """The newest report's history, or that of the recording `report`."""
+    """Show the newest report's history, or that of the recording `report`."""
     recordings = facts.histories(db, participant.id)
     chosen = next((r for r in recordings if str(r.id) == report), recordings[0] if recordings else None)
     history = history_of(chosen, facts.sealed_days(db, participant.id)) if chosen is not None else None

@@ -44,7 +44,7 @@ router = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
 @router.get("/participants")
 def list_participants(db: Db, caller: CurrentCaller, paging: PagingQuery) -> Page[ParticipantOut]:
-    """Participants the caller may see, by code."""
+    """List participants the caller may see, by code."""
     rows, total = repository.participants(db, caller, paging.limit, paging.offset)
     return Page(items=[participant_out(p) for p in rows], total=total, limit=paging.limit, offset=paging.offset)
 
@@ -58,26 +58,26 @@ def enrol(draft: ParticipantIn, db: Db, caller: CurrentCaller) -> ParticipantOut
 
 @router.get("/participants/{code}")
 def read_participant(participant: CurrentParticipant) -> ParticipantOut:
-    """One participant with its present settings."""
+    """Return one participant with its present settings."""
     return participant_out(participant)
 
 
 @router.get("/participants/{code}/settings")
 def list_settings(participant: CurrentParticipant) -> list[SettingsOut]:
-    """All settings versions, oldest first."""
+    """List all settings versions, oldest first."""
     return [SettingsOut.model_validate(s) for s in participant.settings]
 
 
 @router.put("/participants/{code}/settings", responses=problems(409))
 def change_settings(participant: CurrentParticipant, change: SettingsChange, db: Db, caller: CurrentCaller) -> SettingsOut:
-    """Change settings: a new version; members left out keep their value."""
+    """Change settings: a new version; omitted members keep their value."""
     row = settings.change_settings(db, participant, change.settings, change.reason, caller, change.sure)
     return SettingsOut.model_validate(row)
 
 
 @router.get("/participants/{code}/visits")
 def list_visits(participant: CurrentParticipant, db: Db, paging: PagingQuery) -> Page[VisitOut]:
-    """Visits of a participant, by number."""
+    """List visits of a participant, by number."""
     rows, total = repository.visits(db, participant.id, paging.limit, paging.offset)
     return Page(items=[visit_out(v, participant.code) for v in rows], total=total, limit=paging.limit, offset=paging.offset)
 
@@ -91,7 +91,7 @@ def add_visit(participant: CurrentParticipant, draft: VisitIn, db: Db, caller: C
 
 @router.get("/visits/{visit_id}")
 def read_visit(visit: CurrentVisit) -> VisitOut:
-    """One visit."""
+    """Return one visit."""
     return visit_out(visit, visit.participant.code)
 
 
@@ -104,7 +104,7 @@ def change_visit(visit: CurrentVisit, change: VisitChange, db: Db, caller: Curre
 
 @router.get("/visits/{visit_id}/locks")
 def list_locks(visit: CurrentVisit, db: Db) -> list[VisitLockOut]:
-    """When a visit was locked and unlocked, oldest first; the last one holds."""
+    """List locks and unlocks of a visit, oldest first; the last one applies."""
     return lock_rows(db, visit)
 
 
@@ -127,14 +127,14 @@ def unlock_visit(visit: CurrentVisit, why: VisitUnlockIn, db: Db, caller: Curren
 
 @router.get("/visits/{visit_id}/sessions", dependencies=[VisitViewed])
 def list_sessions(visit: CurrentVisit, db: Db, caller: CurrentCaller, paging: PagingQuery) -> Page[SessionOut]:
-    """Confirmed sessions of a visit, in order; proposals stand under the participant's."""
+    """List confirmed sessions of a visit, in order; proposals are listed under the participant."""
     rows, total = repository.sessions_of_visit(db, visit.id, paging.limit, paging.offset)
     return Page(items=[session_out(s, caller) for s in rows], total=total, limit=paging.limit, offset=paging.offset)
 
 
 @router.get("/sessions/{session_id}", dependencies=[SessionViewed])
 def read_session(session: CurrentSession, caller: CurrentCaller) -> SessionOut:
-    """One session."""
+    """Return one session."""
     return session_out(session, caller)
 
 
@@ -147,21 +147,21 @@ def change_session(session: CurrentSession, change: SessionChange, db: Db, calle
 
 @router.get("/sessions/{session_id}/trace", dependencies=[SessionViewed])
 def read_trace(session: CurrentSession, db: Db, caller: CurrentCaller) -> TraceOut:
-    """Beta and amplitude on the 2 s grid; rows with t_s <= 0 are the window before the session."""
+    """Return beta and amplitude on the 2 s grid; rows with t_s <= 0 are the window before the session."""
     require_known(session.visit, caller)
     return trace_out(session_data(db, session))
 
 
 @router.get("/sessions/{session_id}/traces", dependencies=[SessionViewed])
 def read_traces(session: CurrentSession, db: Db, caller: CurrentCaller) -> list[RecordedTraceOut]:
-    """Every trace of every recording of the session: all channels and powers, the amplitudes of all programs and sides."""
+    """Return every trace of every recording of the session: all channels and powers, the amplitudes of all programs and sides."""
     require_known(session.visit, caller)
     return [recorded_trace_out(t) for t in recorded_traces(db, session, session.visit.participant.current_settings)]
 
 
 @router.get("/sessions/{session_id}/conditions")
 def read_conditions(session: CurrentSession, caller: CurrentCaller) -> ConditionsOut | None:
-    """What the session ran under; null of a proposal, whose conditions are taken down when it is confirmed."""
+    """Return the conditions of the session; null of a proposal, whose conditions are recorded when it is confirmed."""
     require_known(session.visit, caller)
     return ConditionsOut.model_validate(session.conditions) if session.conditions else None
 
@@ -176,7 +176,7 @@ def change_conditions(session: CurrentSession, change: ConditionsChange, db: Db,
 
 @router.get("/sessions/{session_id}/qoc")
 def read_qoc(session: CurrentSession) -> QocOut | None:
-    """Newest revision of the QoCs, null when none was entered."""
+    """Return the newest revision of the QoCs, null when none was entered."""
     return QocOut.model_validate(session.qoc) if session.qoc else None
 
 
@@ -189,7 +189,7 @@ def record_qoc(session: CurrentSession, values: QocIn, db: Db, caller: CurrentCa
 
 @router.get("/sessions/{session_id}/outcomes")
 def read_outcomes(session: CurrentSession, db: Db) -> list[OutcomeOut]:
-    """QoCs as the uploaded files give them, with what they rest on; `conflicts` where a person's value stands against them."""
+    """Return QoCs as the uploaded files give them, with what they rest on; `conflicts` where a person's value differs."""
     return [outcome_out(session, d) for d in outcome_values.derive(db, session)]
 
 

@@ -45,7 +45,7 @@ DOSE_LABELS = {"drug": "Drug", "mg": "Dose", "at": "At"}
 
 
 def texts(known: CharacteristicsFields) -> dict[str, str]:
-    """Every field of the form by its name: `lead1_target`, `dose2_mg`, `symptom_tremor`, `hand`."""
+    """Write every field of the form by its name: `lead1_target`, `dose2_mg`, `symptom_tremor`, `hand`."""
     leads = [lead.model_dump(mode="json") for lead in known.leads]
     doses = [d.model_dump(mode="json") | {"mg": f"{d.mg:g}"} for d in known.medication]
     found = {"hand": known.hand or ""} | {f"symptom_{s}": "yes" if s in known.symptoms else "" for s in Symptom}
@@ -57,18 +57,18 @@ def texts(known: CharacteristicsFields) -> dict[str, str]:
 
 
 def posted(values: Mapping[str, Any]) -> dict[str, str]:
-    """A posted form as `texts` names its fields; a box that is not ticked is not sent."""
+    """Read a posted form as `texts` names its fields; a box that is not ticked is not sent."""
     return {name: str(values.get(name, "")).strip() for name in texts(CharacteristicsFields())}
 
 
 def shown_rows(typed: Mapping[str, str], name: str) -> int:
-    """Rows of leads (`lead`) or doses (`dose`) that stand open: up to the last one that says something, at least one."""
+    """Count the rows of leads (`lead`) or doses (`dose`) that are open: up to the last one with content, at least one."""
     labels, most = (LEAD_LABELS, MOST_LEADS) if name == "lead" else (DOSE_LABELS, MOST_DOSES)
     return max((i for i, _ in _rows(typed, name, labels, most)), default=1)
 
 
 def characteristics(typed: Mapping[str, str]) -> CharacteristicsFields:
-    """What a form says; an empty row says nothing.
+    """Read a form; an empty row states nothing.
 
     Raises:
         Invalid: names the row and the field that cannot be read.
@@ -78,7 +78,9 @@ def characteristics(typed: Mapping[str, str]) -> CharacteristicsFields:
     doses = [parse(PlannedDose, row, *_numbered("Dose", i, DOSE_LABELS)) for i, row in planned]
     for k, (i, _) in enumerate(planned):
         if (doses[k].drug, doses[k].at) in [(d.drug, d.at) for d in doses[:k]]:
-            raise Invalid("The same drug stands twice at one time in the schedule.", "Give both together in one row.", field=f"dose{i}_at")
+            raise Invalid(
+                "The same drug is listed twice at one time in the schedule.", "Give both together in one row.", field=f"dose{i}_at"
+            )
     symptoms = [s for s in Symptom if typed[f"symptom_{s}"]]
     hand = parse(CharacteristicsFields, {"hand": typed["hand"]}, {"hand": "Hand of the grasp test"}).hand
     return CharacteristicsFields(leads=leads, symptoms=symptoms, hand=hand, medication=doses)
@@ -90,7 +92,7 @@ def _rows(typed: Mapping[str, str], name: str, labels: Mapping[str, str], most: 
 
 
 def _numbered(what: str, number: int, labels: Mapping[str, str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Labels and names of the fields of a row."""
+    """Return labels and names of the fields of a row."""
     names = {field: f"{what.lower()}{number}_{field}" for field in labels}
     return {field: f"{what} {number}, {label.lower()}" for field, label in labels.items()}, names
 
@@ -102,7 +104,7 @@ api = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
 @api.get("/participants/{code}/characteristics")
 def list_characteristics(participant: CurrentParticipant) -> list[CharacteristicsOut]:
-    """All versions of a participant's characteristics, oldest first; the last one holds."""
+    """List all versions of a participant's characteristics, oldest first; the last one applies."""
     return [CharacteristicsOut.model_validate(row) for row in participant.characteristics]
 
 
@@ -120,7 +122,7 @@ pages = APIRouter()
 
 @pages.get("/participants/{code}/characteristics")
 def characteristics_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """Leads, symptoms, hand and medication of a participant, and the versions before."""
+    """Show leads, symptoms, hand and medication of a participant, and the versions before."""
     return _page(request, db, participant, caller, texts(characteristics_rules.fields_of(participant.current_characteristics)))
 
 

@@ -22,7 +22,7 @@ from app.tables.visits import Dose, Visit
 
 
 def current_dose(dose_id: RowId, db: Db, caller: CurrentCaller) -> tuple[Dose, Visit]:
-    """The dose that the path names, and its visit."""
+    """Load the dose that the path names, and its visit."""
     return doses.dose_with_visit(db, dose_id, caller)
 
 
@@ -36,7 +36,7 @@ api = APIRouter(tags=["study"], responses=problems(401, 403, 404, 422))
 
 @api.get("/visits/{visit_id}/doses")
 def list_doses(visit: CurrentVisit) -> list[DoseOut]:
-    """Doses of medication that bear on a visit, by time."""
+    """List doses of medication that bear on a visit, by time."""
     return [dose_out(row) for row in visit.doses]
 
 

@@ -41,7 +41,7 @@ _LABELS = {
 
 @pages.get("/participants/new")
 def new_participant(request: Request, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """The enrolment form."""
+    """Show the enrolment form."""
     caller.require(can.WRITE_STUDY)
     return _enrolment(request, db, caller, dict.fromkeys(_LABELS, ""), settings_form.texts(SettingsIn()))
 
@@ -83,7 +83,7 @@ def _enrolment(
 
 
 def _typed(values: FormData, base: dict[str, str]) -> dict[str, str]:
-    """What the person typed, so that a refused form comes back as it was sent."""
+    """Return what the person typed, so that a refused form comes back as it was sent."""
     return {name: str(values.get(name, text)) for name, text in base.items()}
 
 
@@ -115,7 +115,7 @@ def change_status_by_form(request: Request, participant: CurrentParticipant, db:
 
 
 def _change(typed: dict[str, str]) -> StatusChange:
-    """The form as the API's type. Raises Invalid, naming the field."""
+    """Parse the form to the API's type. Raises Invalid, naming the field."""
     status, reason = typed["status"], typed["status_reason"]
     if status not in get_args(Status):
         raise Invalid("Choose whether the participant takes part.", f"Known: {', '.join(get_args(Status))}.", field="status")
@@ -160,7 +160,7 @@ def reopen_site(study: ManagedStudy, site_code: SiteCode, why: EndingReason, db:
     return site_out(studies.site_of(db, study, site_code))
 
 
-# The forms that end a study or a site, and open it again; they stand on the page of studies.
+# The forms that end a study or a site, and open it again; they are on the page of studies.
 
 
 @pages.post("/studies/{study_code}/end")

@@ -23,7 +23,7 @@ from app.tables.visits import Visit
 
 
 def outcome_out(session: StudySession, derived: outcome_values.Derived) -> OutcomeOut:
-    """A derived QoC for the API."""
+    """Convert a derived QoC for the API."""
     conflicts = bool(outcomes.disagreements(session, [derived]))
     return OutcomeOut.model_validate(
         {"name": derived.name, "value": derived.value, "unit": derived.unit, "basis": derived.basis, "conflicts": conflicts}
@@ -31,7 +31,7 @@ def outcome_out(session: StudySession, derived: outcome_values.Derived) -> Outco
 
 
 def participant_out(p: Participant) -> ParticipantOut:
-    """A participant for the API."""
+    """Convert a participant for the API."""
     return ParticipantOut(
         code=p.code,
         status=p.status,
@@ -43,7 +43,7 @@ def participant_out(p: Participant) -> ParticipantOut:
 
 
 def visit_out(v: Visit, code: str) -> VisitOut:
-    """A visit for the API."""
+    """Convert a visit for the API."""
     amplitudes = [{"hemisphere": a.hemisphere, "program": a.program, "amplitude_ma": a.amplitude_ma} for a in v.cdbs_amplitudes]
     return VisitOut.model_validate(
         {"id": v.id, "participant": code, "number": v.number, "date": v.date, "note": v.note or "", "cdbs_amplitudes": amplitudes}
@@ -51,7 +51,7 @@ def visit_out(v: Visit, code: str) -> VisitOut:
 
 
 def lock_rows(db: Session, v: Visit) -> list[VisitLockOut]:
-    """The locks and unlocks of a visit for the API, oldest first, with what became of their signatures."""
+    """List the locks and unlocks of a visit for the API, oldest first, with the state of their signatures."""
     found = signatures_of_locks(db, v)
     return [
         VisitLockOut(
@@ -67,7 +67,7 @@ def lock_rows(db: Session, v: Visit) -> list[VisitLockOut]:
 
 
 def session_out(s: StudySession, caller: Caller) -> SessionOut:
-    """A session for the API; the controller comes through the blinding gate."""
+    """Convert a session for the API; the controller comes through the blinding gate."""
     arm = blinding.visible_arm(s, caller)
     return SessionOut(
         id=s.id,
@@ -95,7 +95,7 @@ def session_out(s: StudySession, caller: Caller) -> SessionOut:
 
 
 def trace_out(data: SessionData) -> TraceOut:
-    """A step table for the API."""
+    """Convert a step table for the API."""
     table, beta = data.table, data.table.beta_trace
     return TraceOut(
         session_id=data.session.id,
@@ -115,7 +115,7 @@ def trace_out(data: SessionData) -> TraceOut:
 
 
 def recorded_trace_out(found: RecordedTrace) -> RecordedTraceOut:
-    """A trace of a recording for the API."""
+    """Convert a trace of a recording for the API."""
     trace = found.trace
     return RecordedTraceOut(
         is_control=found.is_control,

@@ -48,39 +48,39 @@ _PLAIN = {"date": "Date", "note": "Note"}
 
 
 def texts(visit: Visit) -> dict[str, str]:
-    """The visit as the form shows it."""
+    """Write the visit's values as the form shows them."""
     fields = {"date": visit.date.isoformat() if visit.date else "", "note": visit.note or ""}
     fields |= {f"cdbs_{side}_{program}": "" for program in PROGRAMS for side in SIDES}
     return fields | {f"cdbs_{a.hemisphere}_{a.program}": typed(a.amplitude_ma, 10) for a in visit.cdbs_amplitudes}
 
 
 def labels(fields: Mapping[str, str]) -> dict[str, str]:
-    """What the form calls its fields."""
+    """Return the labels of the form's fields."""
     return {name: _PLAIN.get(name) or _label(name) for name in fields}
 
 
 def seen_values(values: Mapping[str, Any], present: Mapping[str, str]) -> dict[str, str]:
-    """What the posted form had shown; a field of which it says nothing is held against what is stored now."""
+    """Return what the posted form had shown; a field that it does not contain is compared with the stored value."""
     return {name: posted(values).get(f"seen_{name}", text) for name, text in present.items()}
 
 
 def posted(values: Mapping[str, Any]) -> dict[str, str]:
-    """The posted fields; browsers send line breaks as two characters."""
+    """Read the posted fields; browsers send line breaks as two characters."""
     return {str(name): str(value).replace("\r\n", "\n") for name, value in values.items()}
 
 
 def amplitudes(typed: Mapping[str, str], sure: Collection[str] = ()) -> list[CdbsAmplitudeModel]:
-    """The amplitudes that a form states, `sure` being the fields that a person confirmed. Raises Invalid, naming the field."""
+    """Read the amplitudes that a form states, `sure` being the fields that a person confirmed. Raises Invalid, naming the field."""
     return [_amplitude(n, text, n in sure) for n, text in typed.items() if n.startswith("cdbs_") and text.strip()]
 
 
 def asked_about(question: Mapping[str, Any]) -> str:
-    """The field of the correction form that a question about an amplitude belongs to."""
+    """Return the field of the correction form that a question about an amplitude belongs to."""
     return f"cdbs_{question['hemisphere']}_{question['program']}"
 
 
 def change(present: Mapping[str, str], changed: Mapping[str, str], reason: str, sure: Collection[str] = ()) -> VisitChange:
-    """The change of a visit that the form asks for; `sure`: fields that a person confirmed.
+    """Build the change of a visit that the form requests; `sure`: fields that a person confirmed.
 
     Raises:
         Invalid: no reason, or a field that cannot be read; names it.
@@ -96,7 +96,7 @@ def change(present: Mapping[str, str], changed: Mapping[str, str], reason: str, 
 
 
 def last_editor(db: Session, visit: Visit) -> str:
-    """Who changed the visit last."""
+    """Return who changed the visit last."""
     return repository.last_editor(db, "visit", visit.id)
 
 
@@ -127,7 +127,7 @@ _FIRST_PROGRAM = ("cdbs_left", "cdbs_right")
 
 @pages.get("/participants/{code}/visits", dependencies=[ResultsViewed])
 def visits(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """All visits of a participant with their sessions."""
+    """Show all visits of a participant with their sessions."""
     rows, _ = repository.visits(db, participant.id, 1000, 0)
     days = entering.days_of(rows, repository.sessions_for_lists(db, participant.id), caller)
     may_write = may(caller, can.WRITE_STUDY, participant)
@@ -139,7 +139,7 @@ def visits(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
 
 @pages.get("/participants/{code}/visits/new")
 def new_visit(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """The form of a new visit; the number is the next one."""
+    """Show the form of a new visit; the number is the next one."""
     access.require(caller, can.WRITE_STUDY, participant)
     rows, _ = repository.visits(db, participant.id, 1000, 0)
     draft = {"number": str(max((v.number for v in rows), default=0) + 1), "date": datetime.now(UTC).date().isoformat(), "note": ""}
@@ -162,7 +162,7 @@ def add_visit(request: Request, participant: CurrentParticipant, db: Db, caller:
 
 @pages.get("/visits/{visit_id}", dependencies=[VisitViewed])
 def visit_page(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """One visit day: its sessions in order; to a blinded assessor without what gives the controllers away."""
+    """Show one visit day: its sessions in order; to a blinded assessor without what gives the controllers away."""
     if not may_know(visit, caller) and not (visit.sealed and may(caller, can.READ_ARMS, visit.participant)):
         return blinded_page(request, db, visit, caller)
     return shown_visit(request, db, visit, caller)
@@ -212,13 +212,13 @@ def shown_visit(
     lock_reason: str = "",
     refused: str = "",
 ) -> HTMLResponse:
-    """The page of a visit; `typed`, `dose` and `lock_reason` are what a refused form of a correction, a dose or a lock said.
+    """Render the page of a visit; `typed`, `dose` and `lock_reason` are the content of a refused form of a correction, a dose or a lock.
 
     `refused` says which form `error` is about: `dose`, `removal-` with a dose's number (what was typed is in `typed`), `lock`; empty: the
     correction's.
     """
     sessions, _ = repository.sessions_of_visit(db, visit.id)
-    told = may_know(visit, caller)  # else its plan is sealed: letters and outcomes, and what else tells nothing of what ran
+    told = may_know(visit, caller)  # else its plan is sealed: letters and outcomes, and what else reveals nothing of what ran
     ran = [(arm(s, caller).controller, history.of_recording(control_recording(s))) for s in sessions if s.segments and told]
     seen, traces = texts(visit), traces_of(db, sessions)
     page = render(
@@ -257,7 +257,7 @@ def shown_visit(
 
 
 def _session_row(db: Session, session: StudySession, traces: TracesOf, caller: Caller) -> dict[str, Any]:
-    """What the visit's table says of a session; a session that cannot be laid on the grid says why."""
+    """Build a session's row of the visit's table; a session that does not fit the grid says why."""
     clashes = outcomes.disagreements(session, outcome_values.derive(db, session))
     row: dict[str, Any] = {"session": session, "arm": visible_arm(session, caller), "summary": None, "problem": "", "clashes": clashes}
     row["since"] = since_last_dose(session)

@@ -24,13 +24,13 @@ from app.tables.sessions import Controller, StudySession
 from ml.outcomes import FIELDS, OUTCOMES, enumerated
 
 POLICY_CONTROLLERS = {Controller.RL, Controller.DISTILLED, Controller.OTHER}
-"""Controllers that a policy can stand behind."""
+"""Controllers that may run a policy."""
 
 
 def record_qoc(db: Session, session: StudySession, values: QocIn, caller: Caller) -> QocRevision:
-    """Enter or correct QoCs: a new revision that keeps what the call leaves out. Same values, no revision.
+    """Enter or correct QoCs: a new revision that keeps what the call omits. Same values, no revision.
 
-    Raises Unusual for values outside the usual that nobody has confirmed.
+    Raises Unusual for values outside the usual that are not confirmed.
     """
     require(caller, can.WRITE_QOC, session.visit.participant)
     _refuse_proposal(session)
@@ -92,9 +92,7 @@ def change_session(db: Session, session: StudySession, change: SessionChange, ca
 
 def _refuse_proposal(session: StudySession) -> None:
     if session.status == "proposed":
-        raise Conflict(
-            f"Session {session.id} is a proposal that nobody has confirmed yet.", "Confirm or correct it among the proposals first."
-        )
+        raise Conflict(f"Session {session.id} is a proposal that is not confirmed yet.", "Confirm or correct it among the proposals first.")
 
 
 def _check_policy(db: Session, session: StudySession, controller: Controller, policy_id: int | None) -> None:
@@ -108,7 +106,7 @@ def _check_policy(db: Session, session: StudySession, controller: Controller, po
 
 
 def check_control(db: Session, session: StudySession, given: dict[str, Any]) -> None:
-    """A session can only be controlled by a trace, and through a program, that one of its recordings has."""
+    """Require that the control trace, and the program, are of one of the session's recordings."""
     _check_program(db, session, given.get("control_program"))
     if given.get("control_stream") is None and given.get("control_channel") is None:
         return

@@ -17,12 +17,12 @@ from app.study.traces import amplitude_program, session_offset_s
 from ml.mdp import AMPLITUDE_TOLERANCE
 
 MOST_LEVELS = 12
-"""Amplitudes that stand for themselves; more of them are drawn in bins."""
+"""Amplitudes that are shown one by one; more of them are drawn in bins."""
 BINS = 10
 MOST_LISTED = 60
 """Stretches of equal amplitude that are listed whatever they are."""
 NOTED = {"operator_note": "", "patient": "marked by the patient", "annotation": "annotation", "rating": "rating"}
-"""Kinds of events that people noted, and what is said behind them."""
+"""Kinds of events that people noted, and the words that follow them."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class StimulationStep:
 
     @property
     def above_cdbs(self) -> bool:
-        """Whether it exceeds the cDBS amplitude."""
+        """True where the fraction exceeds the cDBS amplitude."""
         return self.fraction is not None and self.fraction > 1 + AMPLITUDE_TOLERANCE
 
 
 def stimulation_steps(data: SessionData, events: Sequence[Mapping[str, Any]], origin_s: float) -> list[StimulationStep]:
-    """Stretches of equal amplitude within the session: from the device's log where there is one, else from the 2 s table.
+    """Find stretches of equal amplitude within the session: from the device's log where there is one, else from the 2 s table.
 
     Under embedded adaptive stimulation the log of stimulation does not hold what was delivered (the amplitude trace comes from AdaptiveLog
     then): the table counts.
@@ -61,7 +61,7 @@ def stimulation_steps(data: SessionData, events: Sequence[Mapping[str, Any]], or
 
 
 def in_chart_table(data: SessionData, steps: Sequence[StimulationStep]) -> bool:
-    """Whether the table behind the chart lists the same, row by row: many stretches, on its grid, of less than two rows each."""
+    """Check whether the table behind the chart lists the same, row by row: many stretches, on its grid, of less than two rows each."""
     ends = np.array([(s.start_s, s.stop_s) for s in steps]) / data.settings.period_s
     return (
         len(steps) > MOST_LISTED and 2 * len(steps) > int(np.sum(data.table.t_s > 0)) and bool(np.allclose(ends, np.rint(ends), atol=1e-3))
@@ -69,7 +69,7 @@ def in_chart_table(data: SessionData, steps: Sequence[StimulationStep]) -> bool:
 
 
 def _logged_steps(data: SessionData, logged: Sequence[Mapping[str, Any]], origin_s: float) -> list[StimulationStep]:
-    """Steps from the device's log, in the program that the amplitude trace shows, cut at the session's ends."""
+    """Build steps from the device's log, in the program that the amplitude trace shows, cut at the session's ends."""
     trace, cdbs = data.table.amplitude_trace, data.table.cdbs_ma
     program = amplitude_program(trace) if trace else 0
     changes = sorted((float(e["t_s"]) - origin_s, float(e["data"]["delivered_ma"][program])) for e in logged)
@@ -86,13 +86,13 @@ def _logged_steps(data: SessionData, logged: Sequence[Mapping[str, Any]], origin
 
 
 def operator_conflicts(events: Sequence[Mapping[str, Any]], origin_s: float) -> list[tuple[float, str, float | None]]:
-    """Operator's notes that disagree with the device: time in the session (s), the note, what the device delivered (mA)."""
+    """List operator's notes that disagree with the device: time in the session (s), the note, what the device delivered (mA)."""
     notes = (e for e in events if e["kind"] == "operator_note" and e["data"].get("conflict"))
     return [(float(e["t_s"]) - origin_s, str(e["label"]), e["data"].get("device_amplitude_ma")) for e in notes]
 
 
 def notes(events: Sequence[Mapping[str, Any]], origin_s: float, duration_s: float) -> list[tuple[float, str]]:
-    """What people noted within the session: time in the session (s), and an operator's note, a patient's event, an annotation, a rating."""
+    """List notes within the session: time in the session (s), and an operator's note, a patient's event, an annotation, a rating."""
     found = [(float(e["t_s"]) - origin_s, _noted(e)) for e in events if e["kind"] in NOTED]
     return sorted((t, label) for t, label in found if 0 <= t <= duration_s)
 
@@ -117,7 +117,7 @@ def _fit_axis(yaxis: dict[str, Any], values: NDArray[np.float64], threshold: flo
 
 
 def _table_steps(data: SessionData) -> list[StimulationStep]:
-    """Runs of equal amplitude in the 2 s table; unknown stretches between known ones are steps without amplitude."""
+    """Find runs of equal amplitude in the 2 s table; unknown stretches between known ones are steps without amplitude."""
     table, period = data.table, data.settings.period_s
     inside = table.t_s > 0
     ends, values = table.t_s[inside], np.where(np.isnan(table.amplitude_ma), table.fraction, table.amplitude_ma)[inside]
@@ -135,7 +135,7 @@ def _table_steps(data: SessionData) -> list[StimulationStep]:
 
 
 def control_chart(data: SessionData) -> Chart:
-    """Beta with the threshold above, amplitude in mA and as a fraction below, one time axis; windows without valid beta stay gaps."""
+    """Plot beta with the threshold above, amplitude in mA and as a fraction below; windows without valid beta stay gaps."""
     table, settings = data.table, data.settings
     minutes = table.t_s / 60
     # rows lie on a grid, of which its begin and its step travel
@@ -235,7 +235,7 @@ def control_chart(data: SessionData) -> Chart:
 
 
 def beta_by_amplitude(data: SessionData) -> Chart | None:
-    """Beta of the windows at each amplitude: every amplitude that was held, or ten bins where there were many; None below two of them."""
+    """Plot beta of the windows at each amplitude: every sustained amplitude, or ten bins where there were many; None below two of them."""
     table = data.table
     in_ma = _has(table.amplitude_ma)
     amplitude, unit = (table.amplitude_ma, "mA") if in_ma else (100 * table.fraction, "% of cDBS")
@@ -273,7 +273,7 @@ def beta_by_amplitude(data: SessionData) -> Chart | None:
 
 
 def _drawn(values: NDArray[np.float64]) -> list[float]:
-    """Values to four significant digits: a long session has thousands, and the table beside the chart has no more."""
+    """Round values to four significant digits: a long session has thousands, and the table next to the chart has no more."""
     return [float(f"{v:.4g}") for v in values]
 
 
@@ -285,7 +285,7 @@ def _amplitude_traces(data: SessionData, minutes: NDArray[np.float64], grid: Map
     shown = hover() + (" mA (%{customdata:.0%})" if _has(table.amplitude_ma) else "") + "<extra>amplitude</extra>"
     line = {"mode": "lines", "name": "Amplitude", **grid, "y": _drawn(values), "hovertemplate": shown}
     if _has(table.amplitude_ma):
-        line["customdata"] = np.round(table.fraction, 2)  # said in whole per cent
+        line["customdata"] = np.round(table.fraction, 2)  # written in whole per cent
     traces = [base | line]
     above = table.fraction > 1 + AMPLITUDE_TOLERANCE
     if np.any(above):
@@ -314,7 +314,7 @@ def _mark(missing: bool, spikes: bool) -> str:
 
 
 def _spike_rows(data: SessionData) -> NDArray[np.bool_]:
-    """Rows of the session's grid in which the decoder left spikes out."""
+    """Find rows of the session's grid in which the decoder excluded spikes."""
     table, trace = data.table, data.table.beta_trace
     out = np.zeros(table.t_s.size, dtype=bool)
     if trace is None:

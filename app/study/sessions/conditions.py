@@ -1,4 +1,4 @@
-"""What a session ran under: taken down when it is confirmed, corrected by a person afterwards, never read from today's settings."""
+"""Conditions of a session: recorded when it is confirmed, corrected by a person afterwards, never read from today's settings."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from app.tables.recordings import Recording
 from app.tables.sessions import Controller, SessionConditions, StudySession
 
 OF_SETTINGS = ("lower_bound", "window", "period_s", "xi_beta")
-"""What a settings version tells of the sessions that ran under it."""
+"""Conditions that a settings version defines for the sessions under it."""
 NEEDED = ("lower_bound", "window", "period_s")
 """What every session ran under: a correction may replace it and not take it back."""
 
 
 def record(db: Session, session: StudySession, by: str, stated: ConditionsChange | None = None) -> SessionConditions:
-    """Take down what a session ran under as it is confirmed; one that has conditions keeps them.
+    """Record the conditions of a session as it is confirmed; one that has conditions keeps them.
 
-    B, W, period and threshold are those of the settings that were in force when it began, by the clock; the present ones, marked as
-    assumed, where its start is not known or lies before the participant's first settings.
+    B, W, period and threshold are those of the settings that were in force when it began, by the clock. The present ones, marked as
+    assumed, are taken where its start is not known or is before the participant's first settings.
 
     Args:
-        by: whose name stands with it. stated: what a person or a plan says of it, which counts before anything else.
+        by: author of the record. stated: what a person or a plan says of it, which counts before anything else.
     """
     if session.conditions is not None:
         return session.conditions
@@ -55,7 +55,7 @@ def record(db: Session, session: StudySession, by: str, stated: ConditionsChange
 
 
 def change(db: Session, session: StudySession, wanted: ConditionsChange, caller: Caller) -> SessionConditions:
-    """Correct what a session ran under: a new revision; what is left out stays. Same values, no revision.
+    """Correct the conditions of a session: a new revision; omitted fields stay. Same values, no revision.
 
     Raises:
         Conflict: a proposal, which has none yet, or a locked visit.
@@ -63,7 +63,7 @@ def change(db: Session, session: StudySession, wanted: ConditionsChange, caller:
     """
     access.require(caller, can.WRITE_STUDY, session.visit.participant)
     if session.status != "confirmed":
-        raise Conflict(f"Session {session.id} is a proposal that nobody has confirmed yet.", "Confirm it first; then state its conditions.")
+        raise Conflict(f"Session {session.id} is a proposal that is not confirmed yet.", "Confirm it first; then state its conditions.")
     require_unlocked(session.visit)
     repository.lock_session(db, session)
     known = record(db, session, caller.label)
@@ -77,14 +77,14 @@ def change(db: Session, session: StudySession, wanted: ConditionsChange, caller:
         return known
     low, high = merged["min_ma"], merged["max_ma"]
     if low is not None and high is not None and low > high:
-        raise Invalid(f"The lower limit of {low:g} mA lies above the upper one of {high:g} mA.", "Give min_ma below max_ma.")
+        raise Invalid(f"The lower limit of {low:g} mA is above the upper one of {high:g} mA.", "Give min_ma below max_ma.")
     set_reason(db, wanted.reason)
     origin = "stated" if given.keys() & set(OF_SETTINGS) else known.origin
     return _add(db, session, merged, origin, caller.label, wanted.reason)
 
 
 def renew(db: Session, session: StudySession, by: str, reason: str) -> None:
-    """After the recordings of a session became other ones: what they tell of its conditions is taken from them; all else stays."""
+    """Update the conditions from the recordings after these were replaced; all else stays."""
     known = record(db, session, by)
     present = {name: getattr(known, name) for name in ConditionsFields.model_fields}
     told = {name: value for name, value in _of_recordings(db, session, _steps(db, session)).items() if value not in (None, [])}
@@ -93,7 +93,7 @@ def renew(db: Session, session: StudySession, by: str, reason: str) -> None:
 
 
 def _steps(db: Session, session: StudySession) -> StepTable | None:
-    """The session's steps; None where they cannot be read, for which its page and every buffer give the reason."""
+    """Read the session's steps; None where they cannot be read, for which its page and every buffer give the reason."""
     try:
         return step_table(db, session, session.visit.participant.current_settings)
     except Invalid:
@@ -101,7 +101,7 @@ def _steps(db: Session, session: StudySession) -> StepTable | None:
 
 
 def _of_recordings(db: Session, session: StudySession, table: StepTable | None) -> dict[str, Any]:
-    """What recordings, visit and bundles tell of a session's conditions."""
+    """Read the conditions of a session from recordings, visit and bundles."""
     values: dict[str, Any] = dict(zip(("min_ma", "max_ma"), _limits(db, session) or (None, None), strict=True))
     values["programming"] = [p.as_json() for p in designs.programs_of_session(session)]
     values["lead_amplitude_ma"] = lead_amplitude_ma(table) if table is not None else None
@@ -110,7 +110,7 @@ def _of_recordings(db: Session, session: StudySession, table: StepTable | None) 
 
 
 def settings_of(session: StudySession) -> tuple[SettingsVersion, bool]:
-    """The settings that a session ran under, and whether they were in force by the clock; else the present ones."""
+    """Return the settings that a session ran under, and whether they were in force by the clock; else the present ones."""
     versions = session.visit.participant.settings
     began = session.started_at
     before = [v for v in versions if began is not None and v.created_at <= began]
@@ -118,14 +118,14 @@ def settings_of(session: StudySession) -> tuple[SettingsVersion, bool]:
 
 
 def lead_amplitude_ma(table: StepTable) -> float | None:
-    """The amplitude in force just before a session, mA: that of the newest row before its start; None where none is known."""
+    """Return the amplitude in force just before a session, mA: that of the newest row before its start; None where none is known."""
     before = table.amplitude_ma[table.t_s <= 0]
     known = before[np.isfinite(before)]
     return float(known[-1]) if known.size else None
 
 
 def _given(wanted: ConditionsChange) -> dict[str, Any]:
-    """What a change states, whole: null empties a list or an object."""
+    """Return the values that a change states, whole: null empties a list or an object."""
     whole = wanted.model_dump(include=wanted.model_fields_set - {"reason"})
     empty: dict[str, Any] = {"design_parameters": {}, "programming": []}
     return {name: empty.get(name) if value is None else value for name, value in whole.items()}
@@ -140,7 +140,7 @@ def _add(db: Session, session: StudySession, values: dict[str, Any], origin: str
 
 
 def _limits(db: Session, session: StudySession) -> tuple[float, float] | None:
-    """Amplitude limits in force, mA: the controller's by its log, else the device's for the controlled program, else the bundle's."""
+    """Return amplitude limits, mA: the controller's by its log, else the device's for the controlled program, else the bundle's."""
     control = next((s.recording for s in session.segments if s.is_control), None)
     said = controller_log.limits_and_policy(control) if control is not None else None
     if said is not None:
@@ -153,13 +153,13 @@ def _limits(db: Session, session: StudySession) -> tuple[float, float] | None:
 
 
 def _device_limits(db: Session, session: StudySession, recording: Recording) -> tuple[float, float] | None:
-    """Limits of the recording's own program, where its device says which of them that was."""
+    """Return the limits of the recording's own program, where its device says which of them that was."""
     rows: dict[str, tuple[float, float]] = {}
     for programs in (recording.details.get("limits") or {}).values():
         for name, limit in programs.items() if isinstance(programs, Mapping) else ():
             if isinstance(limit, Mapping) and {"lower_ma", "upper_ma"} <= limit.keys() and limit["lower_ma"] <= limit["upper_ma"]:
                 if name in rows and rows[name] != (limit["lower_ma"], limit["upper_ma"]):
-                    return None  # several groups have such a program, and which one was active is not told
+                    return None  # several groups have such a program, and which one was active is not known
                 rows[name] = (float(limit["lower_ma"]), float(limit["upper_ma"]))
     if len(rows) == 1:
         return next(iter(rows.values()))

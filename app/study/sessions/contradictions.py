@@ -1,4 +1,4 @@
-"""Where what was said of a session (visit, controller, side, start) is not what its recordings tell; words: `wording.py`."""
+"""Contradictions between the statements about a session (visit, controller, side, start) and its recordings; words: `wording.py`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CLOCKS_DIFFER = timedelta(minutes=5)
 
 
 class Kind(StrEnum):
-    """What contradicts what; behind each the facts that a sentence about it needs."""
+    """Kind of contradiction; the docstring of each lists the facts that a sentence about it needs."""
 
     DAY = "day"
     """`day`, `utc_offset_h` (None: UTC), `visit`, `visit_date`."""
@@ -78,18 +78,18 @@ class Contradiction:
 
 
 def contradictions(db: Session, session: StudySession, visit_open: bool = False, steps_shown: bool = False) -> list[Contradiction]:
-    """Where a session's recordings are not those of the controller, the side, the start and the visit it is said to have had.
+    """List contradictions between a session's recordings and its stated controller, side, start and visit.
 
-    While the key of the visit's plan is sealed nothing is said of controller and amplitudes.
+    While the key of the visit's plan is sealed controller and amplitudes are not compared.
 
     Args:
-        visit_open: nobody has said the visit yet, so that its date contradicts nothing.
+        visit_open: the visit is not stated yet, so that its date contradicts nothing.
         steps_shown: the reader sees elsewhere why steps cannot be read, and which lie above the cDBS amplitude.
     """
     found = [*_of_minutes(db, session), *_of_day(session, visit_open), *_of_start(session), *_of_side(session)]
     found += [*_of_slot(db, session), *_of_dose(session), *_of_sources(session)]
     if session.visit.sealed:
-        return found  # what follows tells what ran, and these sentences are kept in reports that everybody reads
+        return found  # what follows reveals what ran, and these sentences are kept in reports that everybody reads
     try:
         table = step_table(db, session, session.visit.participant.current_settings)
         sides = delivered(db, session)
@@ -124,19 +124,19 @@ def _of_sources(session: StudySession) -> Iterator[Contradiction]:
 
 
 def utc_offset_h(recording: Recording) -> float | None:
-    """Offset of the clock where a recording was made, hours, as its file states; None where it states none."""
+    """Return the offset of the clock where a recording was made, hours, as its file states; None where it states none."""
     hours = recording.details.get("settings", {}).get("utc_offset_h")
     return float(hours) if isinstance(hours, int | float) and -14 <= hours <= 14 else None
 
 
 def local_day(recording: Recording, moment: datetime) -> date:
-    """The day of a moment where the recording was made, by the offset that its file states, else in UTC."""
+    """Return the day of a moment where the recording was made, by the offset that its file states, else in UTC."""
     hours = utc_offset_h(recording)
     return moment.astimezone(UTC if hours is None else timezone(timedelta(hours=hours))).date()
 
 
 def control_recording(session: StudySession) -> Recording:
-    """The recording that the controller of a session saw."""
+    """Return the recording that the controller of a session saw."""
     return next(s for s in session.segments if s.is_control).recording
 
 
@@ -151,7 +151,7 @@ def _of_day(session: StudySession, visit_open: bool) -> Iterator[Contradiction]:
     if visit_open or visit.date is None or session.started_at is None:
         return
     recording = control_recording(session)
-    # where the stated start is wrong, the day of the recording is what the visit is held against
+    # where the stated start is wrong, the day of the recording is compared with the visit
     day = local_day(recording, recording.started_at or session.started_at)
     if visit.date not in (day, local_day(recording, session.started_at)):
         facts = {"day": day, "utc_offset_h": utc_offset_h(recording), "visit": visit.number, "visit_date": visit.date}
@@ -191,7 +191,7 @@ def _of_dose(session: StudySession) -> Iterator[Contradiction]:
 
 
 def _of_log(ran: controller_log.Logged, arm: blinding.Arm | None, cdbs_ma: float | None) -> Iterator[Contradiction]:
-    """Another policy than the one that wrote the log, or another cDBS amplitude than it was bounded by."""
+    """Report another policy than the one that wrote the log, or another cDBS amplitude than it was bounded by."""
     if ran.policy_id is None or (arm is not None and arm.policy_id != ran.policy_id):
         yield Contradiction(Kind.LOGGED_POLICY, {"logged": ran.policy_name, "number": ran.number})
     if cdbs_ma is not None and abs(cdbs_ma - ran.cdbs_ma) > SILENT_MA:
@@ -199,7 +199,7 @@ def _of_log(ran: controller_log.Logged, arm: blinding.Arm | None, cdbs_ma: float
 
 
 def _of_slot(db: Session, session: StudySession) -> Iterator[Contradiction]:
-    """A log of a session that is planned at another visit, or nowhere any more; or of no session at all."""
+    """Report a log of a session that is planned at another visit, or nowhere any more; or of no session at all."""
     recording = control_recording(session)
     if controller_log.rehearsed(recording):
         yield Contradiction(Kind.BENCH)
@@ -217,7 +217,7 @@ def _of_slot(db: Session, session: StudySession) -> Iterator[Contradiction]:
 
 
 def _of_programs(sides: Sequence[Delivered]) -> Iterator[Contradiction]:
-    """Several programs of the controlled side moved, of which one counts."""
+    """Report several programs of the controlled side that moved, of which one counts."""
     counted = next((s for s in sides if s.is_control and s.moved), None)
     if counted is not None:
         others = [s.name for s in sides if s is not counted and s.hemisphere == counted.hemisphere and s.moved]

@@ -1,4 +1,4 @@
-"""How a random session's amplitudes were drawn: by the design of the visit's approved plan, by a stated one, or as they themselves say."""
+"""Design of a random session's amplitudes: by the visit's approved plan, as stated, or inferred from the amplitudes."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from app.tables.sessions import Controller, SessionConditions, SessionSegment, S
 from ml.designs import Hold, recognise, unstated_holds
 
 Kind = Literal["paper", "stratified", "ladder", "near", "held", "unstated"]
-"""The stated design; `held` where nobody stated one and the amplitudes are held; `unstated` where they are not: taken for the paper's."""
+"""Stated design. Without one, `held` for sustained amplitudes, else `unstated`, taken as the paper's."""
 
 AGREEING_SHARE: Final = 0.9
 """A session followed a planned design as far as this share of its known steps has the planned amplitude."""
 FEWEST_STEPS: Final = 30
-"""Steps that must agree before a session is said to have followed a design."""
+"""Steps that must agree before a session counts as having followed a design."""
 RESOLUTION_MA: Final = 0.1
 """What a stimulator rounds amplitudes to."""
 ALIKE: Final = 0.02
@@ -38,7 +38,7 @@ ALIKE: Final = 0.02
 
 @dataclass(frozen=True)
 class Drawn:
-    """How a random session's amplitudes were drawn.
+    """Draws of a random session's amplitudes.
 
     Attributes:
         kind: by which design. level: of the session, fraction. seed: of the design.
@@ -52,12 +52,12 @@ class Drawn:
 
     @property
     def density_told(self) -> bool:
-        """Whether its bound and its holds say how each amplitude was drawn; False of a stated design of held draws without its holds."""
+        """True where bound and holds give the density of each amplitude; false of stated sustained draws without holds."""
         return bool(self.holds) or self.kind in ("paper", "unstated")
 
 
 def drawn(conditions: SessionConditions | None, table: StepTable) -> Drawn:
-    """How the amplitudes of a random session were drawn, by its conditions, else by the amplitudes themselves.
+    """Find how the amplitudes of a random session were drawn, by its conditions, else by the amplitudes themselves.
 
     Args:
         conditions: of the session; None where nothing is known of them. table: its steps, and rows before it.
@@ -74,9 +74,9 @@ def drawn(conditions: SessionConditions | None, table: StepTable) -> Drawn:
 
 
 def of_session(db: Session, session: StudySession, table: StepTable, caller: Caller) -> Drawn | None:
-    """How a random session's amplitudes were drawn, also of a proposal that is not confirmed yet; None of another controller's.
+    """Find how a random session's amplitudes were drawn, also of a proposal that is not confirmed yet; None of another controller's.
 
-    A proposal whose controller is open is read too: held amplitudes may say what it was.
+    A proposal whose controller is open is read too: sustained amplitudes may show what it was.
     """
     arm = blinding.stated_arm(session, caller)
     if arm is not None and arm.controller is not Controller.RANDOM:
@@ -90,13 +90,13 @@ def of_session(db: Session, session: StudySession, table: StepTable, caller: Cal
 
 
 def planned(db: Session, session: StudySession, table: StepTable, period_s: float) -> dict[str, Any] | None:
-    """What its controller's log, else the visit's approved plan, says of how this random session was drawn, as members of its conditions.
+    """Return the design of this random session by its controller's log, else by the visit's approved plan, as members of its conditions.
 
-    Without a log a session is held against every designed session of the plan, and belongs to the one whose amplitudes it followed longest;
-    decisions after it left the design, such as a return to cDBS, are cut off. None where it followed none.
+    Without a log a session is compared with every designed session of the plan, and belongs to the one whose amplitudes it followed
+    longest. Decisions after it left the design, such as a return to cDBS, are cut off. None where it followed none.
 
     Args:
-        db: the session. session: whose visit. table: its steps. period_s: of these steps; designs of other steps are left out.
+        db: the session. session: whose visit. table: its steps. period_s: of these steps; designs of other steps are ignored.
     """
     if (drawn_by_log := controller_log.design_of_session(session)) is not None:
         return drawn_by_log
@@ -122,7 +122,8 @@ def planned(db: Session, session: StudySession, table: StepTable, period_s: floa
 
 
 def followed(fraction: NDArray[np.float64], holds: list[dict[str, Any]], within: float) -> int:
-    """Steps from the start on over which the amplitudes are the planned ones in at least `AGREEING_SHARE` of those that are known.
+    """Count the steps from the start on over which the amplitudes are the planned ones in at least `AGREEING_SHARE` of those that are
+    known.
 
     Args:
         fraction: of the session's steps, [T]; NaN where unknown. holds: planned. within: fractions closer than this agree.
@@ -137,7 +138,7 @@ def followed(fraction: NDArray[np.float64], holds: list[dict[str, Any]], within:
 
 
 def tolerance(cdbs_ma: float | None) -> float:
-    """Fractions closer than this are one amplitude after rounding to the device's resolution."""
+    """Return the fraction below which two amplitudes are one after rounding to the device's resolution."""
     return max(ALIKE, RESOLUTION_MA / cdbs_ma) if cdbs_ma else ALIKE
 
 
@@ -147,7 +148,7 @@ def _by_themselves(table: StepTable) -> tuple[Hold, ...]:
 
 
 def _until(holds: tuple[Hold, ...], steps: int) -> tuple[Hold, ...]:
-    """The holds of a session that ended after so many steps."""
+    """Cut the holds of a session that ended after so many steps."""
     return tuple(Hold(h.start, min(h.steps, steps - h.start), h.log_density) for h in holds if h.start < steps)
 
 
@@ -174,7 +175,7 @@ class Program:
     rate_hz: float | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """For storage; `Program(**stored)` is the way back."""
+        """Convert for storage; `Program(**stored)` is the inverse."""
         return asdict(self)
 
 
@@ -189,7 +190,7 @@ class Difference:
 
 
 def programs_of_session(session: StudySession) -> list[Program]:
-    """Every program that stimulated during a session, of all its recordings; a program that was changed within it stands there twice."""
+    """List every program that stimulated during a session, of all its recordings; a program that was changed within it is listed twice."""
     found: dict[Program, None] = {}
     for segment in session.segments:
         side = segment.recording.hemisphere or (session.hemisphere if segment.is_control else None)
@@ -198,12 +199,12 @@ def programs_of_session(session: StudySession) -> list[Program]:
 
 
 def stored(rows: Sequence[Mapping[str, Any]]) -> list[Program]:
-    """Programs of a session's conditions."""
+    """Read programs of a session's conditions."""
     return [Program(**row) for row in rows]
 
 
 def differences(own: Iterable[Program], current: Iterable[Program], side: Hemisphere | None) -> list[Difference]:
-    """In what a session's programs are not those that the participant has now.
+    """List the differences between a session's programs and those that the participant has now.
 
     Compared are contacts, pulse width and rate of each program that both name, on the given side; what either does not know differs in
     nothing. Of a program that changed within a session, the last word counts as current, and every one of its own is compared.
@@ -235,7 +236,7 @@ def _plain(value: str | float) -> str:
 
 
 def _of_recording(recording: Recording, side: str | None, start_s: float, stop_s: float) -> list[Program]:
-    """Programs in force within a part of a recording, as its device's settings and stimulation log have them."""
+    """List programs in force within a part of a recording, as its device's settings and stimulation log have them."""
     therapy = (recording.details.get("settings") or {}).get("therapy")
     if isinstance(therapy, Mapping):
         contacts, width, rate = (therapy.get(name) for name in ("contacts", "pulse_width_us", "rate_hz"))
@@ -255,7 +256,7 @@ def _of_recording(recording: Recording, side: str | None, start_s: float, stop_s
 
 
 def others(db: Session, session: StudySession) -> list[SameMinutes]:
-    """Other sessions, proposed ones too, that are controlled by the same device and side in the same minutes, in another recording."""
+    """Find other sessions, proposed ones too, that are controlled by the same device and side in the same minutes, in another recording."""
     found: dict[int, SameMinutes] = {}
     for segment in session.segments:
         if segment.is_control and segment.recording.started_at is not None:
@@ -265,18 +266,18 @@ def others(db: Session, session: StudySession) -> list[SameMinutes]:
 
 
 def counts_elsewhere(db: Session, session: StudySession) -> bool:
-    """Whether a session that counts has the same minutes of the same device in another recording."""
+    """Check whether a session that counts has the same minutes of the same device in another recording."""
     return any(one.counts for one in others(db, session))
 
 
 def refuse(db: Session, session: StudySession) -> None:
-    """Raises Conflict where a session that counts has the same minutes of the same device in another recording."""
+    """Raise Conflict where a session that counts has the same minutes of the same device in another recording."""
     for one in others(db, session):
         if one.counts:
             mine = next(s.recording_id for s in session.segments if s.is_control)
             raise Conflict(
                 f"Session {session.id} (recording {mine}) and session {one.session_id} (recording {one.recording_id}), which counts, "
-                f"hold the same {one.seconds:.0f} s of one device, and what they hold differs: the same minutes count once.",
+                f"hold the same {one.seconds:.0f} s of one device. Their contents differ: the same minutes count once.",
                 f"Look at both. Drop this one, or exclude session {one.session_id} with a reason and confirm this one then.",
                 sessions=[session.id, one.session_id],
                 recordings=[mine, one.recording_id],

@@ -91,7 +91,7 @@ class Summary:
 
 
 def summarise(data: SessionData) -> Summary:
-    """The numbers of a session's step table."""
+    """Summarise a session's step table in numbers."""
     table, settings = data.table, data.settings
     inside = table.t_s > 0
     beta, fraction = table.beta[inside], table.fraction[inside]
@@ -116,7 +116,7 @@ def summarise(data: SessionData) -> Summary:
 
 @router.get("/sessions/{session_id}", dependencies=[SessionViewed])
 def session_page(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller) -> Response:
-    """One session; a proposal is looked at where it is confirmed."""
+    """Show one session; redirect a proposal to the page where it is confirmed."""
     if session.status == "proposed":
         return RedirectResponse(f"/proposals/{session.id}", 303)
     return _page(request, db, session, caller)
@@ -163,7 +163,7 @@ def exclude(request: Request, session: CurrentSession, db: Db, caller: CurrentCa
 @router.post("/sessions/{session_id}/correction")
 def correct(request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
     """Correct what a session was: controller, policy, hemisphere, the trace that drove the controller."""
-    # only what the form changed of what it showed, so that an old form takes back nothing that somebody else corrected meanwhile
+    # only what the form changed of what it showed, so that an old form takes back nothing that another person corrected meanwhile
     present = Shown(1, _correction(session, caller), repository.last_editor(db, "session", session.id))
     shown = Shown(0, {n: str(values.get(f"seen_{n}", text)) for n, text in present.fields.items()}, "")
     changes = own_changes(values, "0", [shown, present], _CORRECTION_LABELS)
@@ -193,7 +193,7 @@ def correct_conditions(request: Request, session: CurrentSession, db: Db, caller
     reason = str(values.get("conditions_reason", "")).strip()[:1000]
     try:
         access.require(caller, can.WRITE_STUDY, session.visit.participant)
-        require_known(session.visit, caller)  # before what is refused could tell
+        require_known(session.visit, caller)  # before a refusal could reveal anything
         changes.refuse_conflicts()
         labels = _CONDITIONS_LABELS | {"reason": "Reason"}
         conditions.change(db, session, parse(ConditionsChange, changes.fields | {"reason": reason}, labels), caller)
@@ -216,7 +216,7 @@ def take_derived(request: Request, session: CurrentSession, db: Db, caller: Curr
 
 
 def _correction(session: StudySession, caller: Caller) -> dict[str, str]:
-    """What the form of corrections shows of a session."""
+    """Return what the form of corrections shows of a session."""
     known = arm(session, caller)
     return {
         "controller": known.controller.value,
@@ -231,23 +231,23 @@ def _correction(session: StudySession, caller: Caller) -> dict[str, str]:
 
 
 def _on_blinded_page(session: StudySession, caller: Caller) -> bool:
-    """Whether the caller enters QoCs on the blinded page of the visit."""
+    """Check whether the caller enters QoCs on the blinded page of the visit."""
     return not may_know(session.visit, caller) and not access.may(caller, can.READ_ARMS, session.visit.participant)
 
 
 def _qoc_revisions(session: StudySession) -> list[Shown]:
-    """Every revision as the form showed it; before the first one, it was empty."""
+    """List every revision as the form showed it; before the first one, it was empty."""
     return [Shown(0, _shown_qoc(None), ""), *(Shown(q.revision, _shown_qoc(q), q.entered_by) for q in session.qocs)]
 
 
 def _shown_qoc(revision: QocRevision | None) -> dict[str, str]:
-    """QoCs as the form shows them."""
+    """Write QoCs as the form shows them."""
     values = {n: getattr(revision, n, None) for n in FIELDS}
     return {name: typed(value) for name, value in values.items()}
 
 
 def _conditions_revisions(session: StudySession) -> list[Shown]:
-    """Every revision of a session's conditions as the form showed it; before the first one, it was empty."""
+    """List every revision of a session's conditions as the form showed it; before the first one, it was empty."""
     names = [n for n in _CONDITIONS_LABELS if n != "conditions_reason"]
     found = [Shown(0, dict.fromkeys(names, ""), "")]
     for row in session.conditions_revisions:
@@ -348,7 +348,7 @@ shown_again = _page
 def _sealed_page(
     request: Request, db: Session, session: StudySession, caller: Caller, error: BetaloopError | None, typed: dict[str, str] | None
 ) -> HTMLResponse:
-    """A session of a blinded plan whose key is sealed: its letter and outcomes, and nothing that tells what ran."""
+    """Render a session of a blinded plan whose key is sealed: its letter and outcomes, and nothing that reveals what ran."""
     participant = session.visit.participant
     known = _shown_qoc(session.qoc)
     page = render(
@@ -372,13 +372,13 @@ def _sealed_page(
 
 
 def _drawn(db: Session, session: StudySession, data: SessionData | None, caller: Caller) -> str:
-    """How a random session's amplitudes were drawn, in words; empty for other sessions and where its steps cannot be read."""
+    """Describe how a random session's amplitudes were drawn; empty for other sessions and where its steps cannot be read."""
     found = designs.of_session(db, session, data.table, caller) if data else None
     return drawn_words(found) if found else ""
 
 
 def _beside(db: Session, session: StudySession, data: SessionData | None) -> list[str]:
-    """Sides and programs that stimulated too, of which mean amplitude and energy hold nothing."""
+    """List sides and programs that stimulated too, of which mean amplitude and energy hold nothing."""
     if data is None:
         return []
     try:
@@ -388,7 +388,7 @@ def _beside(db: Session, session: StudySession, data: SessionData | None) -> lis
 
 
 def _control_events(session: StudySession, recordings: list[Recording]) -> tuple[list[dict[str, Any]], float]:
-    """Events of the recording that the controller saw, as stored, and where the session starts in its clock, seconds."""
+    """Return events of the recording that the controller saw, as stored, and where the session starts in its clock, seconds."""
     control = {s.recording_id for s in session.segments if s.is_control}
     for recording in recordings:
         if recording.id in control:

@@ -40,7 +40,7 @@ from ml.outcomes import Outcome
 
 
 def fingerprints(db: Session, participant_ids: Collection[int]) -> dict[int, str]:
-    """By participant: a hash over every row that its sessions are made of, each with the transaction that wrote its present version.
+    """Hash, by participant, every row that its sessions are made of, each with the transaction that wrote its present version.
 
     PostgreSQL gives every version of a row such a number (`xmin`), so that any change of any column changes the hash.
     """
@@ -52,7 +52,7 @@ def fingerprints(db: Session, participant_ids: Collection[int]) -> dict[int, str
 
 @lru_cache(maxsize=1)
 def _row_versions() -> Select[Any]:
-    """The query of `fingerprints`: to write it takes longer than to run it, and every page of results asks it."""
+    """Build the query of `fingerprints` once: to write it takes longer than to run it, and every page of results needs it."""
     visit, recording = Visit.participant_id, Recording.participant_id
     of_event = (AdverseEvent, AdverseEvent.id == AdverseEventRevision.event_id)
     parts = [
@@ -81,7 +81,7 @@ def _row_versions() -> Select[Any]:
 
 
 def _versions(name: str, key: Any, owner: Any, *joins: Any) -> tuple[Select[Any], Any]:
-    """A hash over the rows of one table by their participant, and the column that says whose they are."""
+    """Hash the rows of one table by their participant; return the query and the column with the owner."""
     version = cast(key, String).op("||")(literal(":")).op("||")(cast(literal_column(f"{name}.xmin"), String))
     hashed = func.md5(func.string_agg(version, aggregate_order_by(literal(","), key, version)))
     query = select(owner.label("owner"), literal(name).label("name"), hashed).select_from(key.class_).group_by(owner)
@@ -92,7 +92,7 @@ def _versions(name: str, key: Any, owner: Any, *joins: Any) -> tuple[Select[Any]
 
 @dataclass
 class ReadOnce:
-    """What several parts of a page ask of a participant's confirmed sessions, read when one of them asks first; of one request."""
+    """Cache of a participant's confirmed sessions for several parts of one page; of one request."""
 
     db: Session
     participant_id: int
@@ -104,12 +104,12 @@ class ReadOnce:
 
     @cached_property
     def rows(self) -> Sequence[StudySession]:
-        """The sessions by visit and order, read anew: what the transaction read before may be older than `fingerprint`."""
+        """Sessions by visit and order, read again: what the transaction read before may be older than `fingerprint`."""
         return sessions_of_participant(self.db, self.participant_id, afresh=True)
 
 
 def other_values(db: Session, session: StudySession, outcome: Outcome) -> list[float]:
-    """The newest values of an outcome in the visit's other confirmed sessions that have one."""
+    """Return the newest values of an outcome in the visit's other confirmed sessions that have one."""
     mine = (StudySession.visit_id == session.visit_id) & (StudySession.status == "confirmed") & (StudySession.id != session.id)
     value = getattr(QocRevision, outcome.field)
     revisions = select(QocRevision.session_id, value).join(StudySession, StudySession.id == QocRevision.session_id).where(mine)
@@ -136,7 +136,7 @@ class SameMinutes:
 
 
 def same_minutes(db: Session, recording: Recording, begin: datetime, end: datetime, besides: int | None) -> list[SameMinutes]:
-    """Sessions controlled by a recording's device and side within [begin, end], in another recording, by number.
+    """Find sessions controlled by a recording's device and side within [begin, end], in another recording, by number.
 
     Args:
         recording: one of no known side is of both. besides: a session that is not asked for.
@@ -171,7 +171,7 @@ def policy_shares(db: Session, session_ids: Collection[int]) -> dict[int, float]
 
 
 def repeated_sessions(db: Session, participant_id: int) -> set[int]:
-    """Sessions that count by a device's clock and have no place of their own in `counted_time`: another one had their minutes before."""
+    """Find sessions that count by a device's clock and whose minutes in `counted_time` belong to an earlier session."""
     query = (
         select(StudySession.id)
         .join(StudySession.visit)

@@ -1,4 +1,4 @@
-"""What the recordings of a session tell of its stimulation, and which controller such an amplitude can and cannot have come from."""
+"""Stimulation in the recordings of a session, and the controllers that such an amplitude can and cannot have come from."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ KNOWN_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Delivered:
-    """What one recording of a session holds of the stimulation: one side, or one program of a side.
+    """Stimulation in one recording of a session: one side, or one program of a side.
 
     Attributes:
         name: of the side, for a sentence. hemisphere: where it is known.
@@ -59,27 +59,27 @@ class Delivered:
 
     @property
     def silent(self) -> bool:
-        """Whether every known amplitude is 0, and at least one is known."""
+        """True where every known amplitude is 0, and at least one is known."""
         amount, _, in_ma = self.inside
         known = amount[~np.isnan(amount)]
         return bool(known.size) and float(np.abs(known).max()) <= (SILENT_MA if in_ma else SILENT_FRACTION)
 
     @property
     def stimulated(self) -> bool:
-        """Whether any known amplitude is not 0."""
+        """True where any known amplitude is not 0."""
         amount, _, _ = self.inside
         return bool(np.any(~np.isnan(amount))) and not self.silent
 
     @property
     def moved(self) -> bool:
-        """Whether the known amplitude was not the same throughout."""
+        """True where the known amplitude changed."""
         amount, _, in_ma = self.inside
         known = amount[~np.isnan(amount)]
         return bool(known.size) and float(np.ptp(known)) > (SILENT_MA if in_ma else SILENT_FRACTION)
 
 
 class Pattern(StrEnum):
-    """How the amplitude of one side ran over a session."""
+    """Pattern of the amplitude of one side over a session."""
 
     UNKNOWN = "unknown"
     MOSTLY_UNKNOWN = "mostly_unknown"
@@ -102,7 +102,7 @@ class Course:
         side: its name.
         known, steps: steps whose amplitude is known, and all.
         low, high, median: of the known ones, in `unit` ("mA", or "% of cDBS" where the source gives fractions).
-        cdbs_ma: the cDBS amplitude in force, mA. share: median fraction of it, in per cent; both None where nobody stated one.
+        cdbs_ma: the cDBS amplitude in force, mA. share: median fraction of it, in per cent; both None where none is stated.
     """
 
     side: str
@@ -122,12 +122,12 @@ class Course:
         return GUESSES.get(self.pattern)
 
     def as_json(self) -> dict[str, Any]:
-        """For storage; `Course(**stored)` with its pattern is the way back."""
+        """Convert for storage; `Course(**stored)` with its pattern is the inverse."""
         return asdict(self)
 
 
 def course(side: Delivered) -> Course:
-    """How the amplitude of a side ran."""
+    """Describe the course of the amplitude of a side."""
     amount, fraction, in_ma = side.inside
     scale, unit = (1.0, "mA") if in_ma else (100.0, "% of cDBS")
     known = scale * amount[~np.isnan(amount)]
@@ -162,13 +162,13 @@ def _pattern(side: Delivered, known: NDArray[np.float64], relative: NDArray[np.f
 
 
 def fits(controller: Controller, mean_fraction: float) -> bool:
-    """Whether a session of this controller can have this mean amplitude fraction."""
+    """Check whether a session of this controller can have this mean amplitude fraction."""
     low, high = MEAN_FRACTION.get(controller, (-np.inf, np.inf))
     return bool(low <= mean_fraction <= high)
 
 
 def contradicts(session: StudySession, controller: Controller, side: Delivered) -> bool:
-    """Whether the amplitude of a side cannot have come from this controller; False where too little is known."""
+    """Check whether the amplitude of a side cannot have come from this controller; False where too little is known."""
     amount, fraction, _ = side.inside
     known, relative = amount[~np.isnan(amount)], fraction[~np.isnan(fraction)]
     if not known.size:
@@ -183,18 +183,18 @@ def contradicts(session: StudySession, controller: Controller, side: Delivered) 
 
 
 def delivered(db: Session, session: StudySession) -> list[Delivered]:
-    """The stimulation of every side of a session, from all its recordings, the controlled one first; errors as in `delivered_by`."""
+    """Collect the stimulation of every side of a session, the controlled one first; errors as in `delivered_by`."""
     return delivered_by(session, lambda recording_id: repository.traces_of_recording(db, recording_id))
 
 
 def beside(sides: Sequence[Delivered], counted: Trace | None) -> list[str]:
-    """Names of the sides and programs that stimulated, but for the one whose amplitude trace a session's step table was read from."""
+    """Name the sides and programs that stimulated, but for the one whose amplitude trace a session's step table was read from."""
     traces = ((s, s.table.amplitude_trace) for s in sides if s.table is not None and s.stimulated)
     return [s.name for s, trace in traces if trace is not None and (counted is None or trace.id != counted.id)]
 
 
 def delivered_by(session: StudySession, traces_of: TracesOf) -> list[Delivered]:
-    """The same from traces that somebody else read.
+    """Collect the stimulation of every side of a session from traces that are already loaded.
 
     Raises:
         Invalid: amplitudes that are not on the participant's grid, or a visit that states both sides and a session that names none.
@@ -225,7 +225,7 @@ def delivered_by(session: StudySession, traces_of: TracesOf) -> list[Delivered]:
 
 
 def _spared(session: StudySession, side: Delivered) -> bool:
-    """Whether a silent side is as the visit has it: cDBS amplitudes are stated for the other side alone."""
+    """Check whether a silent side agrees with the visit: cDBS amplitudes are stated only for the other side."""
     stated = {a.hemisphere for a in session.visit.cdbs_amplitudes}
     return side.silent and bool(stated) and side.hemisphere is not None and side.hemisphere not in stated
 

@@ -1,4 +1,4 @@
-"""How many steps of a session can be learned from, per channel that could have driven its controller, and why where there are none."""
+"""Usable steps of a session, per channel that could have driven its controller, and the reason where there are none."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class SessionData:
 
     @property
     def threshold_mismatch(self) -> str:
-        """Why the participant's threshold says nothing about this trace; empty where it does."""
+        """Reason why the participant's threshold does not apply to this trace; empty where it does."""
         return mismatch(self.settings, self.table.beta_trace)
 
     @property
@@ -43,14 +43,14 @@ class SessionData:
 
 
 def session_data(db: Session, session: StudySession, traces: TracesOf | None = None) -> SessionData:
-    """Beta and amplitude of a session, from `traces` where the caller has read those of many sessions at once."""
+    """Return beta and amplitude of a session, from `traces` where the caller has read those of many sessions at once."""
     settings = session.visit.participant.current_settings
     table = step_table(db, session, settings) if traces is None else laid_out(session, settings, traces)
     return SessionData(session, settings, table)
 
 
 def qoc_of(session: StudySession) -> Qoc:
-    """A session's QoCs as the science knows them."""
+    """Convert a session's QoCs for the analyses."""
     row = session.qoc
     return Qoc() if row is None else Qoc(**{o.field: getattr(row, o.field) for o in OUTCOMES})
 
@@ -92,14 +92,14 @@ class UsableSteps:
 
 @dataclass(frozen=True)
 class Worth:
-    """What a channel's beta alone can teach: steps that are usable where the amplitude is known, and steps with a valid beta."""
+    """Steps of a channel that can be learned from: those that are usable where the amplitude is known, and those with a valid beta."""
 
     usable: int
     valid: int
 
 
 def worth_of(trace: Trace, settings: SettingsVersion, start_s: float, stop_s: float) -> Worth:
-    """What a channel can teach within a part of its recording, before there is a session of it; nothing off the participant's grid."""
+    """Count the steps of a channel within a part of its recording, before there is a session of it; none off the participant's grid."""
     try:
         beta = beta_of_part(trace, settings, start_s, stop_s)
     except Invalid:
@@ -109,7 +109,7 @@ def worth_of(trace: Trace, settings: SettingsVersion, start_s: float, stop_s: fl
 
 
 def on_any(found: Sequence[UsableSteps], source: str = "time_domain") -> int:
-    """Steps of a session that are usable on one channel of a source or another, each counted once.
+    """Count steps of a session that are usable on any channel of a source, each counted once.
 
     More than on any single channel where the device sensed other contacts from one part of the recording to the next. A controller sees one
     channel, so that no buffer holds them together.
@@ -118,7 +118,7 @@ def on_any(found: Sequence[UsableSteps], source: str = "time_domain") -> int:
 
 
 def usable_steps(db: Session, session: StudySession) -> list[UsableSteps]:
-    """Usable steps of every channel of the control recordings under the participant's present settings, the control channel first.
+    """Count usable steps of every channel of the control recordings under the participant's present settings, the control channel first.
 
     A session of several parts of recordings is counted by channel over all of them. Empty where no recording has such a channel.
     """
@@ -146,7 +146,7 @@ def _control(session: StudySession, candidates: Sequence[Trace]) -> Trace | None
 
 
 def sentence(found: Sequence[UsableSteps]) -> str:
-    """Usable steps of a session in words: the control channel, and the others that have any."""
+    """Describe the usable steps of a session: the control channel, and the others that have any."""
     if not found:
         return "Usable steps: none, because no recording has a beta amplitude or a band power."
     first, rest = found[0], found[1:]
@@ -187,7 +187,7 @@ def _of_channel(
 def _trajectory(
     session_id: int, visit: int, beta: NDArray[np.float64], fraction: NDArray[np.float64], settings: SettingsVersion
 ) -> SessionTrajectory:
-    """A session's rows, [W + T] each, as learning would have them."""
+    """Build a trajectory of a session's rows, [W + T] each, as learning would have them."""
     return SessionTrajectory(
         session_id=session_id,
         visit=visit,
@@ -200,7 +200,7 @@ def _trajectory(
 
 
 def _reason(s: SessionTrajectory, table: StepTable, settings: SettingsVersion, valid: int) -> str:
-    """Why a channel has no usable step, the first thing that would have to change."""
+    """Explain why a channel has no usable step, by the first thing that would have to change."""
     if valid == 0:
         return f"none of its steps has a valid beta: measured samples cover less than {100 * settings.min_valid_fraction:g} % of each"
     states = np.asarray(np.isfinite(s.states()).all(axis=1))

@@ -1,4 +1,4 @@
-"""What the page of a session shows: the chosen trace against the amplitude, each recording with its quality, the files behind the QoCs."""
+"""Content of a session's page: the chosen trace against the amplitude, each recording with its quality, the files behind the QoCs."""
 
 from __future__ import annotations
 
@@ -97,12 +97,12 @@ class OutcomesView:
     uploads: Mapping[int, int]
 
     def named(self, derived: Derived) -> str:
-        """Numbers of the uploads that a value rests on."""
+        """List the numbers of the uploads that a value rests on."""
         return ", ".join(str(u) for u in sorted({self.uploads[i] for i in derived.upload_file_ids}))
 
 
 def shown_trace(session: StudySession, data: SessionData | None, traces: Mapping[int, Sequence[Trace]], wanted: str) -> TraceView:
-    """The trace that a page asks for by its number, else the one that the controller saw."""
+    """Return the trace that a page requests by its number, else the one that the controller saw."""
     settings = session.visit.participant.current_settings
     drawable = [t for rows in traces.values() for t in rows if t.stream != AMPLITUDE_STREAM and abs(t.dt_s - settings.period_s) < 1e-6]
     many = len(traces) > 1
@@ -124,7 +124,7 @@ def shown_trace(session: StudySession, data: SessionData | None, traces: Mapping
 def recording_blocks(
     session: StudySession, recordings: Sequence[Recording], traces: Mapping[int, Sequence[Trace]], used: set[int]
 ) -> list[RecordingBlock]:
-    """All recordings of a session, the one that the controller saw first."""
+    """List all recordings of a session, the one that the controller saw first."""
     settings = session.visit.participant.current_settings
     blocks = []
     for recording in recordings:
@@ -155,7 +155,7 @@ def recording_blocks(
 
 
 def outcomes_view(db: Session, session: StudySession) -> OutcomesView:
-    """What the uploaded files say of the session's QoCs."""
+    """Collect the session's QoCs from the uploaded files."""
     tremor, grasp = outcome_values.tremor_outcome(db, session), outcome_values.grasp_outcome(db, session)
     derived = [o.derived for o in (grasp, tremor) if o is not None]
     files = [*(tremor.minutes.upload_file_ids if tremor else ()), *(t.row.upload_file_id for t in (grasp.tests if grasp else ()))]

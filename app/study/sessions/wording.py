@@ -23,12 +23,12 @@ _SAID = {Controller.CDBS: "Said to be cDBS", Controller.NO_DBS: "Said to be with
 
 
 def sentences(contradictions: Iterable[Contradiction]) -> list[str]:
-    """What a person should look at, a sentence each."""
+    """Write what a person should look at, a sentence each."""
     return [_SENTENCES[c.kind](c.facts) for c in contradictions]
 
 
 def drawn_words(drawn: Drawn) -> str:
-    """How a random session's amplitudes were drawn."""
+    """Describe how a random session's amplitudes were drawn."""
     holds = f", {len(drawn.holds)} held amplitudes" if drawn.holds else ""
     held = f"the amplitudes are held ({len(drawn.holds)} of them) and not drawn every step"
     told = {

@@ -69,7 +69,7 @@ def test_versions_follow_each_other_and_two_writers_are_told(db: Session, study_
     state(db, participant, hand=LEFT)
     state(db, participant, 1, hand=LEFT)  # nothing differs
     assert len(participant.characteristics) == 1
-    with pytest.raises(Conflict, match="Somebody else"):
+    with pytest.raises(Conflict, match="Another person"):
         state(db, participant, 0, hand=RIGHT)
 
 

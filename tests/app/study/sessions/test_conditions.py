@@ -75,7 +75,7 @@ def test_a_person_corrects_conditions_with_a_reason_and_every_revision_stays(
     assert same["revision"] == 2
     for wrong, word in (
         ({"lower_bound": None}, "always ran under some lower_bound"),
-        ({"min_ma": 3.0, "max_ma": 1.0}, "lies above the upper one"),
+        ({"min_ma": 3.0, "max_ma": 1.0}, "is above the upper one"),
         ({"lower_bound": 1.0}, "less than 1"),
         ({"design": "ours"}, "paper"),
     ):
@@ -92,7 +92,7 @@ def test_a_proposal_has_no_conditions_until_it_is_confirmed(client: TestClient, 
     (session,) = answer.json()["sessions"]
     assert client.get(f"/api/v1/sessions/{session['id']}/conditions").json() is None
     early = client.put(f"/api/v1/sessions/{session['id']}/conditions", json={"lower_bound": 0.2, "reason": "x"})
-    assert (early.status_code, "nobody has confirmed" in early.text) == (409, True)
+    assert (early.status_code, "is not confirmed" in early.text) == (409, True)
     body = {"version": 1, "controller": "random"}
     assert client.post(f"/api/v1/proposals/{session['id']}/confirm", json=body).status_code == 200
     assert client.get(f"/api/v1/sessions/{session['id']}/conditions").json()["lower_bound"] == 0.3
