@@ -201,6 +201,7 @@ def sign_in(db: Session, email: str, password: str, code: str = "") -> str:
             "The e-mail address or the password is wrong.",
             "If you have set up a second factor, its code is needed too.",
         )
+    set_actor(db, user.email, user.id, db.info.get("actor", {}).get("request_id"))
     repository.forget_failures(db, attempt)
     return open_session(db, user)
 

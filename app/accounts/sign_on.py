@@ -69,14 +69,14 @@ def sign_on(db: Session, identity: Identity) -> str:
         raise _refused(db, "unknown account", "There is no account here of an address that the sign-on vouches for.")
     if not user.active:
         raise _refused(db, user.email, "Your account here is closed.")
-    set_actor(db, user.email, user.id, db.info.get("actor", {}).get("request_id"))
     if link is None:
         # two first sign-ons of one person at once: the second one waits here, and finds the link of the first
         db.refresh(user, with_for_update=True)
         link = link_of(db, identity.issuer, identity.subject)
+    if link is None and link_of_user(db, user.id, identity.issuer):
+        raise _refused(db, user.email, "The account of your address belongs to somebody else at the sign-on.")
+    set_actor(db, user.email, user.id, db.info.get("actor", {}).get("request_id"))
     if link is None:
-        if link_of_user(db, user.id, identity.issuer):
-            raise _refused(db, user.email, "The account of your address belongs to somebody else at the sign-on.")
         link = SignOnLink(user_id=user.id, issuer=identity.issuer, subject=identity.subject)
         db.add(link)
         db.flush()

@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar
 
 from app.platform.errors import Conflict
 from app.platform.numbers import typed
+from app.platform.web.forms import same_value
 from ml.formats import SOURCE_NAMES
 from ml.outcomes import END_WEIGHTS
 
@@ -66,10 +67,10 @@ def own_changes(values: Mapping[str, Any], seen: str | None, revisions: Sequence
     for name, stored in present.fields.items():
         typed = str(values.get(name, stored)).strip()
         shown = known.fields[name].strip() if known else None
-        if typed in (shown, stored.strip()):
+        if same_value(typed, stored) or (shown is not None and same_value(typed, shown)):
             continue
         fields[name] = typed
-        if shown != stored.strip():
+        if shown is None or not same_value(shown, stored):
             author = next((b.author for a, b in reversed(list(pairwise(revisions))) if a.fields[name] != b.fields[name]), present.author)
             what = f"stored now: {stored or 'no value'}, by {author}; you typed: {typed or 'no value'}"
             conflicts.append({"where": labels.get(name, name), "what": what})

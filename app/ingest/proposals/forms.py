@@ -19,7 +19,7 @@ from app.ingest.schemas import PartIn, ProposalChange
 from app.platform.errors import Invalid
 from app.platform.numbers import counted
 from app.platform.web.charts import written
-from app.platform.web.forms import FieldNote, parse
+from app.platform.web.forms import FieldNote, parse, same_value
 from app.platform.web.svg import Plane, drawing
 from app.study import blinding
 from app.study import repository as study
@@ -138,7 +138,7 @@ def own_texts(values: Mapping[str, Any], session_id: int, stored: Mapping[str, s
         seen = {}
     shown = {**stored, **seen} if isinstance(seen, dict) else stored
     typed = typed_texts(values, session_id, stored)
-    return {name: text for name, text in typed.items() if text not in (str(shown[name]), stored[name])}
+    return {n: text for n, text in typed.items() if not (same_value(text, str(shown[n])) or same_value(text, stored[n]))}
 
 
 def typed_parts(values: Mapping[str, Any], session_id: int) -> list[dict[str, str]]:
@@ -158,7 +158,7 @@ def typed_own(values: Mapping[str, Any], session_id: int) -> dict[str, str]:
 
 def as_change(session: StudySession, version: str, stored: Mapping[str, str], typed: Mapping[str, str]) -> ProposalChange:
     """Convert the fields that a person changed to a correction. Raises Invalid, naming the field."""
-    own = {name: text for name, text in typed.items() if text != stored[name]}
+    own = {name: text for name, text in typed.items() if not same_value(text, stored[name])}
     fields: dict[str, Any] = {n: own[n] for n in ("visit", "controller", "policy", "hemisphere", "started_at") if n in own}
     if "visit" in own and not own["visit"]:
         del fields["visit"]  # an open visit stays open

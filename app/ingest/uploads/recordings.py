@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 
 from app.ingest import repository, wording
 from app.ingest.proposals import copies
+from app.platform.database import acting
 from app.platform.web.schemas import sensible_time
 from app.settings import get_settings
 from app.study import repository as study
@@ -50,7 +51,7 @@ def store(db: Session, participant: Participant, file: UploadFile, decoded: Sequ
         fresh = _add(db, row, one)
         stored.fresh.append(fresh)
         for old in verdict.fuller_than:
-            moved = copies.supersede(db, old, fresh, verdict.alone, file.upload.created_by)
+            moved = copies.supersede(db, old, fresh, verdict.alone, acting(db))
             stored.flagged.append(wording.fuller_than(old, moved))
         for old in verdict.locked:
             stored.flagged.append(wording.locked_copy(fresh, old, [s.id for s in copies.sessions_of(db, old) if s.visit.locked]))

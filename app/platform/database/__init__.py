@@ -237,6 +237,11 @@ def set_actor(db: Session, label: str, user_id: int | None = None, request_id: s
         _announce(db, db.connection())
 
 
+def acting(db: Session) -> str:
+    """Return who writes in this session, as the audit trail names them."""
+    return str(db.info.get("actor", {}).get("label", "system"))
+
+
 def set_reason(db: Session, reason: str | None) -> None:
     """Set the reason for the following changes of this session (kept in the audit trail)."""
     actor = db.info.get("actor", {"label": "system"})

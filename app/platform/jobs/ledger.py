@@ -36,9 +36,18 @@ MOST_UNFINISHED = 0.99
 """Share that a step or a job shows at most before it has ended: its computation may be done, its results are not stored yet."""
 
 
+_MOST_ACTOR = 254
+"""Length of an actor's name in the audit trail."""
+
+
+def acting_for(person: str) -> str:
+    """Name a worker in the audit trail, with the person whose job it runs. That person wrote none of the rows."""
+    return f"worker for {person}"[:_MOST_ACTOR]
+
+
 @dataclass(frozen=True)
 class Ledger:
-    """Writes about one job, in the name of the person who submitted it.
+    """Writes about one job, in the name of the worker that runs it, which also names the person who submitted it.
 
     Args:
         check: raises when this worker must leave the job alone.
@@ -165,8 +174,8 @@ class Ledger:
 
     @contextmanager
     def _locked(self, live_only: bool = True) -> Iterator[tuple[Session, Job]]:
-        with transaction(self.created_by) as db:
-            set_actor(db, self.created_by, request_id=self.job_id)
+        with transaction(acting_for(self.created_by)) as db:
+            set_actor(db, acting_for(self.created_by), request_id=self.job_id)
             job = repository.locked(db, self.job_id)
             if live_only and (JobStatus(job.status).ended or job.cancel_requested_at is not None):
                 raise JobCancelled

@@ -56,7 +56,7 @@ def submit(
         kind: a registered name.
         participant_id: whose data it works on.
         params: checked by the kind's schema.
-        created_by: the user who asks for it; the audit trail names them with everything that the job writes.
+        created_by: the user who asks for it; the audit trail names the worker for them with everything that the job writes.
         urgency: a `Priority`; that of the kind when left open.
         repeats: a job that has ended: the results of its steps are taken over where code and params are the same.
 

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping
 from contextlib import aclosing
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
@@ -42,6 +43,26 @@ async def _form(request: Request) -> FormData:
 
 FormValues = Annotated[FormData, Depends(_form)]
 """The fields of a posted form (no files), e.g. `values.get("name", "")` and, for repeated ones, `values.getlist("policy")`."""
+
+
+def same_value(one: str, other: str) -> bool:
+    """Return whether two texts of a field state the same. Browsers send 10:00:00 as 10:00, and a line break as two characters."""
+    one, other = (text.replace("\r\n", "\n").strip() for text in (one, other))
+    if one == other:
+        return True
+    moments = [_moment(text) for text in (one, other)]
+    return None not in moments and moments[0] == moments[1]
+
+
+def _moment(text: str) -> datetime | None:
+    """Parse a time with or without a date, UTC where it names no zone; None for other text."""
+    if ":" not in text:
+        return None
+    try:
+        found = datetime.fromisoformat(text if "-" in text else f"1970-01-01T{text}")
+    except ValueError:
+        return None
+    return found if found.tzinfo else found.replace(tzinfo=UTC)
 
 
 def parse(model: type[M], values: Mapping[str, Any], labels: Mapping[str, str] | None = None, names: Mapping[str, str] | None = None) -> M:

@@ -8,6 +8,11 @@ from html import unescape
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import text
+from sqlalchemy.orm import Session
+
+from app.platform.web.forms import same_value
+from tests.app.ingest.conftest import device_zip
 
 STORED = {"grasp_hz": 2.4790827393, "rating": 5, "tremor_percent": 10.0}
 
@@ -26,6 +31,15 @@ def fields_of(page: str, action: str) -> dict[str, str]:
         assert chosen, name
         found[name] = unescape(chosen[1])
     return found | {name: unescape(text) for name, text in re.findall(r'<textarea [^>]*name="([^"]*)"[^>]*>(.*?)</textarea>', form, re.S)}
+
+
+def as_browsers_send(page: str, action: str) -> dict[str, str]:
+    """Return what a browser sends of an untouched form: times without seconds where these are 0, and line breaks of two characters."""
+    found = fields_of(page, action)
+    timed = [tag for tag in re.findall(r"<input [^>]*>", page) if re.search(r'type="(datetime-local|time)"', tag)]
+    for name in re.findall(r' name="([^"]*)"', " ".join(timed)):
+        found[name] = re.sub(r"(:\d\d):00$", r"\1", found.get(name, ""))
+    return {name: value.replace("\n", "\r\n") for name, value in found.items()}
 
 
 class Tab:
@@ -158,3 +172,61 @@ def test_a_suggested_threshold_does_not_replace_one_that_was_set_meanwhile(brows
     assert client.put("/api/v1/participants/P2/settings", json={"settings": {"xi_beta": 9.0}}).status_code == 200
     assert browser.post("/participants/P2/settings", data=fields).status_code == 409
     assert client.get("/api/v1/participants/P2").json()["settings"]["xi_beta"] == 9.0
+
+
+@pytest.fixture
+def everything_typed(client: TestClient, session_id: int, participant_code: str) -> str:
+    """A session, its visit and a proposal with a value in every field whose text a browser changes; the proposal's number."""
+    assert client.put(f"/api/v1/sessions/{session_id}/qoc", json=STORED).status_code == 200
+    visit = client.get(f"/api/v1/sessions/{session_id}").json()["visit_id"]
+    noted = {"note": "first line\nsecond line", "reason": "as told"}
+    assert client.patch(f"/api/v1/visits/{visit}", json=noted).status_code == 200
+    files = [("file", ("s.zip", device_zip(("random",), steps=60)))]
+    sent = client.post("/api/v1/uploads", data={"participant": participant_code}, files=files)
+    assert sent.status_code == 201, sent.text
+    return str(sent.json()["proposals"][0]["session"]["id"])
+
+
+FORMS = {
+    "proposals": ("/participants/P1/proposals", "/participants/P1/proposals", {"do": "save:all"}),
+    "settings": ("/participants/P1/settings", "/participants/P1/settings", {}),
+    "margins": ("/participants/P1/margins", "/participants/P1/margins", {}),
+    "visit": ("/visits/{visit}", "/visits/{visit}", {"reason": "looked again"}),
+    "outcomes": ("/sessions/{session}", "/sessions/{session}/qoc", {}),
+    "correction": ("/sessions/{session}", "/sessions/{session}/correction", {"reason": "looked again"}),
+    "conditions": ("/sessions/{session}", "/sessions/{session}/conditions", {"conditions_reason": "looked again"}),
+}
+"""Every form that compares what was typed with what it showed: its page, its address, and what must be typed to send it."""
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_form_that_nobody_touched_changes_nothing_however_a_browser_writes_its_values(
+    form: str, browser: TestClient, client: TestClient, session_id: int, everything_typed: str, db: Session
+) -> None:
+    visit = client.get(f"/api/v1/sessions/{session_id}").json()["visit_id"]
+    page, action, more = FORMS[form]
+    page, action = (path.format(visit=visit, session=session_id) for path in (page, action))
+    written = text("select count(*) from audit_event where action in ('insert', 'update', 'delete')")
+    if form == "proposals":  # a time in full minutes, which browsers shorten
+        first = as_browsers_send(browser.get(page).text, action) | {f"from-{everything_typed}": "2026-03-02T10:01"}
+        assert browser.post(action, data=first | more).status_code == 303
+    opened, before = browser.get(page).text, db.scalar(written)
+    fields = as_browsers_send(opened, action)
+    answers = [browser.post(action, data=fields | more) for _ in range(2)]  # a second time, as after going back
+    db.rollback()
+    assert db.scalar(written) == before, answers[0].text[:400]
+    assert [a.status_code for a in answers] != [409, 409]
+    assert "Somebody else changed" not in answers[1].text
+    assert "after this form was opened" not in answers[1].text
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("2026-03-02T10:00", "2026-03-02T10:00:00", True), ("2026-03-02 10:00:00", "2026-03-02T10:00:00+00:00", True),
+        ("10:00", "10:00:00", True), ("a\r\nb", "a\nb", True), ("2026-03-02T10:00", "2026-03-02T10:00:30", False),
+        ("10:00", "10:01", False), ("1.5", "1.50", False), ("a: b", "a:b", False),
+    ],
+)  # fmt: skip
+def test_times_are_compared_as_times_and_all_else_as_text(one: str, other: str, same: bool) -> None:
+    assert same_value(one, other) is same_value(other, one) is same
