@@ -1,4 +1,4 @@
-"""The console command `betaloop`. Exit code 0: done; 1: it could not be done, said in one line; 2: the call itself is wrong."""
+"""The console command `betaloop`. Exit code 0: done; 1: it failed, for the reason in one line; 2: the call itself is wrong."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from app.study.commands import participant_app
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
-    pretty_exceptions_enable=False,  # a fault of ours is told as Python tells it, in lines that can be searched
+    pretty_exceptions_enable=False,  # a fault of ours is printed as by Python, in lines that can be searched
     help="betaloop: the study system for closed-loop deep brain stimulation.",
 )
 study_app = typer.Typer(no_args_is_help=True, help="Whole studies.")
@@ -60,8 +60,8 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 def decide_cookies(settings: Settings, host: str, *, tls: bool) -> None:
-    """Whether sessions and HTTPS belong together: always with TLS of one's own; where other machines reach the service, unless somebody
-    has said otherwise (`BETALOOP_COOKIE_SECURE=false`), and then it is told.
+    """Decide whether cookies are limited to HTTPS. They always are with the service's own TLS. Where other machines reach the service they
+    are too, unless the settings say otherwise (`BETALOOP_COOKIE_SECURE=false`), which is logged.
     """
     log = structlog.get_logger()
     if tls:
@@ -74,7 +74,7 @@ def decide_cookies(settings: Settings, host: str, *, tls: bool) -> None:
 
 
 def main() -> None:
-    """Entry point: runs a command and turns errors into one line and an exit code."""
+    """Run a command, and turn errors into one line and an exit code."""
     _end_in_order_on_signals()
     try:
         logs.configure_own()
@@ -94,7 +94,7 @@ def serve(
     tls_certificate: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Serve over TLS: chain, PEM.")] = None,
     tls_key: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Its private key, PEM.")] = None,
 ) -> None:
-    """Serve the web pages and the REST interface. Jobs need a worker beside it (`betaloop worker`)."""
+    """Serve the web pages and the REST interface. Jobs need a worker besides (`betaloop worker`)."""
     import uvicorn
 
     from app.accounts.commands import say_how_to_begin
@@ -118,10 +118,10 @@ def serve(
     supervise_database()
     structlog.get_logger().info("database", lies_in=database_place())
     if configured():
-        provider()  # settings that do not fit are said now, not to the first person who signs on
+        provider()  # settings that do not fit are reported now, not to the first person who signs on
     service = create_app()
     say_how_to_begin()
-    # beside the service, for reading what a crash left behind may take minutes
+    # in parallel to the service, for reading what a crash left behind may take minutes
     threading.Thread(target=keep_resuming, args=("the service", threading.Event()), daemon=True).start()
     threading.Thread(target=keep_sealing, args=(threading.Event(),), daemon=True).start()
     stop = threading.Event()
@@ -204,13 +204,13 @@ def control_(
     source: Annotated[str | None, typer.Option(help="Device (-, tcp:PORT, tail:FILE, simulated:P1), recording or cohort:P1.")] = None,
     speed: Annotated[str, typer.Option(help="realtime or fast.")] = "realtime",
     log: Annotated[Path | None, typer.Option(help="CSV of every decision.")] = None,
-    key: Annotated[str | None, typer.Option(help="Public key, or a file with it; this installation's own when left out.")] = None,
+    key: Annotated[str | None, typer.Option(help="Public key, or a file with it; this installation's own by default.")] = None,
     channel: Annotated[str | None, typer.Option(help="Channel of a recording with several.")] = None,
     beta_source: Annotated[str | None, typer.Option(help="How the beta of a table was made, where not by 'table'.")] = None,
     steps: Annotated[int, typer.Option(min=1, help="Length of a simulated session.")] = 300,
     participant: Annotated[str | None, typer.Option(help="Code of the participant that the bundle must be of.")] = None,
     battery: Annotated[Path | None, typer.Option(help="JSON with assumptions about the implant, for battery life in days.")] = None,
-    bench: Annotated[bool, typer.Option("--bench", help="Nobody is connected: any bundle runs, on any day.")] = False,
+    bench: Annotated[bool, typer.Option("--bench", help="No participant is connected: any bundle runs, on any day.")] = False,
     ledger: Annotated[Path | None, typer.Option(help="Folder with the sessions that this tablet has run.")] = None,
     withdrawn: Annotated[Path | None, typer.Option(help="The study's list of withdrawn policies and plans.")] = None,
     timed: Annotated[int, typer.Option("--time", min=0, max=100_000, help="Time so many decisions on this machine.")] = 0,
@@ -259,7 +259,7 @@ def check_port_(
 
 
 def _end_in_order_on_signals() -> None:
-    """Have a stop from outside end the process as any other end does, so that the embedded PostgreSQL is stopped and not left behind."""
+    """Let a stop from outside end the process as any other end does, so that the embedded PostgreSQL is stopped and not left behind."""
 
     def end(number: int, _frame: Any) -> None:
         raise SystemExit(128 + number)

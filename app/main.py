@@ -140,8 +140,7 @@ def router_of(name: str) -> APIRouter:
 
 
 def _watched(router: str) -> list[Any]:
-    """What routes of a router depend on beside their own: analyses tell the audit trail who looked at results. Other routes that show some
-    name it themselves."""
+    """Return the dependencies that all routes of a router share: analyses record who looked at results."""
     return [ResultsViewed] if router.startswith("app.analysis.") else []
 
 
@@ -180,9 +179,10 @@ def _built() -> FastAPI:
 
 
 SEARCHED_AFTER = (10_000, 20, 20)
-"""New objects after which the youngest are searched for garbage, searches after which the older are, and all of them. A page makes some
-7 000. Results that the service keeps are among the oldest: to search them takes 0.1 to 0.2 s, which every thirteenth request waited for by
-the interpreter's own measure (700, 10, 10). Nearly all garbage goes without any search, when its last reference does."""
+"""New objects after which the youngest are searched for garbage, searches after which the older are, and all of them. A page makes some 7
+000. Results that the service caches are among the oldest, and to search them takes 0.1 to 0.2 s. By the interpreter's default (700, 10, 10)
+every thirteenth request waited for that. Nearly all garbage goes without any search, when its last reference does.
+"""
 
 
 def leave_to_itself() -> None:
@@ -194,7 +194,7 @@ def leave_to_itself() -> None:
 
 @asynccontextmanager
 async def _lifespan(_: FastAPI) -> AsyncIterator[None]:
-    """At the start of the service: what killed processes left of incoming files goes, also so that it cannot keep a full disk full."""
+    """Remove, at the start of the service, what killed processes left of incoming files, so that it cannot keep a full disk full."""
     leave_to_itself()
     removed = await run_in_threadpool(remove_abandoned)
     prune_copies_beside()
@@ -208,25 +208,25 @@ def _service_routes() -> APIRouter:
 
     @router.get("/healthz", tags=["service"])
     def healthz(db: Db) -> dict[str, str]:
-        """Whether the service and its database answer; no token needed."""
+        """Return whether the service and its database answer; no token needed."""
         check_connection(db)
         return {"status": "ok", "version": __version__}
 
     @router.get("/readyz", tags=["service"], responses=problems(503))
     def readyz(db: Db) -> dict[str, str]:
-        """Whether requests can be served: the database answers and has the schema of this version; no token needed."""
+        """Return whether requests can be served: the database answers and has the schema of this version; no token needed."""
         if (has := revision(db)) != (needs := newest_revision()):
             raise DatabaseAway(f"The database has schema {has or 'none'}; this version needs {needs}.", "Run `betaloop migrate`.")
         return {"status": "ready", "schema": has}
 
     @router.get(METRICS, include_in_schema=False, dependencies=[Depends(reader_of_figures)])
     def metrics() -> Response:
-        """Prometheus metrics."""
+        """Return Prometheus metrics."""
         return Response(generate_latest(), media_type=CONTENT_TYPE_LATEST)
 
     @router.get(DESCRIPTION, include_in_schema=False)
     def description(request: Request, _: CurrentCaller) -> JSONResponse:
-        """The OpenAPI document, for who has signed in or has a token."""
+        """Return the OpenAPI document (sign-in or token required)."""
         return JSONResponse(request.app.openapi())
 
     return router
@@ -245,7 +245,7 @@ _BEFORE_ROUTES = {
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document; problems are application/problem+json, and FastAPI's own validation schema is left out."""
+    """Build the OpenAPI document; problems are application/problem+json, and FastAPI's own validation schema is removed."""
     if app.openapi_schema:
         return app.openapi_schema
     document = get_openapi(title=app.title, version=app.version, routes=app.routes, description="REST interface of a betaloop study.")
@@ -264,9 +264,9 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
 
 
 def _answered_before(method: str, operation: dict[str, Any]) -> set[int]:
-    """Which of those answers an operation may give."""
+    """Select those of these responses that an operation may give."""
     found = {503}
-    if "security" in operation:  # who calls is looked up, and their token's last use is written down, where somebody only reads too
+    if "security" in operation:  # who calls is looked up, and their token's last use is written down, also for reads
         found |= {507}
     if method != "get":
         found |= {413, 429}

@@ -23,7 +23,7 @@ class Settings(BaseSettings):
         description="PostgreSQL URL, several hosts as HOST:PORT,HOST:PORT; without one an embedded PostgreSQL runs in the data folder.",
     )
     owner_url: str | None = Field(
-        None, description="PostgreSQL URL of the role that owns the tables, for migrate, backup and restore; database_url's when left out."
+        None, description="PostgreSQL URL of the role that owns the tables, for migrate, backup and restore; database_url's by default."
     )
     server_user: str = Field(
         "pgserver", description="System user of the embedded PostgreSQL where root starts betaloop; made at the first start."
@@ -40,7 +40,7 @@ class Settings(BaseSettings):
     session_idle_minutes: int = Field(60, ge=1, description="A browser session ends after this many idle minutes.")
     session_max_hours: int = Field(12, ge=1, description="A browser session ends after this many hours in any case.")
     metrics_on_loopback: bool = Field(
-        False, description="Answer /metrics without a token to programs of this machine; not where a proxy runs beside the service."
+        False, description="Answer /metrics without a token to programs of this machine; not where a proxy runs next to the service."
     )
     require_released_policies: bool = Field(
         False, description="Approve plans only of policies that a clinician has released, with a signature of its own."

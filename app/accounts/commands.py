@@ -40,7 +40,7 @@ def user_add(
     role: Annotated[Role, typer.Option(help=", ".join(Role))],
     study: Annotated[str | None, typer.Option(help="Code of the study, where there are several.")] = None,
     site: Annotated[str | None, typer.Option(help="Code of the only site that the user sees; all sites by default.")] = None,
-    password_file: Annotated[Path | None, typer.Option(help="File with the password; asked for when left out ('-': stdin).")] = None,
+    password_file: Annotated[Path | None, typer.Option(help="File with the password; asked for when omitted ('-': stdin).")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Add a user with a role in a study."""
@@ -87,8 +87,8 @@ Draft = TypeVar("Draft", bound=BaseModel)
 def study_add(
     code: Annotated[str, typer.Argument(help="Code of the new study.")],
     name: Annotated[str, typer.Option(help="Its name.")],
-    site: Annotated[str | None, typer.Option(help="Code of its first site; the study's when left out.")] = None,
-    prefix: Annotated[str | None, typer.Option(help="Of its participants' codes; code and hyphen when left out.")] = None,
+    site: Annotated[str | None, typer.Option(help="Code of its first site; the study's by default.")] = None,
+    prefix: Annotated[str | None, typer.Option(help="Of its participants' codes; code and hyphen by default.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Add a study with its first site."""
@@ -120,7 +120,7 @@ def study_rename(
     code: Annotated[str, typer.Argument(help="Code of the study.")],
     name: Annotated[str, typer.Option(help="Its new name; the code stays.")],
     reason: Why,
-    site: Annotated[str | None, typer.Option(help="Code of a site; the study itself when left out.")] = None,
+    site: Annotated[str | None, typer.Option(help="Code of a site; the study itself by default.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Give a study or a site another name."""
@@ -153,7 +153,7 @@ def user_role(
     email: Annotated[str, typer.Argument(help="E-mail address of the user.")],
     role: Annotated[str, typer.Argument(help="A role, or 'none' to end the one that the user has there.")],
     study: Annotated[str | None, typer.Option(help="Code of the study, where there are several.")] = None,
-    site: Annotated[str | None, typer.Option(help="Code of the site; all sites when left out.")] = None,
+    site: Annotated[str | None, typer.Option(help="Code of the site; all sites by default.")] = None,
     also: Annotated[bool, typer.Option("--also", help="Keep a role at all sites besides this one at a single site.")] = False,
     as_json: AsJson = False,
 ) -> None:

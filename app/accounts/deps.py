@@ -53,7 +53,7 @@ def get_caller(request: Request, db: Db, bearer: Annotated[HTTPAuthorizationCred
     if caller.is_blinded and not is_open(request.method, path):
         raise Forbidden(
             "This is closed to blinded assessors: it may show which controller a session had.",
-            "Results by controller stand under Analyses once a visit is locked.",
+            "Results by controller are under Analyses once a visit is locked.",
         )
     set_actor(db, caller.label, caller.user_id, getattr(request.state, "request_id", None))
     request.state.caller = caller  # before a form is refused: the page that says so is of who has signed in, and drops what another typed
@@ -76,8 +76,8 @@ def _refuse_entries_of_others(request: Request, caller: Caller) -> None:
     writer = written_by(request)
     if writer is not None and writer != caller.user_id:
         raise EntriesOfAnother(
-            "Somebody else had signed in when this was entered; nothing was saved under your name.",
-            "Whoever entered it signs in here and sends it again; or open the page anew and enter what is yours.",
+            "Another person had signed in when this was entered; nothing was saved under your name.",
+            "The person who entered it signs in here and sends it again; or open the page again and enter what is yours.",
         )
 
 

@@ -74,7 +74,7 @@ def sign_on(db: Session, identity: Identity) -> str:
         db.refresh(user, with_for_update=True)
         link = link_of(db, identity.issuer, identity.subject)
     if link is None and link_of_user(db, user.id, identity.issuer):
-        raise _refused(db, user.email, "The account of your address belongs to somebody else at the sign-on.")
+        raise _refused(db, user.email, "The account of your address belongs to another person at the sign-on.")
     set_actor(db, user.email, user.id, db.info.get("actor", {}).get("request_id"))
     if link is None:
         link = SignOnLink(user_id=user.id, issuer=identity.issuer, subject=identity.subject)
@@ -97,7 +97,7 @@ def confirm(db: Session, caller: Caller, identity: Identity) -> None:
             db, caller.label, "This sign-on is linked with no account yet: sign out and sign on with it once, or give your password."
         )
     if row is None or link.user_id != caller.user_id:
-        raise _refused(db, caller.label, "Somebody else has signed on at the provider than the user of this page.")
+        raise _refused(db, caller.label, "Another person has signed on at the provider than the user of this page.")
     if not use_login(db, link, identity.asked_at):
         raise _refused(db, caller.label, "The provider has not asked you again who you are since you last signed on or confirmed.", _AGAIN)
     row.confirmed_at = now()

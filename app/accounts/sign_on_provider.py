@@ -239,15 +239,15 @@ class Provider:
             claims.validate(leeway=LEEWAY_S)
         except (JoseError, ValueError, TypeError) as error:
             log.warning("ID token refused", error=type(error).__name__, what=str(error)[:200])
-            raise Refused("What the provider said of you cannot be verified.", "Tell those who run the sign-on.") from error
+            raise Refused("The provider's statement about you cannot be verified.", "Inform those who run the sign-on.") from error
         earliest = begun.at if begun.fresh else time.time() - max_age_s
         if claims["auth_time"] < earliest - LEEWAY_S:
             raise Refused("The provider has not asked you again who you are.", "Begin again, and give your password there.")
         subject = claims["sub"]
         if not isinstance(subject, str) or not 0 < len(subject) <= 255:
-            raise Refused("What the provider said of you names nobody.", "Tell those who run the sign-on.")
+            raise Refused("The provider's statement about you names no user.", "Inform those who run the sign-on.")
         if claims["auth_time"] > time.time() + LEEWAY_S:
-            raise Refused("The provider's clock is ahead of ours.", "Tell those who run the sign-on.")
+            raise Refused("The provider's clock is ahead of ours.", "Inform those who run the sign-on.")
         return Identity(self.issuer, subject, self._address(claims), datetime.fromtimestamp(claims["auth_time"], UTC))
 
     def _address(self, claims: Mapping[str, Any]) -> str | None:

@@ -43,7 +43,7 @@ class StudyIn(SiteIn):
 
     site: SiteIn | None = None
     code_prefix: Prefix | None = Field(
-        None, description="What every code of its participants begins with; the study's code and a hyphen when left out."
+        None, description="What every code of its participants begins with; the study's code and a hyphen by default."
     )
 
 
@@ -184,7 +184,7 @@ def claim(db: Session, study: Study, prefix: Prefix) -> None:
     lower = prefix.lower()
     for _, code, theirs in prefixes(db):
         if lower.startswith(theirs.lower()) or theirs.lower().startswith(lower):
-            raise Conflict(f"'{prefix}' and the prefix '{theirs}' of study '{code}' cannot be told apart.", "Choose another.")
+            raise Conflict(f"'{prefix}' and the prefix '{theirs}' of study '{code}' cannot be distinguished.", "Choose another.")
     if codes_elsewhere(db, study.id, prefix):
         raise Conflict(f"Codes of another study's participants begin with '{prefix}'.", "Choose another prefix.")
     study.code_prefix = prefix
@@ -244,7 +244,7 @@ def study_to_manage(db: Session, code: str, caller: Caller) -> Study:
     if study is None or not caller.may(READ, study.id):
         raise NotFound(f"There is no study '{code}', or you have no access to it.")
     if not administers(caller, study.id):
-        raise Forbidden(f"You do not administer study '{code}' at all of its sites.", "Ask somebody who does.")
+        raise Forbidden(f"You do not administer study '{code}' at all of its sites.", "Ask a person who does.")
     return study
 
 
@@ -323,7 +323,7 @@ def grant(db: Session, study: Study, email: str, role: Role, site_code: str | No
     if role is Role.BLINDED_ASSESSOR and not all(administers(caller, m.study_id, m.site_id) for m in elsewhere):
         raise Forbidden(
             f"{user.email} works in a study that you do not administer, and a blinded assessor is blinded in every study.",
-            "Ask an administrator of both studies, or name somebody else.",
+            "Ask an administrator of both studies, or name another person.",
         )
     found = membership(db, user.id, study.id, site_id)
     if found is None:

@@ -29,13 +29,13 @@ def import_(
         typer.Argument(exists=True, help="A zip of an RC+S session folder, a Percept report, a table, an export; with --study folders."),
     ],
     participant: Annotated[str | None, typer.Option(help="Code of the participant; with --study the sheet names them.")] = None,
-    visit: Annotated[int | None, typer.Option(min=1, help="Number of the visit; left out, it is proposed by its date.")] = None,
+    visit: Annotated[int | None, typer.Option(min=1, help="Number of the visit; by default proposed by its date.")] = None,
     controller: Annotated[
-        str | None, typer.Option(help="cdbs, rl, distilled, no_dbs, random or other; left out, sessions are proposed.")
+        str | None, typer.Option(help="cdbs, rl, distilled, no_dbs, random or other; by default sessions are proposed.")
     ] = None,
     policy: Annotated[str | None, typer.Option(help="Name or number of the policy that ran.")] = None,
     started_at: Annotated[datetime | None, typer.Option(help="Start of the session, UTC.")] = None,
-    beta_unit: Annotated[str | None, typer.Option(help="Unit of a table's beta; the participant's when left out.")] = None,
+    beta_unit: Annotated[str | None, typer.Option(help="Unit of a table's beta; the participant's by default.")] = None,
     study: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Sheet with a row per session, CSV or xlsx.")] = None,
     zone: Annotated[str | None, typer.Option(help="Zone of the sheet's times, such as Europe/Berlin or +01:00.")] = None,
     dictionary: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="The sheet's REDCap data dictionary.")] = None,
@@ -140,9 +140,9 @@ def _print_study(report: StudyReport, columns: list[str]) -> None:
 
 @ingest_app.command("redecode", epilog="Example: betaloop ingest redecode --participant P1 --dry-run")
 def redecode_(
-    participant: Annotated[str | None, typer.Option(help="Code of a participant; every one when left out.")] = None,
+    participant: Annotated[str | None, typer.Option(help="Code of a participant; every one by default.")] = None,
     upload_file: Annotated[int | None, typer.Option(min=1, help="Number of one file, from its upload's page.")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Tell what would change, and change nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would change, and change nothing.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Read stored files with the present decoder; sessions use what it gives from then on, snapshots keep what they pin."""

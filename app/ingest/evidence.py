@@ -81,7 +81,7 @@ class Evidence:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Evidence:
-        """Evidence as it was stored."""
+        """Read evidence as it was stored."""
         return cls(Source(stored["source"]), Reason(stored["reason"]), stored["facts"])
 
 

@@ -15,7 +15,7 @@ from app.tables.sessions import Controller
 
 
 class UploadForm(Model):
-    """What the upload page asks about the sessions in the files; what is left empty is proposed from the files."""
+    """Statements of the upload page about the sessions in the files; empty ones are proposed from the files."""
 
     visit: Int | None = Field(None, ge=1)
     controller: Controller | None = None
@@ -25,7 +25,7 @@ class UploadForm(Model):
 
 
 class ProposalChange(Model):
-    """Corrections of a proposed session; what is left out stays. `version` is that of the proposal the caller looked at."""
+    """Corrections of a proposed session; omitted ones stay. `version` is that of the proposal the caller looked at."""
 
     version: Int = Field(ge=1)
     visit: Int | None = Field(None, ge=1, description="Number of the visit.")
@@ -57,7 +57,7 @@ class SplitIn(Model):
 
 
 class DiscardIn(Model):
-    """Why a proposal is no session."""
+    """Reason why a proposal is no session."""
 
     version: Int = Field(ge=1)
     reason: Text = Field(min_length=1, max_length=1000)
@@ -124,7 +124,7 @@ class AttachIn(Model):
 
 
 class AttachedOut(Model):
-    """What attaching a file did."""
+    """Result of attaching a file."""
 
     session: SessionOut
     notes: list[str]
@@ -149,20 +149,20 @@ class QuarantinedOut(Model):
 
 
 class ReleaseIn(Model):
-    """How a quarantined file leaves: `read` hands it to the present decoder, `as_is` stores it, reviewed, as it came."""
+    """Release of a quarantined file: `read` hands it to the present decoder, `as_is` stores it, reviewed, as it came."""
 
     how: Literal["read", "as_is"]
     reason: Text = Field(min_length=1, max_length=1000)
 
 
 class QuarantineDiscardIn(Model):
-    """Why a quarantined file is erased."""
+    """Reason why a quarantined file is erased."""
 
     reason: Text = Field(min_length=1, max_length=1000)
 
 
 class ProblemOut(Model):
-    """Why a file could not be used."""
+    """Reason why a file could not be used."""
 
     what: str
     where: str
@@ -170,7 +170,7 @@ class ProblemOut(Model):
 
 
 class FileReportOut(Model):
-    """What became of one file; every list holds sentences for the person who uploaded it."""
+    """Report on one file; every list contains sentences for the person who uploaded it."""
 
     name: str
     understood: list[str]
@@ -193,7 +193,7 @@ class UploadedFileOut(Model):
     redactor_version: int | None
     quarantined: bool = Field(description="Whether the original is kept, encrypted, because it could not all be read.")
     status: str
-    waits_for_mapping: bool = Field(description="Whether it is a table that can be read once somebody says what its columns are.")
+    waits_for_mapping: bool = Field(description="Whether it is a table that can be read once its columns are named.")
     duplicate: bool
     session_ids: list[int]
 
@@ -215,7 +215,7 @@ class UploadOut(Model):
 
 
 class VisitOfRecordingIn(Model):
-    """Which proposal, as the caller looked at it, a visit is added for."""
+    """Proposal, as the caller looked at it, that a visit is added for."""
 
     version: Int = Field(ge=1)
 

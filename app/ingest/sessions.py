@@ -283,7 +283,7 @@ def count(db: Session, session: StudySession) -> None:
         number = session.id
         db.rollback()
         raise Conflict(
-            f"Somebody else confirmed a session with the same minutes of this device as session {number} at the same time.",
+            f"Another person confirmed a session with the same minutes of this device as session {number} at the same time.",
             "Load the page again: it names the other session.",
         ) from error
 

@@ -1,4 +1,4 @@
-"""Sentences of uploads and proposals, made where somebody reads them; nothing is decided by them."""
+"""Sentences of uploads and proposals, made where they are shown; nothing is decided by them."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ SEALED = "hidden while the key of the blinded plan is sealed; kept as it is when
 
 
 def reasons(evidence: Mapping[str, Any], sealed: bool = False) -> dict[str, str]:
-    """The stored evidence of a proposal, by field, in words; without what tells what ran where the key of its plan is `sealed`."""
+    """Write the stored evidence of a proposal in words, by field; without what reveals what ran where the key of its plan is `sealed`."""
     said = {name: reason(Evidence.from_json(stored)) for name, stored in evidence.items()}
     return said | {name: SEALED for name in said if sealed and name in _TELLING}
 
 
 def reason(evidence: Evidence) -> str:
-    """Why a value of a proposal is what it is."""
+    """Explain a value of a proposal."""
     return _stated(evidence) if evidence.reason is Reason.STATED else _SENTENCES[evidence.reason](evidence.facts)
 
 
@@ -50,7 +50,7 @@ AFTER_READER_ENDED = (
 
 
 def reader_ended(cause: str, memory_mb: int, cpu_s: int | None) -> str:
-    """Why a file could not be read, where that was ended by a limit."""
+    """Explain why a file could not be read, where a limit ended its reading."""
     reasons = {
         "memory": f"reading it takes more memory than the {memory_mb} MiB that one file may have",
         "time": f"reading it takes longer than the {cpu_s} s of processor time that one file may have",
@@ -59,13 +59,13 @@ def reader_ended(cause: str, memory_mb: int, cpu_s: int | None) -> str:
 
 
 def progress(file: int, files: int, share: float, doing: str) -> str:
-    """How far the reading of an upload is."""
+    """Describe how far the reading of an upload is."""
     of = f"file {file} of {files}: " if files > 1 else ""
     return f"{of}{doing}, {100 * share:.0f} %" if doing else f"{of}receiving"
 
 
 def cut_short(upload_id: int, kept: int, of: int, beneath: BetaloopError | None = None) -> tuple[str, str]:
-    """What was kept of an upload that a fault ended, ours or one `beneath` the service that passes, and what becomes of it."""
+    """Describe what was kept of an upload that a fault ended, ours or one `beneath` the service that passes, and what follows."""
     what = f"Upload {upload_id} was cut short: the bytes of {kept} of its {of} file{'s' if of != 1 else ''} are kept."
     rest = "" if kept >= of else " Send the others again; what came before is recognised."
     if beneath is not None:
@@ -79,7 +79,7 @@ def cut_short(upload_id: int, kept: int, of: int, beneath: BetaloopError | None 
 
 
 def left(why: str) -> str:
-    """That an upload which was cut short is not read, and why."""
+    """Say that an upload which was cut short is not read, and why."""
     return f"This upload was cut short, and what is kept of it is left as it is. {why} It is read by itself if that is taken back."
 
 
@@ -87,12 +87,12 @@ MADE_ANEW = "What was kept of it was missing or damaged; these bytes took its pl
 
 
 def read_by_mapping(mapping: ColumnMapping) -> str:
-    """That a table was read by a column mapping of its study, and by which."""
+    """Say that a table was read by a column mapping of its study, and by which."""
     return f"read by the study's column mapping '{mapping.name}', version {mapping.version}"
 
 
 def unreadable(members: list[str]) -> list[str]:
-    """Of files that could not be read, and are stored encrypted for that reason."""
+    """Describe files that could not be read, and are stored encrypted for that reason."""
     return [f"kept encrypted, because it could not be read: {member}" for member in members]
 
 
@@ -141,7 +141,7 @@ def _channel(facts: Mapping[str, Any]) -> str:
 
 
 def _steps(facts: Mapping[str, Any]) -> str:
-    """Usable steps of a channel; empty in evidence that does not tell them."""
+    """Write the usable steps of a channel; empty in evidence without them."""
     usable = facts.get("usable")
     return "" if usable is None else f"{usable} usable step{'' if usable == 1 else 's'}"
 
@@ -153,7 +153,7 @@ def _program(facts: Mapping[str, Any]) -> str:
 
 
 def _ran(program: Mapping[str, Any]) -> str:
-    """What a program stimulated with."""
+    """Describe the stimulation of a program."""
     match program["how"]:
         case "moved":
             return f"{ma(program['low'])} to {ma(program['high'])} mA"
@@ -167,7 +167,7 @@ _NO_AMPLITUDE = "the file states no amplitude"
 
 
 def _course(c: Course) -> str:
-    """How the amplitude of one side ran."""
+    """Describe the course of the amplitude of one side."""
     level = f"{ma(c.median)} {c.unit}" if c.median is not None else ""
     match c.pattern:
         case Pattern.UNKNOWN:
@@ -212,12 +212,12 @@ _SENTENCES: dict[Reason, Callable[[Mapping[str, Any]], str]] = {
 
 
 def no_more_than(stored: Recording) -> str:
-    """Of a copy that holds no more than a stored recording."""
+    """Describe a copy that holds no more than a stored recording."""
     return f"The same minutes of this device came before, as recording {stored.id}, which holds all of this: nothing was stored again."
 
 
 def fuller_than(old: Recording, sessions: Sequence[int]) -> str:
-    """Of a copy that holds more than a stored recording."""
+    """Describe a copy that holds more than a stored recording."""
     several = len(sessions) > 1
     named = f"; session{'s' if several else ''} {', '.join(map(str, sessions))}"
     used = f"{named} use{'' if several else 's'} it from now on" if sessions else ""
@@ -225,7 +225,7 @@ def fuller_than(old: Recording, sessions: Sequence[int]) -> str:
 
 
 def locked_copy(new: Recording, old: Recording, sessions: Sequence[int]) -> str:
-    """Of a copy that holds more than a stored recording, which sessions of a locked visit use."""
+    """Describe a copy that holds more than a stored recording, which sessions of a locked visit use."""
     named = f"session{'s' if len(sessions) > 1 else ''} {', '.join(map(str, sessions))}"
     return (
         f"A fuller copy (recording {new.id}) of the minutes of recording {old.id}, of which {named} of a locked visit is made: nothing was "
@@ -235,7 +235,7 @@ def locked_copy(new: Recording, old: Recording, sessions: Sequence[int]) -> str:
 
 
 def beside(new: Recording, other: Recording) -> str:
-    """Of a recording of the same minutes as a stored one, neither of which holds all of the other."""
+    """Describe a recording of the same minutes as a stored one, neither of which holds all of the other."""
     return (
         f"Recording {other.id} holds minutes of the same device that this one (recording {new.id}) holds too, and the two differ, or each "
         "holds what the other lacks: both are kept, and their minutes count once. If it is one session, upload its whole folder."

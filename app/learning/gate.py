@@ -108,7 +108,7 @@ def decide(db: Session, participant: Participant, choice: GateChoice, reason: st
 
 
 def _compare(outcome: Outcome, learned: Sequence[StudySession], random: Sequence[StudySession]) -> QocTest:
-    """Unadjusted one-sided tests of one outcome."""
+    """Run the unadjusted one-sided tests of one outcome."""
     named = outcome.field, outcome.label, outcome.unit
     x, y = _values(learned, outcome), _values(random, outcome)
     medians = (median(x) if x else None, median(y) if y else None)

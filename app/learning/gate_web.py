@@ -52,7 +52,7 @@ def gate_out(found: gates.Gate) -> GateOut:
 
 @api.get("/participants/{code}/buffer-gate", dependencies=[ResultsViewed])
 def read_gate(participant: CurrentParticipant, db: Db) -> GateOut:
-    """Whether sessions of learned policies may enter the replay buffer, with the tests behind it."""
+    """Return whether sessions of learned policies may enter the replay buffer, with the tests behind it."""
     return gate_out(gates.gate(db, participant, study_repository.sessions_of_participant(db, participant.id)))
 
 

@@ -97,7 +97,7 @@ def policy_out(db: Session, p: Policy, participant: Participant) -> PolicyOut:
 
 @api.get("/participants/{code}/policies")
 def list_policies(participant: CurrentParticipant, db: Db, paging: PagingQuery) -> Page[PolicyOut]:
-    """Policies of a participant, newest first; baselines and retired ones among them."""
+    """List policies of a participant, newest first; baselines and retired ones among them."""
     rows, total = repository.policies(db, participant.id, paging.limit, paging.offset)
     return Page(items=[policy_out(db, p, participant) for p in rows], total=total, limit=paging.limit, offset=paging.offset)
 
@@ -119,7 +119,7 @@ def add_policy(
 
 @api.get("/policies/{policy_id}")
 def read_policy(policy: CurrentPolicy, db: Db) -> PolicyOut:
-    """One policy."""
+    """Return one policy."""
     return policy_out(db, policy, db.get_one(Participant, policy.participant_id))
 
 

@@ -43,17 +43,18 @@ ALGORITHM_NAMES: dict[str, str] = {name: algorithm.title for name, algorithm in 
 Aim = Literal["steps", "return", "both"]
 Anchor = Literal["logged", "cdbs", "best", "both", "all"]
 DEFAULT_SWEEP: dict[str, Any] = {"algorithms": ["ddpg", "rebrac"], "aim": "both", "anchor": "all", "critic_memory": True}
-"""What the pipeline trains where nothing else is asked for: the paper's algorithm, and one held near what was logged, near the best
-constant amplitude or near cDBS, with and without a share of r_end. DDPG alone went below cDBS in all participants of the demo. The three
-anchors span the energies, so that a visit has something to choose from; near the best constant amplitude policies are held twice, closely
-and with more room, because there most patients who respond have one that succeeds. The critics see past amplitudes."""
+"""Policies of a sweep by default: the paper's algorithm, and one kept near the logged amplitudes, near the best constant amplitude or near
+cDBS. They are trained with and without a share of r_end. DDPG alone went below cDBS in all participants of the demo. The three anchors span
+the energies, so that a visit has something to choose from. Near the best constant amplitude policies are kept twice, closely and with more
+room: there most patients who respond have one that succeeds. The critics see past amplitudes.
+"""
 
 
 class SweepParams(Model):
-    """What a sweep takes: several policies trained in one action. What is left out comes from the preset."""
+    """Parameters of a sweep: several policies trained in one action. Omitted ones come from the preset."""
 
     preset: Preset = Field("full", description="`full`: sizes for a study; `quick`: for a first look.")
-    sweep: SweepName | None = Field(None, description="Name of the sweep; numbered where left out.")
+    sweep: SweepName | None = Field(None, description="Name of the sweep; numbered where omitted.")
     algorithms: Annotated[list[AlgorithmName], Field(min_length=1, max_length=5)] = Field(
         ["ddpg"], description="The policies are dealt to these in turn; from scratch only."
     )
@@ -63,15 +64,15 @@ class SweepParams(Model):
     )
     anchor: Anchor = Field(
         "logged",
-        description="What TD3+BC and ReBRAC hold the policy near: the logged amplitudes, as published; the cDBS amplitude, so that it "
-        "leaves the standard of care only where the values speak for it; `best`, the constant amplitude with the largest expected saving "
-        "(energy saved times the probability that all QoCs keep within the margins) of those that sessions support and that probably "
-        "keep them, by turns closely and with more room; `both`, by turns logged and cDBS; or `all` by turns. The others have no such "
-        "bond. Where policies are fine-tuned, by turns means what each was held near, and as firmly.",
+        description="Amplitudes that TD3+BC and ReBRAC keep the policy near. `logged`: the logged ones, as published. `cdbs`: the cDBS "
+        "amplitude, left only where the values speak for it. `best`: the constant amplitude with the largest expected saving, alternately "
+        "closely and with more room. It is chosen among those that sessions support and that probably keep all margins. That saving is "
+        "energy saved times the probability that all QoCs keep within the margins. `both`: alternately logged and cDBS. `all`: all "
+        "alternately. Other algorithms have no anchor. Where anchors alternate, a fine-tuned policy keeps its own, as firmly.",
     )
     critic_memory: bool = Field(
         False,
-        description="Whether the critics see means of past amplitudes beside the beta window. The policy never does. A fine-tuned policy "
+        description="Whether the critics see means of past amplitudes besides the beta window. The policy never does. A fine-tuned policy "
         "keeps what its critics had.",
     )
     policies: PolicyIds = Field(default_factory=list, description="Fine-tune from each of these; empty: train from scratch.")
@@ -82,7 +83,7 @@ class SweepParams(Model):
 
 
 class TrainParams(SweepParams):
-    """What `train` takes."""
+    """Parameters of `train`."""
 
     updates: Int | None = Field(None, ge=1, le=1_000_000, description="Gradient steps of each policy.")
     batch: Int | None = Field(None, ge=1, le=4096, description="Transitions per gradient step.")
@@ -93,7 +94,7 @@ class TrainParams(SweepParams):
 
 
 class DistilParams(Model):
-    """What `distill` takes."""
+    """Parameters of `distill`."""
 
     preset: Preset = Field("full", description="`full`: sizes for a study; `quick`: for a first look.")
     policies: PolicyIds = Field(default_factory=list, description="Teachers; empty: every trained policy without a student.")
@@ -106,14 +107,14 @@ class DistilParams(Model):
 
 
 class SnapshotSessionOut(Model):
-    """One session of a snapshot, or why it was left out."""
+    """One session of a snapshot, or why it was excluded."""
 
     session_id: int
     beta_trace_id: int | None
     amplitude_trace_id: int | None
     decode_version: int | None
     qoc_id: int | None
-    conditions_id: int | None = Field(description="Revision of the session's conditions; null in snapshots of before there were any.")
+    conditions_id: int | None = Field(description="Revision of the session's conditions; null in snapshots of older versions.")
     cdbs_amplitude_ma: float | None
     hours_since_dose: float | None = Field(description="From the last dose to the start; null where not known, and in earlier snapshots.")
     steps: int | None
@@ -177,7 +178,7 @@ class QocTestOut(Model):
 
 
 class GateDecisionOut(Model):
-    """What a clinician decided, and why."""
+    """Decision of a clinician, and its reason."""
 
     choice: GateChoice
     reason: str
@@ -186,7 +187,7 @@ class GateDecisionOut(Model):
 
 
 class GateOut(Model):
-    """Whether sessions of learned policies may enter the replay buffer."""
+    """Decision whether sessions of learned policies may enter the replay buffer."""
 
     open: bool
     grounds: str
@@ -225,15 +226,15 @@ class SweepCandidateOut(Model):
     )
     supported: bool | None = Field(description="Whether sessions lie near what the policy does; null where that was not asked.")
     beyond_margin: bool | None = Field(
-        description="Whether an outcome is as probably worse than under cDBS by more than its margin as makes a verdict `unsafe`; "
-        "null where that was not asked, or no outcome is known."
+        description="Whether an outcome is so probably worse than under cDBS by more than its margin that the verdict is `unsafe`. "
+        "Null where not checked, or no outcome is known."
     )
     within_margins: float | None = Field(
         description="Probability that every known outcome keeps its margin against cDBS; null where that is not known."
     )
     energy_saved: float | None = Field(
         description="Share of cDBS's energy that the policy is predicted to save; null where that is not known. "
-        "The policies stand in the order of this times `within_margins`."
+        "The policies are in the order of this times `within_margins`."
     )
     below_bound: float | None = Field(
         description="Share of the buffer's states answered with less than the lower bound of its random sessions; null without those."
@@ -274,6 +275,6 @@ class PolicyLabel(Model):
 
 
 class PolicyChange(Model):
-    """Retire a policy, or take it back; nothing else of a policy ever changes."""
+    """Change of a policy: retire it, or take it back; nothing else of a policy ever changes."""
 
     retired_reason: Text | None = Field(max_length=1000, description="Why it is no longer to be ranked or planned; null takes it back.")

@@ -239,7 +239,7 @@ def _mend(db: Session, snapshot: BufferSnapshot, found: Collection) -> None:
 
 
 def _read(db: Session, session: StudySession, version: SettingsVersion, traces: TracesOf, failed: Qoc) -> Member:
-    """The session's trajectory, or the first reason of its own against it."""
+    """Read the session's trajectory, or the first reason of its own against it."""
     if session.visit.sealed:
         return Member(session, None, None, SEALED)  # how much was learnt from it, and what, would reveal what ran
     try:
@@ -275,7 +275,7 @@ def _signal(version: SettingsVersion, read: list[Member]) -> tuple[str, str]:
         return str(version.beta_unit), str(version.beta_source)
     kinds = Counter(f"{m.table.beta_trace.unit} from {m.table.beta_trace.source}" for m in read if m.table and m.table.beta_trace)
     raise Invalid(
-        f"Nobody has stated the {' and the '.join(unstated)} of the threshold of {version.xi_beta:g} of participant "
+        f"No person has stated the {' and the '.join(unstated)} of the threshold of {version.xi_beta:g} of participant "
         f"{version.participant.code}, so that no reward can be computed.",
         "State unit and source of beta in the participant's settings."
         + (f" The confirmed sessions have beta in {', '.join(f'{kind} ({n})' for kind, n in kinds.most_common(4))}." if kinds else ""),

@@ -41,19 +41,19 @@ def snapshot_out(db: Session, s: BufferSnapshot, participant: Participant) -> Sn
 
 @api.get("/participants/{code}/snapshots")
 def list_snapshots(participant: CurrentParticipant, db: Db, paging: PagingQuery) -> Page[SnapshotOut]:
-    """Buffer snapshots of a participant, newest first."""
+    """List buffer snapshots of a participant, newest first."""
     rows, total = repository.snapshots(db, participant.id, paging.limit, paging.offset)
     return Page(items=[snapshot_out(db, s, participant) for s in rows], total=total, limit=paging.limit, offset=paging.offset)
 
 
 @api.post("/participants/{code}/snapshots", status_code=201)
 def take_snapshot(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> SnapshotOut:
-    """Pin the replay buffer as it is now; the same data give the same snapshot."""
+    """Pin the present replay buffer; the same data give the same snapshot."""
     row = snapshots.take_snapshot(db, participant, caller)
     return snapshot_out(db, row, participant)
 
 
 @api.get("/snapshots/{snapshot_id}")
 def read_snapshot(snapshot: CurrentSnapshot, db: Db) -> SnapshotOut:
-    """One snapshot with its sessions, and why others were left out."""
+    """Return one snapshot with its sessions, and why others were excluded."""
     return snapshot_out(db, snapshot, db.get_one(Participant, snapshot.participant_id))

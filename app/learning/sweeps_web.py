@@ -77,14 +77,14 @@ def sweep_out(db: Session, sweep: Sweep) -> SweepOut:
 
 @api.get("/participants/{code}/sweeps", dependencies=[ResultsViewed])
 def list_sweeps(participant: CurrentParticipant, db: Db, paging: PagingQuery) -> Page[SweepOut]:
-    """Sweeps of a participant, newest first."""
+    """List sweeps of a participant, newest first."""
     rows, total = repository.sweeps(db, participant.id, paging.limit, paging.offset)
     return Page(items=[sweep_out(db, s) for s in rows], total=total, limit=paging.limit, offset=paging.offset)
 
 
 @api.get("/sweeps/{sweep_id}", dependencies=[SweepViewed])
 def read_sweep(sweep: CurrentSweep, db: Db) -> SweepOut:
-    """One sweep: its policies on sessions they did not learn from, and the scores of controllers without learning."""
+    """Return one sweep: its policies on sessions they did not learn from, and the scores of controllers without learning."""
     return sweep_out(db, sweep)
 
 

@@ -154,7 +154,7 @@ def best_supported(constants: Mapping[str, PosteriorGain], level: float) -> floa
 
 
 def known_tests(tested: Mapping[str, Any] | None, buffer: ReplayBuffer) -> Tests:
-    """Tested policies as `app.pipeline.training.tested_so_far` has them; none where None."""
+    """Load tested policies as `app.pipeline.training.tested_so_far` has them; none where None."""
     if tested is None:
         return Tests()
     policies = {str(p["id"]): OnnxPolicy(files.read(p["sha256"]), buffer.settings.window) for p in tested["policies"]}

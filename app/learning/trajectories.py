@@ -23,7 +23,7 @@ def read_buffer(sha256: str) -> ReplayBuffer:
 
 
 def trajectory_of(session: StudySession, table: StepTable, arm: Arm, version: SettingsVersion, failed: Qoc) -> SessionTrajectory | str:
-    """The session's steps after its start, with the window of beta before it; or why there are none.
+    """Build a trajectory of the session's steps after its start, with the window of beta before it; or the reason why there are none.
 
     Args:
         session: its QoCs are taken in their newest revision. table: its steps, [window + T].

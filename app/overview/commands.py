@@ -14,7 +14,7 @@ from app.platform.terminal import ACTOR, AsJson, Code, bad_call, reason, say, sh
 
 def export_package(
     code: Code,
-    to: Annotated[Path | None, typer.Option(help="Zip to write; CODE.zip when left out.")] = None,
+    to: Annotated[Path | None, typer.Option(help="Zip to write; CODE.zip by default.")] = None,
     sheet: Annotated[bool, typer.Option("--sheet", help="A CSV of its sessions, as `betaloop import --study` reads it.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -66,7 +66,7 @@ def export_trail(
         try:
             with to.open("w", encoding="utf-8") as out:
                 pieces = as_csv(db, true(), wanted, SYSTEM)
-                db.commit()  # rows that were written stand in the trail as taken, whatever becomes of the rest
+                db.commit()  # rows that were written are in the trail as taken, whatever becomes of the rest
                 for piece in pieces:
                     written += out.write(piece)
         except OSError as error:

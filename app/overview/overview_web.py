@@ -60,7 +60,7 @@ class Offer:
 
 
 def offers(participants: Sequence[Participant], states: Mapping[int, State]) -> list[Offer]:
-    """The questions that the study can answer by now: fewer while its participants still arrive.
+    """Choose the questions that the study can answer by now: fewer while its participants still arrive.
 
     Args:
         states: of these participants, by their id.
@@ -92,7 +92,7 @@ pages = APIRouter()
 
 REFRESH_S = 5
 SOON = 12
-"""Next visits that stand open; later ones are a fold away."""
+"""Number of next visits that are shown; later ones are a fold away."""
 
 
 @pages.get("/")
@@ -102,7 +102,7 @@ def overview(
     """Show what waits for the reader, visits as a status board, and all participants as cards, those that need attention marked."""
     rows, total = study.participants(db, caller, paging.limit, paging.offset, withdrawn=withdrawn == "yes")
     today = datetime.now(UTC).date()
-    # of the whole study: whoever is seen tomorrow may stand on another page of participants
+    # of the whole study: a participant seen tomorrow may be on another page of participants
     coming = study.next_visits(db, caller, today, withdrawn=withdrawn == "yes")
     states = state.states(db, list(dict.fromkeys([*rows, *coming])), today)
     page = render(
@@ -133,12 +133,12 @@ def overview(
     return HTMLResponse(page)
 
 
-# The page of a participant: where the study stands, its visits, and the five metrics of every controller against cDBS.
+# The page of a participant: the state of the study, its visits, and the five metrics of every controller against cDBS.
 
 
 @pages.get("/participants/{code}", dependencies=[ResultsViewed])
 def participant_page(request: Request, participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """One participant."""
+    """Show one participant."""
     visits, _ = study.visits(db, participant.id, 1000, 0)
     sessions = study.sessions_for_lists(db, participant.id)
     held = evidence(db, participant, caller)
@@ -187,7 +187,7 @@ def _answer(db: Session, participant: Participant, caller: Caller) -> _Answer | 
 
 
 def _story(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsVersion]) -> Chart | None:
-    """The months on one axis, kept while none of what they are made of has changed."""
+    """Plot the months on one axis, cached while none of its inputs has changed."""
     key = ("story", held.key, tuple((v.id, v.date) for v in visits), tuple((v.version, v.created_at) for v in versions))
     today = datetime.now(UTC).date()
     return kept((*key, today), lambda: story_chart(held, visits, versions, today))
@@ -198,7 +198,7 @@ def _story(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsV
 
 @pages.get("/energy-saved", dependencies=[ResultsViewed])
 def energy_saved_page(request: Request, participants: Summed, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """Energy saved so far; the home page takes its numbers from here once it stands."""
+    """Show the energy saved so far; the home page takes its numbers from here once it is loaded."""
     saved = [outline.saved for outline in outlines(db, participants, caller) if outline.saved is not None]
     page = render(request, "overview/energy_saved.html", saved=saved, overall=overall(saved), withdrawn=withdrawn_codes(participants))
     return HTMLResponse(page)
@@ -212,7 +212,7 @@ MOST = 20
 
 @dataclass(frozen=True)
 class Hit:
-    """One thing that was found: its name, what tells it from others, and its page."""
+    """One thing that was found: its name, what distinguishes it, and its page."""
 
     name: str
     about: str
@@ -220,7 +220,7 @@ class Hit:
 
 
 def search(db: Session, caller: Caller, words: str) -> dict[str, list[Hit]]:
-    """What the words name, by kind; a participant's code before another word narrows policies, jobs and sessions to that participant."""
+    """Search what the words name, by kind; a participant's code first narrows policies, jobs and sessions to that participant."""
     whole = words.strip()
     first, _, rest = whole.partition(" ")
     owner = repository.participant_id_of_code(db, caller, first) if rest else None
@@ -258,7 +258,7 @@ def search(db: Session, caller: Caller, words: str) -> dict[str, list[Hit]]:
 
 @pages.get("/search")
 def search_page(request: Request, db: Db, caller: CurrentCaller, q: Annotated[Text, Query(max_length=100)] = "") -> Response:
-    """What was found; a single hit opens at once."""
+    """Show what was found; a single hit opens at once."""
     found = search(db, caller, q)
     every: Sequence[Hit] = [hit for hits in found.values() for hit in hits]
     if len(every) == 1:
@@ -268,7 +268,7 @@ def search_page(request: Request, db: Db, caller: CurrentCaller, q: Annotated[Te
 
 @pages.get("/participants/{code}/export.zip")
 def data_package(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> Response:
-    """Everything of a participant as a Frictionless data package."""
+    """Download everything of a participant as a Frictionless data package."""
     content = export_participant(db, participant, caller)
     return Response(
         content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{participant.code}.zip"'}

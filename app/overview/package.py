@@ -53,9 +53,9 @@ def export_sheet(db: Session, participant: Participant, caller: Caller) -> bytes
 
 
 def export_participant(db: Session, participant: Participant, caller: Caller) -> bytes:
-    """Everything the caller may know of a participant, as a zipped data package. Controllers come through the blinding gate.
+    """Export everything the caller may know of a participant, as a zipped data package. Controllers come through the blinding gate.
 
-    Sessions of a blinded plan whose key is sealed are left out, and README.txt names their visits.
+    Sessions of a blinded plan whose key is sealed are excluded, and README.txt names their visits.
 
     A session whose steps cannot be read has its row all the same, with the reason in the column `problem`. No date leaves: times are days
     since the participant was enrolled.
@@ -196,7 +196,7 @@ def _coverage_rows(db: Session, participant: Participant) -> list[tuple[Any, ...
 
 
 def _cell(value: Any) -> Any:
-    """A cell as Frictionless reads it: truth in small letters."""
+    """Convert a cell for Frictionless: truth in small letters."""
     return str(value).lower() if isinstance(value, bool) else value
 
 

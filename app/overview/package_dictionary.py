@@ -28,11 +28,11 @@ class Days:
         self._enrolled = enrolled
 
     def of(self, moment: datetime | None) -> float | None:
-        """A moment, days; None where it is not known."""
+        """Convert a moment to days since enrolment; None where it is not known."""
         return None if moment is None else round((moment - self._enrolled).total_seconds() / 86400, 5)
 
     def of_date(self, day: date | None) -> int | None:
-        """A date, whole days."""
+        """Convert a date to whole days since enrolment."""
         return None if day is None else (day - self._enrolled.date()).days
 
 
@@ -57,7 +57,7 @@ TITLES = {
 
 
 def _fields(text: str) -> tuple[Field, ...]:
-    """`name type meaning`, a line each."""
+    """Parse `name type meaning`, a line each."""
     return tuple(Field(*line.strip().split(" ", 2)) for line in text.strip().splitlines())
 
 
@@ -218,7 +218,7 @@ FIELDS: dict[str, tuple[Field, ...]] = {
 
 
 def descriptor(code: str, synthetic: bool, contents: Mapping[str, str]) -> dict[str, Any]:
-    """datapackage.json of these tables, as Frictionless Data Package v1 has it."""
+    """Build datapackage.json of these tables, by Frictionless Data Package v1."""
     resources = []
     for name, fields in FIELDS.items():
         content = contents[f"{name}.csv"].encode()

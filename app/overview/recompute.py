@@ -1,9 +1,9 @@
-"""Recompute the primary tables of this data package from its sessions and steps, with numpy and scipy alone, and compare.
+"""Recomputation of this data package's primary tables from its sessions and steps, with numpy and scipy alone, and comparison.
 
     python recompute.py            in the folder of the package
 
-Writes recomputed.csv beside the tables. Ends with 0 where every number agrees with primary.csv and noninferiority.csv, with 1 where one
-does not. The methods stand in the docstrings; nothing of the software that made the package is used.
+Writes recomputed.csv next to the tables. Ends with 0 where every number agrees with primary.csv and noninferiority.csv, with 1 where one
+does not. The docstrings describe the methods; nothing of the software that made the package is used.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ TOLERANCE = 1e-6
 
 
 def read(folder: Path, name: str) -> list[Row]:
-    """The rows of a table."""
+    """Read the rows of a table."""
     with (folder / name).open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 def number(text: str) -> float:
-    """A cell; NaN where it is empty."""
+    """Parse a cell; NaN where it is empty."""
     return float(text) if text else math.nan
 
 
@@ -48,7 +48,7 @@ class Outcome(NamedTuple):
 
 
 def outcomes_of(folder: Path) -> dict[str, Outcome]:
-    """The outcomes by name. A failure without a stated value counts as the worst of all sessions that nobody excluded."""
+    """Read the outcomes by name. A failure without a stated value counts as the worst of all sessions that are not excluded."""
     found = {}
     for row in read(folder, "outcomes.csv"):
         better, failure = row["higher_is_better"] == "true", number(row["failure"])
@@ -62,7 +62,7 @@ def outcomes_of(folder: Path) -> dict[str, Outcome]:
 
 
 def metrics(folder: Path, outcomes: Mapping[str, Outcome]) -> list[dict[str, Any]]:
-    """Every session that counts, with its metrics: energy is the mean of a^2, both it and beta from at least half of the steps."""
+    """Compute the metrics of every session that counts: energy is the mean of a^2, both it and beta from at least half of the steps."""
     steps: dict[str, list[Row]] = {}
     for row in read(folder, "steps.csv"):
         if float(row["t_s"]) > 0:
@@ -83,7 +83,7 @@ def metrics(folder: Path, outcomes: Mapping[str, Outcome]) -> list[dict[str, Any
 
 
 def known(values: np.ndarray[Any, Any]) -> bool:
-    """Whether at least half of the values are there."""
+    """Check whether at least half of the values are known."""
     return bool(values.size) and float(np.mean(np.isfinite(values))) >= KNOWN_SHARE
 
 
@@ -100,11 +100,11 @@ class Contrasts:
                 self.arms.append((np.array(one), np.array(two)))
 
     def means(self, value: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Mean of the controller less that of cDBS, by visit."""
+        """Compute the mean of the controller less that of cDBS, by visit."""
         return np.array([value[one].mean() - value[two].mean() for one, two in self.arms])
 
     def imbalance(self) -> float:
-        """How much later the controller comes, in standard deviations of the place, on average over visits."""
+        """Compute how much later the controller comes, in standard deviations of the place, on average over visits."""
         found = []
         for one, two in self.arms:
             sd = self.order[np.r_[one, two]].std()
@@ -112,16 +112,16 @@ class Contrasts:
         return float(np.mean(found)) if found else 0.0
 
     def wins(self, value: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Share of pairs that the controller wins, by visit; pairs less than one step of the scale apart count in proportion."""
+        """Compute the controller's share of won pairs, by visit; pairs less than one step of the scale apart count in proportion."""
         pairs = [np.clip(np.subtract.outer(value[one], value[two]), -1, 1) for one, two in self.arms]
         return np.array([0.5 + 0.5 * p.mean() for p in pairs])
 
     def half_pairs(self) -> float:
-        """Mean squared half of one pair, which is as fine as a visit tells a share of pairs: a correction for continuity."""
+        """Average the squared half of one pair, the resolution of a visit's share of pairs: a correction for continuity."""
         return float(np.mean([(0.5 / (one.size * two.size)) ** 2 for one, two in self.arms]))
 
     def slope(self, visits: Iterable[int]) -> float:
-        """Common slope of the value on the place within arms of visits; NaN where nothing tells it."""
+        """Estimate the common slope of the value on the place within arms of visits; NaN where it cannot be estimated."""
         xx = xy = 0.0
         for k in visits:
             for arm in self.arms[k]:
@@ -130,15 +130,15 @@ class Contrasts:
         return xy / xx if xx > 0 else math.nan
 
     def floor(self, resolution: float) -> float:
-        """Least variance of a contrast of rounded values (Sheppard)."""
+        """Compute the least variance of a contrast of rounded values (Sheppard)."""
         return float(np.mean([resolution**2 / 12 * (1 / one.size + 1 / two.size) for one, two in self.arms]))
 
 
 class Average(NamedTuple):
     """Average over visits, its standard error, the number of visits, and the skewness of their contrasts.
 
-    Of a metric with a floor or a ceiling the larger p counts of Student's ratio and of the same freed from skewness (Hall 1992), and the
-    interval holds both; of others the skewness is 0.
+    For a metric with a floor or a ceiling, p is the larger of two: of Student's ratio, and of the same freed from skewness (Hall 1992). The
+    interval covers both. For others the skewness is 0.
     """
 
     estimate: float
@@ -147,21 +147,21 @@ class Average(NamedTuple):
     skewness: float
 
     def ratios(self, value: float) -> tuple[float, float]:
-        """Student's ratio against a value, and the same freed from skewness."""
+        """Compute Student's ratio against a value, and the same freed from skewness."""
         n, g, ratio = self.visits, self.skewness, (self.estimate - value) / self.error
         u = ratio / math.sqrt(n)
         return ratio, ratio + math.sqrt(n) * (g * u**2 / 3 + g**2 * u**3 / 27 + g / (6 * n))
 
     def p_above(self, value: float) -> float:
-        """One-sided p of an average of `value` or less."""
+        """Compute the one-sided p of an average of `value` or less."""
         return float(t.sf(min(self.ratios(value)), self.visits - 1))
 
     def p_value(self) -> float:
-        """Two-sided p of no difference."""
+        """Compute the two-sided p of no difference."""
         return 2 * float(t.sf(min(abs(r) for r in self.ratios(0.0)), self.visits - 1))
 
     def interval(self) -> tuple[float, float]:
-        """Of 95 %."""
+        """Compute the interval of 95 %."""
         n, g, q = self.visits, self.skewness, float(t.ppf(0.975, self.visits - 1))
         ends = [-q, q]
         if abs(g) >= 1e-6:
@@ -199,7 +199,7 @@ def average(c: Contrasts, resolution: float, adjust: bool, bounded: bool, ordina
 
 
 def primary(c: Contrasts, resolution: float, bounded: bool, ordinal: bool = False) -> Average | None:
-    """The average, freed from the order where one arm stands later than the other by more than half a standard deviation."""
+    """Compute the average, freed from the order where one arm comes later than the other by more than half a standard deviation."""
     if abs(c.imbalance()) > UNBALANCED:
         adjusted = average(c, resolution, True, bounded, ordinal)
         if adjusted is not None:
@@ -208,7 +208,7 @@ def primary(c: Contrasts, resolution: float, bounded: bool, ordinal: bool = Fals
 
 
 def rank_sum_p(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> float:
-    """Two-sided exact rank-sum p, given the ties: twice the smaller tail. Every choice of ranks for x is equally likely."""
+    """Compute the two-sided exact rank-sum p, given the ties: twice the smaller tail. Every choice of ranks for x is equally likely."""
     ranks = np.rint(2 * rankdata(np.r_[x, y])).astype(int)
     ways = np.zeros((x.size + 1, int(ranks.sum()) + 1))
     ways[0, 0] = 1.0
@@ -220,7 +220,7 @@ def rank_sum_p(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> float:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's adjustment."""
+    """Adjust p-values by Holm's method."""
     order, adjusted, top = np.argsort(p_values, kind="stable"), [0.0] * len(p_values), 0.0
     for place, i in enumerate(order):
         top = max(top, min(1.0, p_values[i] * (len(p_values) - place)))
@@ -231,7 +231,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def primary_table(
     sessions: Sequence[dict[str, Any]], controllers: Sequence[str], outcomes: Mapping[str, Outcome]
 ) -> dict[tuple[str, str], dict[str, float]]:
-    """Primary result and the paper's test, by controller and metric."""
+    """Compute the primary result and the paper's test, by controller and metric."""
     found: dict[tuple[str, str], dict[str, float]] = {}
     for controller in controllers:
         taken = [s for s in sessions if s["controller"] in (controller, "cdbs")]
@@ -257,10 +257,10 @@ def primary_table(
 
 
 def noninferiority(sessions: Sequence[dict[str, Any]], row: Row, outcome: Outcome) -> dict[str, float]:
-    """One outcome of one verdict: a stopped session of the controller counts as the worst; the one-sided p of a loss of the margin or more.
+    """Test one outcome of one verdict: the one-sided p of a loss of the margin or more. A stopped session counts as the worst.
 
     Where the margin is a share of cDBS, the cDBS values are made worse by that share and better by the margin. Ordinal values of the
-    controller are made better by the margin, and must then win at least half of the pairs with the same visit's cDBS.
+    controller are made better by the margin. They must then win at least half of the pairs with the same visit's cDBS.
     """
     visits, controller = {int(v) for v in row["visits"].split()}, row["controller"]
     taken = [s for s in sessions if s["visit"] in visits and s["controller"] in (controller, "cdbs")]
@@ -289,7 +289,7 @@ def noninferiority(sessions: Sequence[dict[str, Any]], row: Row, outcome: Outcom
 
 
 def differs(stored: str, computed: float | None) -> bool:
-    """Whether a stored cell and a computed number disagree."""
+    """Check whether a stored cell and a computed number disagree."""
     if not stored or computed is None:
         return bool(stored) and computed is None
     return abs(float(stored) - computed) > TOLERANCE * max(1.0, abs(computed))

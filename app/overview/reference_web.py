@@ -44,7 +44,7 @@ class Operation:
 
 
 def operations(document: Mapping[str, Any]) -> dict[str, list[Operation]]:
-    """The routes of an OpenAPI document by the first part of their path."""
+    """Group the routes of an OpenAPI document by the first part of their path."""
     found: dict[str, list[Operation]] = {}
     for path, entry in document["paths"].items():
         for method in _METHODS:
@@ -56,13 +56,13 @@ def operations(document: Mapping[str, Any]) -> dict[str, list[Operation]]:
 
 
 def schemas(document: Mapping[str, Any]) -> dict[str, list[Member]]:
-    """The members of every named object."""
+    """List the members of every named object."""
     named = document.get("components", {}).get("schemas", {})
     return {name: _members(schema) for name, schema in sorted(named.items()) if schema.get("properties")}
 
 
 def type_in_words(schema: Mapping[str, Any]) -> str:
-    """A schema's type for people: `text`, `list of number`, `Job or null`."""
+    """Write a schema's type for people: `text`, `list of number`, `Job or null`."""
     if "$ref" in schema:
         return str(schema["$ref"]).rpartition("/")[2]
     if alternatives := schema.get("anyOf") or schema.get("oneOf"):
@@ -80,14 +80,14 @@ def type_in_words(schema: Mapping[str, Any]) -> str:
 
 @pages.get("/api-reference")
 def api_reference(request: Request, _: CurrentCaller) -> HTMLResponse:
-    """Every route of the REST interface with its parameters, and every object that it takes or gives."""
+    """Show every route of the REST interface with its parameters, and every object that it takes or gives."""
     document = request.app.openapi()
     return HTMLResponse(render(request, "overview/api_reference.html", groups=operations(document), schemas=schemas(document)))
 
 
 @pages.get("/styleguide")
 def styleguide(request: Request, _: CurrentCaller) -> HTMLResponse:
-    """The set of components with the rules of writing pages; in development alone."""
+    """Show the set of components with the rules of writing pages; only in development."""
     if not get_settings().development:
         raise NotFound("The style guide is shown in development mode alone.", "Start the service with BETALOOP_DEVELOPMENT=true.")
     return HTMLResponse(render(request, "overview/styleguide.html", controllers=CONTROLLERS, example=_example()))

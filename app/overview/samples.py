@@ -54,9 +54,9 @@ class SampleFile:
 
 
 def session_samples(db: Session, session: StudySession, form: SampleFormat, caller: Caller) -> SampleFile:
-    """A session's samples with their times, and every trace on its own rows.
+    """Write a session's samples with their times, and every trace on its own rows.
 
-    The samples are decoded anew from the stored files; a recording of which only traces were ever uploaded gives these alone.
+    The samples are decoded again from the stored files; a recording of which only traces were ever uploaded gives these alone.
 
     Raises:
         Forbidden: the caller may not know yet what ran. Conflict: the session has no recording, the installation cannot write NWB,
@@ -119,13 +119,13 @@ def _params(db: Session, session: StudySession, caller: Caller, folder: Path) ->
 
 
 def reading_limits() -> ChildLimits:
-    """What a child may take that reads the samples of a session, for whom a person waits."""
+    """Return the limits of a child that reads the samples of a session, for which a person waits."""
     settings = get_settings()
     return ChildLimits(settings.decode_memory_mb, settings.decode_seconds, quotes=False)
 
 
 def files_of(db: Session, session: StudySession) -> list[dict[str, Any]]:
-    """The stored files of the session's recordings, and which stretch of each recording is the session's.
+    """List the stored files of the session's recordings, and which stretch of each recording is the session's.
 
     Raises:
         Conflict: a stored file is missing.
@@ -156,7 +156,7 @@ def files_of(db: Session, session: StudySession) -> list[dict[str, Any]]:
 
 
 def unread(session: StudySession, ended: ChildEnded) -> BetaloopError:
-    """In words, what kept a session's samples from being read. Raises nothing; a fault of ours goes on as the fault that it is."""
+    """Explain what kept a session's samples from being read. Raises nothing; a fault of ours goes on as the fault that it is."""
     if ended.cause in ("memory", "time"):
         much = f"{ended.limits.memory_mb} MiB" if ended.cause == "memory" else f"{ended.limits.cpu_s} s of processor time"
         setting = "BETALOOP_DECODE_MEMORY_MB" if ended.cause == "memory" else "BETALOOP_DECODE_SECONDS"

@@ -65,7 +65,7 @@ SCHEMA = pa.schema(
 
 
 def write_parquet(target: Path, signals: Sequence[Signal], about: Mapping[str, Any]) -> None:
-    """Write the table; `about` stands as JSON under the key `betaloop` of its schema. An invalid row of a trace is null."""
+    """Write the table; `about` is stored as JSON under the key `betaloop` of its schema. An invalid row of a trace is null."""
     said = {**about, "rates_hz": {f"{s.recording} {s.channel}": s.rates_hz for s in signals if s.rates_hz}}
     schema = SCHEMA.with_metadata({"betaloop": json.dumps(said)})
     with pq.ParquetWriter(target, schema, compression="zstd") as out:
@@ -176,20 +176,20 @@ def _times(trace: Signal) -> dict[str, Any]:
 
 
 def _stored(values: np.ndarray[Any, Any]) -> Any:
-    """Compressed as HDF5 holds it."""
+    """Compress values as HDF5 stores them."""
     from pynwb import H5DataIO
 
     return H5DataIO(values, compression="gzip", shuffle=True) if values.size else values
 
 
 def _name(s: Signal) -> str:
-    """A name that no other signal of the session has; NWB takes neither slashes nor colons."""
+    """Make a name that no other signal of the session has; NWB takes neither slashes nor colons."""
     return f"recording {s.recording} {s.stream} {s.channel}".strip().replace("/", "-").replace(":", "-")
 
 
-# A session's samples and traces as one file, written in a limited child: samples are decoded anew from the files that came.
+# A session's samples and traces as one file, written in a limited child: samples are decoded again from the files that came.
 #
-# The child knows no settings and no database: what it needs stands in its params. `service` beside this is its caller's side.
+# The child knows no settings and no database: its params contain all that it needs. `samples` is its caller's side.
 
 WRITERS = {"parquet": write_parquet, "nwb": write_nwb}
 
@@ -198,7 +198,7 @@ def write(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
     """Write the file.
 
     Args:
-        params: `format` (of `WRITERS`), `target` and `traces` (paths; traces as `npz`), `headers` of the traces, `files` with their
+        params: `format` (of `WRITERS`), `target` and `traces` (paths; traces as `npz`) and `headers` of the traces. Also `files` with their
             `recordings`, and `session`, what the file says of the session.
         workdir: not used.
         report: takes the share that was read.
@@ -222,7 +222,7 @@ def write(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
 
 
 def _samples_of(file: Mapping[str, Any]) -> tuple[list[Signal], list[int]]:
-    """The samples of a file's recordings within the session as signals, and which recordings it no longer gives."""
+    """Return the samples of a file's recordings within the session as signals, and which recordings it no longer gives."""
     logs, missing = samples_within(file)
     return [
         Signal(row["id"], row["hemisphere"], "lfp", log.channel, log.unit, log.t_s, log.values, log.rates_hz, _pieces(log))
@@ -237,7 +237,7 @@ def _pieces(log: SampleLog) -> tuple[tuple[int, int, float], ...]:
 
 
 def samples_within(file: Mapping[str, Any]) -> tuple[list[tuple[Mapping[str, Any], SampleLog]], list[int]]:
-    """The samples of a file's recordings within the session.
+    """Return the samples of a file's recordings within the session.
 
     Args:
         file: as `app.overview.samples.files_of` gives it.
@@ -263,9 +263,9 @@ def samples_within(file: Mapping[str, Any]) -> tuple[list[tuple[Mapping[str, Any
     return found, [r["id"] for r in wanted if r["fingerprint"] not in by_content]
 
 
-# What the screen needs of a session's samples, written once in a limited child: samples, their extremes per bin, the spectrogram.
+# Data for the screen from a session's samples, written once in a limited child: samples, their extremes per bin, the spectrogram.
 #
-# The child knows no settings and no database. `service` beside this is its caller's side, and reads the folder that is written here.
+# The child knows no settings and no database. `signals` is its caller's side, and reads the folder that is written here.
 
 HEADER = "channels.json"
 
@@ -318,7 +318,7 @@ def _written(log: SampleLog, target: Path, number: int) -> dict[str, Any]:
 
 
 def _stretches(log: SampleLog) -> Iterator[Stretch]:
-    """Gap-free pieces with the rate that their own times have."""
+    """Yield gap-free pieces with the rate that their own times have."""
     for first, stop in zip(log.starts, [*log.starts[1:], log.values.size], strict=True):
         if stop - first > 1:
             rate = (stop - first - 1) / (log.t_s[stop - 1] - log.t_s[first])

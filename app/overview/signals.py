@@ -34,7 +34,7 @@ BUILD = "app.overview.samples_compute:build"
 VERSION = 1
 """Raised when the child writes something else for the same samples."""
 KEPT = 50
-"""Sessions in the cache; the least recently seen ones go first, but none that somebody saw within `KEPT_S`."""
+"""Sessions in the cache; the least recently seen ones go first, but none that was seen within `KEPT_S`."""
 KEPT_S = 3600.0
 MOST_COLUMNS = 400
 HEADER = "channels.json"
@@ -65,7 +65,7 @@ class SignalWindow:
     """A channel between two times.
 
     Attributes:
-        begin_s, end_s: of the window. resolution_s: width of a bin; 0 where every sample stands.
+        begin_s, end_s: of the window. resolution_s: width of a bin; 0 where every sample is given.
         t_s: middle of each bin, or time of each sample, [n]. low, high: extremes of a bin, NaN where it has no sample; equal for samples.
         power: the spectrogram of the window.
     """
@@ -89,7 +89,7 @@ class Signals:
     headers: tuple[dict[str, Any], ...]
 
     def window(self, number: int, begin_s: float | None, end_s: float | None, points: int) -> SignalWindow:
-        """A channel between two times, drawn in at least `points` bins, or sample by sample where there are not more than that many.
+        """Return a channel between two times, drawn in at least `points` bins, or sample by sample where there are not more than that many.
 
         Raises:
             NotFound: the session has no such channel. Invalid: the window is empty or outside the recording.
@@ -115,7 +115,7 @@ class Signals:
         return SignalWindow(channel, begin, end, 0.0 if level is None else levels[level].width_s, t_s, low, high, power)
 
     def _samples(self, number: int, begin: float, end: float) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
-        """Every sample; an empty one stands where samples are missing, so that no line bridges them."""
+        """Return every sample; missing samples become an empty one, so that no line bridges them."""
         t_s = np.load(self.folder / f"{number}-t.npy", mmap_mode="r")
         values = np.load(self.folder / f"{number}-v.npy", mmap_mode="r")
         inside = np.flatnonzero((t_s >= begin) & (t_s <= end))
@@ -137,7 +137,7 @@ class Signals:
 
 
 def signals_of(db: Session, session: StudySession, caller: Caller) -> Signals:
-    """The channels of a session; the first call reads its files.
+    """Return the channels of a session; the first call reads its files.
 
     Raises:
         Forbidden: the caller may not know yet what ran. Conflict: a stored file is missing, or no recording of the session has
@@ -165,7 +165,7 @@ def signals_of(db: Session, session: StudySession, caller: Caller) -> Signals:
 
 
 def _folder(session: StudySession, wanted: Sequence[dict[str, Any]]) -> Path:
-    """Named by all that decides what stands in it: the files, what of them is the session's, and the programs that read them."""
+    """Name the folder by all that determines its content: the files, what of them is the session's, and the programs that read them."""
     pins = json.dumps([session.id, wanted, DECODE_VERSION, VERSION, FIRST], sort_keys=True)
     return _cache() / hashlib.sha256(pins.encode()).hexdigest()
 
@@ -185,7 +185,7 @@ def _build(session: StudySession, wanted: Sequence[dict[str, Any]], folder: Path
         try:
             target.rename(folder)
         except OSError as error:
-            # two who asked at once wrote the same; whoever is second leaves the first one's
+            # two requests at once write the same; the second keeps the first one's
             if not (folder / HEADER).exists():
                 raise Conflict("The samples could not be kept.", "Ask the administrator whether the data folder is full.") from error
 

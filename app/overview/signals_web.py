@@ -64,7 +64,7 @@ class SignalOut(Model):
     channel: int
     begin_s: float
     end_s: float
-    resolution_s: float = Field(description="Width of a bin; 0 where every sample stands.")
+    resolution_s: float = Field(description="Width of a bin; 0 where every sample is given.")
     t_s: list[float] = Field(description="Middle of each bin, or time of each sample, seconds from the session's start.")
     low: list[float | None] = Field(description="Lowest sample of each bin; null where samples are missing.")
     high: list[float | None]
@@ -75,7 +75,7 @@ class SignalOut(Model):
 
 
 def signal_out(signals: Signals, window: SignalWindow) -> SignalOut:
-    """A window, and what other channels there are."""
+    """Convert a window, and list the other channels."""
     power = window.power
     return SignalOut(
         channels=[SignalChannelOut.model_validate(c) for c in signals.channels],
@@ -96,7 +96,7 @@ def signal_out(signals: Signals, window: SignalWindow) -> SignalOut:
 
 
 def decibel(density: NDArray[np.float32]) -> NDArray[np.float64]:
-    """10 log10 of a density, to a tenth; NaN where it is 0 or not known."""
+    """Convert a density to 10 log10, to a tenth; NaN where it is 0 or not known."""
     with np.errstate(divide="ignore", invalid="ignore"):
         found = np.round(10 * np.log10(density.astype(np.float64)), 1)
     return np.where(np.isfinite(found), found, np.nan)
@@ -116,7 +116,7 @@ TABLE_ROWS = 60
 
 
 def chart_figure(window: SignalWindow, span_s: tuple[float, float], low_hz: float, high_hz: float) -> dict[str, Any]:
-    """The chart: samples above, power below, minutes of the session along both, from and to `span_s`."""
+    """Build the chart: samples above, power below, minutes of the session along both, from and to `span_s`."""
     unit = window.channel.unit
     x, y = _line(window)
     power, (bottom, top) = _decibel(window.power)
@@ -156,7 +156,7 @@ def chart_figure(window: SignalWindow, span_s: tuple[float, float], low_hz: floa
 
 
 def picture_of(window: SignalWindow, low_hz: float, high_hz: float) -> Markup:
-    """The drawing: the same, with the beta band marked in words."""
+    """Draw the window as a static picture, with the beta band marked in words."""
     unit = written(window.channel.unit)
     span = (window.begin_s / 60, window.end_s / 60)
     known = np.concatenate([window.low, window.high])
@@ -187,7 +187,7 @@ def picture_of(window: SignalWindow, low_hz: float, high_hz: float) -> Markup:
 
 
 def table_of(window: SignalWindow, low_hz: float, high_hz: float) -> list[list[Cell]]:
-    """Rows of the table behind: begin (s), lowest and highest sample, mean density in the beta band, for at most `TABLE_ROWS` pieces."""
+    """List the rows of the table: begin (s), lowest and highest sample, mean density in the beta band, for at most `TABLE_ROWS` pieces."""
     power = fewer_columns(window.power, window.begin_s, window.end_s, TABLE_ROWS)
     inside = (power.hz >= low_hz) & (power.hz <= high_hz)
     rows: list[list[Cell]] = []
@@ -205,7 +205,7 @@ def table_of(window: SignalWindow, low_hz: float, high_hz: float) -> list[list[C
 
 
 def _line(window: SignalWindow) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Times (s) and values of the line: each sample, or each bin's lowest and highest one after the other."""
+    """Return times (s) and values of the line: each sample, or each bin's lowest and highest one after the other."""
     if window.resolution_s == 0:
         return window.t_s, window.low
     return np.repeat(window.t_s, 2), np.stack([window.low, window.high], axis=1).reshape(-1)
@@ -234,7 +234,7 @@ Form = Annotated[SampleFormat, Query(alias="format", description="Parquet: a row
 
 @samples_api.get("/sessions/{session_id}/samples", response_class=StreamingResponse, responses=ANSWERS)
 def read_samples(session: CurrentSession, db: Db, caller: CurrentCaller, form: Form = SampleFormat.PARQUET) -> StreamingResponse:
-    """Every sample of a session's recordings with its time from the session's start, and every 2 s trace, as one file."""
+    """Return every sample of a session's recordings with its time from the session's start, and every 2 s trace, as one file."""
     found = session_samples(db, session, form, caller)
     headers = {"Content-Disposition": f'attachment; filename="{found.name}"', "Content-Length": str(found.size)}
     return StreamingResponse(_chunks(found.content), media_type=MEDIA_TYPES[form], headers=headers)
@@ -263,9 +263,9 @@ def read_signal(
     end_s: Time = None,
     points: Points = 1000,
 ) -> SignalOut:
-    """A channel of raw samples between two times: extremes per bin (every sample, where there are few), and the spectrogram.
+    """Return a channel of raw samples between two times: extremes per bin (every sample, where there are few), and the spectrogram.
 
-    The first request for a session decodes its files, which may take seconds; what was made of them is kept.
+    The first request for a session decodes its files, which may take seconds; the results are cached.
     """
     signals = signals_of(db, session, caller)
     return signal_out(signals, signals.window(channel, begin_s, end_s, points))
@@ -286,11 +286,11 @@ def signal_figure(
     begin_s: Time = None,
     end_s: Time = None,
 ) -> JSONResponse:
-    """The chart of a channel between two times, its title, and the names of all channels."""
+    """Return the chart of a channel between two times, its title, and the names of all channels."""
     signals = signals_of(db, session, caller)
     window = signals.window(channel, begin_s, end_s, POINTS)
     settings = session.visit.participant.current_settings
-    # all of the session unless a stretch is asked for, as the charts beside it
+    # all of the session unless a stretch is asked for, as the charts next to it
     span = (-settings.window * settings.period_s if begin_s is None else begin_s, session.duration_s if end_s is None else end_s)
     content: dict[str, Any] = {
         "figure": chart_figure(window, span, settings.beta_low_hz, settings.beta_high_hz),
@@ -304,7 +304,7 @@ def signal_figure(
 def signal_page(
     request: Request, session: CurrentSession, db: Db, caller: CurrentCaller, channel: str = "0", begin_s: str = "", end_s: str = ""
 ) -> HTMLResponse:
-    """A drawing of a channel between two times, and the numbers behind it."""
+    """Show a drawing of a channel between two times, and the numbers behind it."""
     settings = session.visit.participant.current_settings
     low_hz, high_hz = settings.beta_low_hz, settings.beta_high_hz
     signals = signals_of(db, session, caller)
@@ -333,7 +333,7 @@ def signal_page(
 
 
 def resolution(window: SignalWindow) -> str:
-    """How much of the samples a figure shows, in words."""
+    """Describe how much of the samples a figure shows."""
     rates = " and ".join(f"{r:g}" for r in window.channel.rates_hz)
     shown = "every sample" if window.resolution_s == 0 else f"lowest and highest sample of every {1000 * window.resolution_s:.0f} ms"
     named, samples = written(f"{window.channel.channel} · {window.channel.unit}"), number(window.channel.samples)
@@ -346,7 +346,7 @@ def _named(channels: Any) -> list[tuple[int, str]]:
 
 
 def _seconds(text: str) -> float | None:
-    """What was typed; nothing where it is no number, as an empty field."""
+    """Parse a typed number; None where it is no number, as for an empty field."""
     try:
         value = float(text.replace(",", "."))
     except ValueError:

@@ -1,4 +1,4 @@
-"""Where every participant stands, and what somebody should do."""
+"""State of every participant, and what is to be done."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from app.platform.numbers import counted
 from app.tables.jobs import Job
 from app.tables.participants import Participant
 
-# What somebody may have to do for a participant, who may do it, and where: values; `state` says what is due, `wording` the sentences.
+# Tasks for a participant, who may do them, and where: values; `state` says what is due, `wording` the sentences.
 
 
 class Actor(StrEnum):
-    """Whose turn it is."""
+    """Person whose turn it is."""
 
     CLINICIAN = "clinician"
     COORDINATOR = "coordinator"
@@ -28,7 +28,7 @@ class Actor(StrEnum):
 
 
 class Task(StrEnum):
-    """What is to be done, in the order in which one thing waits for the other."""
+    """Task, in the order in which one thing waits for the other."""
 
     ADD_VISIT = "add_visit"
     STATE_AMPLITUDE = "state_amplitude"
@@ -65,7 +65,7 @@ class NextStep:
     urgent: bool = True
 
 
-# How far the visits with a signed plan are: sessions planned, held, and those whose logs are missing. What is to be done: `state`.
+# How far the visits with a signed plan are: sessions planned, done, and those whose logs are missing. What is to be done: `state`.
 
 
 @dataclass(frozen=True)
@@ -73,10 +73,9 @@ class VisitProgress:
     """One visit with a signed plan.
 
     Attributes:
-        planned: sessions of the plan. held: those that a confirmed session fills.
-        logs_missing: those that none fills although the day is past; 0 before it, of a visit without a date, and of a
-            locked one, which takes no data any more.
-        tested: those held that ran a policy, which nobody is told while the key is sealed (0). sealed: whether it is.
+        planned: sessions of the plan. `held`: those that a confirmed session fills.
+        logs_missing: those that none fills although the day is past; 0 before it, of a visit without a date, and of a locked one.
+        tested: those filled that ran a policy; 0 while the key is sealed, which hides it. sealed: whether it is.
     """
 
     visit_id: int
@@ -90,9 +89,9 @@ class VisitProgress:
 
 
 def visit_progress(db: Session, participant_ids: Sequence[int], today: dt.date) -> dict[int, list[VisitProgress]]:
-    """By participant: its visits with a signed plan, by number; participants without one have none.
+    """Return by participant its visits with a signed plan, by number; participants without one have none.
 
-    Plans of versions that kept no limits have no slots to fill and are left out.
+    Plans of versions that kept no limits have no slots to fill and are ignored.
     """
     found: dict[int, list[VisitProgress]] = {i: [] for i in participant_ids}
     for row in slots.slots_filled(db, participant_ids):
@@ -109,7 +108,7 @@ PHASES = (("I", "Collect"), ("II", "Learn"), ("III", "Evaluate"), ("IV", "Plan")
 
 @dataclass
 class State:
-    """Where a participant stands.
+    """State of a participant.
 
     Attributes:
         sessions, excluded, without_qoc: counts of confirmed sessions; the last one of those that are not excluded.
@@ -156,12 +155,12 @@ class State:
 
     @property
     def attention(self) -> list[NextStep]:
-        """What somebody should see to, where it is not merely the next thing to do."""
+        """Steps that need attention, beyond being merely the next thing to do."""
         return [s for s in self.steps if s.urgent]
 
     @property
     def blocked_by(self) -> NextStep | None:
-        """What the next visit waits for first; None where it can be held."""
+        """Step that the next visit waits for first; None where it can take place."""
         return next((s for s in self.steps if s.blocks_visit), None)
 
     @property
@@ -172,12 +171,12 @@ class State:
 
     @property
     def grown(self) -> bool:
-        """Whether sessions came after the last evaluation's snapshot."""
+        """True where sessions came after the last evaluation's snapshot."""
         return bool(self.snapshot_at and self.newest_session and self.newest_session > self.snapshot_at)
 
 
 def states(db: Session, participants: Sequence[Participant], today: dt.date) -> dict[int, State]:
-    """Where each participant stands, by row number."""
+    """Determine the state of each participant, by row number."""
     ids = [p.id for p in participants]
     found = {i: State() for i in ids}
     _study(db, ids, found, today)
@@ -190,7 +189,7 @@ def states(db: Session, participants: Sequence[Participant], today: dt.date) -> 
 
 
 def next_steps(participant: Participant, state: State) -> list[NextStep]:
-    """Everything that is to be done for a participant, what others wait for first."""
+    """List everything that is to be done for a participant, what others wait for first."""
     return list(_steps(participant, state))
 
 
@@ -284,17 +283,17 @@ _TASKS: dict[Task, str | Callable[[int], str]] = {
 
 
 def what(step: NextStep) -> str:
-    """What is to be done."""
+    """Describe what is to be done."""
     said = _TASKS[step.task]
     return said if isinstance(said, str) else said(step.count)
 
 
 def progress(visit: VisitProgress) -> str:
-    """How far a visit with a signed plan is."""
+    """Describe how far a visit with a signed plan is."""
     missing = f", {counted(visit.logs_missing, 'log')} missing" if visit.logs_missing else ""
     return f"Visit {visit.number}: {visit.held} of {counted(visit.planned, 'planned session')} held{missing}"
 
 
 def in_days(days: int) -> str:
-    """How far a day lies ahead."""
+    """Describe how far ahead a day is."""
     return {0: "today", 1: "tomorrow"}.get(days, f"in {days} days")

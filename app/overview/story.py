@@ -25,15 +25,15 @@ _TICKS = 8
 _AIR = 0.03
 """Of what the axis shows, left and right of it."""
 _APART = dt.timedelta(minutes=20)
-"""Between sessions of a visit whose times nobody stated, so that they stand beside each other in their order."""
+"""Time between sessions of a visit whose times are not stated, so that they are drawn side by side in their order."""
 
 
 def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[SettingsVersion], today: dt.date) -> Chart | None:
-    """Every session that counts and that the reader may know of, as a dot in a panel per quantity, and every dated visit, also one without
-    such a session; None with neither on a known day.
+    """Plot every session that counts and that the reader may know of, as a dot in a panel per quantity, and every dated visit. None with
+    neither on a known day.
 
     Args:
-        held: sessions as the caller may know them. visits: with their dates. versions: of the settings, by number.
+        `held`: sessions as the caller may know them. visits: with their dates. versions: of the settings, by number.
         today: the first visit from then on is marked as the next one.
     """
     days = {v.id: v.date for v in visits}
@@ -68,7 +68,7 @@ def story_chart(held: Evidence, visits: Sequence[Visit], versions: Sequence[Sett
 
 
 def _moment(session: Facts, days: Mapping[int, dt.date | None]) -> dt.datetime | None:
-    """When a session began; its place within the visit's day where nobody stated the time."""
+    """Return when a session began; its place within the visit's day where no time is stated."""
     if session.started_at is not None:
         return session.started_at
     day = days.get(session.visit_id)
@@ -76,7 +76,7 @@ def _moment(session: Facts, days: Mapping[int, dt.date | None]) -> dt.datetime |
 
 
 def _places(dated: Sequence[tuple[dt.datetime, Facts]]) -> list[dt.datetime]:
-    """Where sessions stand on the axis: those of a visit side by side in their order about the visit's day, for months hide hours."""
+    """Place sessions on the axis: those of a visit side by side in their order about the visit's day, for months hide hours."""
     by_visit: dict[int, list[int]] = {}
     for i, (_, s) in sorted(enumerate(dated), key=lambda row: (row[1][0], row[1][1].ordinal)):
         by_visit.setdefault(s.visit_id, []).append(i)
@@ -109,7 +109,7 @@ def _quantities(held: Evidence, sessions: Sequence[Facts]) -> list[tuple[str, st
 def _panels(
     dated: Sequence[tuple[dt.datetime, Facts]], places: Sequence[dt.datetime], panels: Sequence[tuple[str, str, list[float | None]]]
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """A trace and an axis per quantity, the first one on top; one empty axis without any quantity."""
+    """Build a trace and an axis per quantity, the first one on top; one empty axis without any quantity."""
     x, began = [place.isoformat() for place in places], [f"{moment:%Y-%m-%d %H:%M}" for moment, _ in dated]
     colours, shapes = [colour(s.controller.value) for _, s in dated], [SYMBOLS[s.controller.value] for _, s in dated]
     pages = [f"/sessions/{s.session_id}" for _, s in dated]
@@ -163,7 +163,7 @@ class _Stand:
 def _visits(
     dated: Sequence[tuple[dt.datetime, Facts]], places: Sequence[dt.datetime], visits: Sequence[Visit], today: dt.date
 ) -> list[_Stand]:
-    """Every visit that has a day, from its own row or from its sessions, in the order of the axis."""
+    """List every visit that has a day, from its own row or from its sessions, in the order of the axis."""
     spans: dict[int, list[tuple[dt.datetime, dt.datetime]]] = {}
     for (moment, s), place in zip(dated, places, strict=True):
         spans.setdefault(s.visit_id, []).append((place, moment))
@@ -184,14 +184,14 @@ def _visits(
 
 
 def _range(places: Sequence[dt.datetime], stands: Sequence[_Stand], versions: Sequence[SettingsVersion]) -> list[str]:
-    """What the axis shows: every dot and every line, which the library would not look at, with some air."""
+    """Return the range of the axis: every dot and every line, which the library would not look at, with some air."""
     moments = [*places, *(v.at for v in stands), *(v.created_at for v in versions if v.version > 1)]
     air = max((max(moments) - min(moments)) * _AIR, dt.timedelta(hours=1))
     return [(min(moments) - air).isoformat(), (max(moments) + air).isoformat()]
 
 
 def _days(stands: Sequence[_Stand]) -> dict[str, Any]:
-    """Ticks where visits stand, with their days: a calendar's would date sessions that stand beside their visit's day by another one."""
+    """Place ticks at visits, with their days: a calendar's ticks would give another day to sessions drawn next to their visit's day."""
     step = -(-len(stands) // _TICKS)
     # counted from the last, so that the newest has its day, and the next one whatever its place
     shown = [v for i, v in enumerate(reversed(stands)) if i % step == 0][::-1]
@@ -204,7 +204,7 @@ def _title(name: str, unit: str) -> dict[str, Any]:
 
 
 def _marks(stands: Sequence[_Stand], versions: Sequence[SettingsVersion]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """A line per visit, the next one's in colour with its words, and a dashed one with its words where settings were changed."""
+    """Draw a line per visit, the next one's in colour with its words, and a dashed one with its words where settings were changed."""
     lines, labels = [], []
     for text, at, ink, dash, width in (
         *((f"next visit: {v.number}" if v.is_next else "", v.line, ACCENT if v.is_next else GRID, "solid", 1 + v.is_next) for v in stands),

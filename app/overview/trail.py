@@ -1,4 +1,4 @@
-"""Which part of the audit trail somebody reads who does not read all of it."""
+"""Readable part of the audit trail, for a reader who does not read all of it."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _POLICY = re.compile(r"policies/([0-9]+)(?:/(.*))?")
 
 
 def sentence(event: AuditEvent, names: Names, sealed: bool = False) -> str:
-    """What a row of the trail means, without its subject: the actor stands beside it.
+    """Describe a row of the trail, without its subject: the actor is shown next to it.
 
     Args:
-        sealed: whether it is of a blinded plan whose key is sealed: the sentence tells no policy then.
+        sealed: whether it is of a blinded plan whose key is sealed: the sentence names no policy then.
     """
     if sealed and event.entity == "bundle_release":
         return SEALED_ACT
@@ -48,12 +48,12 @@ def sentence(event: AuditEvent, names: Names, sealed: bool = False) -> str:
 
 
 def headline(events: Sequence[AuditEvent]) -> AuditEvent:
-    """Of the changes of one request, the one that names the act: rows that merely hang on others do not."""
+    """Choose the change of one request that names the act: rows that merely hang on others do not."""
     return min(events, key=lambda e: (_ORDER.index(e.entity) if e.entity in _ORDER else len(_ORDER), e.id))
 
 
 def _recorded(event: AuditEvent, names: Names) -> str:
-    """What changed no row: looks, exports, refusals, false times that were looked into."""
+    """Describe an event that changed no row: looks, exports, refusals, false times that were looked into."""
     number = int(event.entity_id) if event.entity_id.isdecimal() else 0
     said: Mapping[tuple[str, str], Callable[[], str]] = {
         ("view", "results"): lambda: f"looked at the results of {_which(event.entity_id, names)}",
@@ -77,7 +77,7 @@ def _recorded(event: AuditEvent, names: Names) -> str:
 
 
 def _which(path: str, names: Names) -> str:
-    """Whose results, and which, by the address of their page."""
+    """Name the results, and whose, by the address of their page."""
     path = path.removeprefix("/api/v1").removesuffix(".csv").removesuffix(".svg")
     if not path.startswith("/participants/"):
         which = path.strip("/").removeprefix("analyses").replace("-", " ").replace("/", " ").strip()
@@ -102,7 +102,7 @@ def _plainly(event: AuditEvent) -> str:
     return f"{verb} a row of {event.entity.replace('_', ' ')}"
 
 
-# What the audit trail shows of its rows: acts in words with every row that they changed, and nothing of what is hidden from a reader.
+# Acts of the audit trail in words, with every row that they changed; nothing of what is hidden from a reader.
 
 _ARM_COLUMNS = ("controller", "policy_id")
 _HIDDEN = "hidden from you"
@@ -120,15 +120,15 @@ _KEPT = {
     "stored_file": frozenset({"sha256", "size", "created_at"}),
     "plan": frozenset(c.name for c in Plan.__table__.columns) - {"seed", "rules"},  # from which the order is drawn
 }
-"""Columns that tell nobody what ran, of tables that would: all that is shown of their rows while the key of a blinded plan is sealed."""
+"""Columns that never reveal what ran; only these are shown of rows that would while the key of a blinded plan is sealed."""
 
 
 @dataclass(frozen=True)
 class Act:
-    """What one request did: in words, by its most telling change, and every row that it changed.
+    """Act of one request: in words, by its most telling change, and every row that it changed.
 
     Attributes:
-        event: the change that names it. said: in words. reason: why, as far as it may be shown.
+        event: the change that names it. `said`: in words. reason: why, as far as it may be shown.
         rows: each change with column, value before, value after.
     """
 
@@ -139,7 +139,7 @@ class Act:
 
 
 def acts(db: Session, events: Sequence[AuditEvent], caller: Caller) -> list[Act]:
-    """The events of a page, those of one request together; newest first."""
+    """Group the events of a page by request; newest first."""
     names = trail_rows.audit_names(db, events)
     sealed = trail_rows.sealed_events(db, events) if not caller.is_system else frozenset()
     found = []
@@ -163,7 +163,7 @@ class Line:
 
 
 def lines(db: Session, events: Sequence[AuditEvent], caller: Caller) -> list[Line]:
-    """The events as a table has them, one after another. Under a sealed key nobody is told what ran, the command line neither."""
+    """List the events one by one, as a table has them. Under a sealed key what ran is hidden from all, the command line too."""
     names, sealed = trail_rows.audit_names(db, events), trail_rows.sealed_events(db, events)
     return [
         Line(e, sentence(e, names, e.id in sealed), None if _hides_reason(e, sealed) else e.reason, changes(db, e, caller, e.id in sealed))
@@ -172,12 +172,12 @@ def lines(db: Session, events: Sequence[AuditEvent], caller: Caller) -> list[Lin
 
 
 def _hides_reason(event: AuditEvent, sealed: frozenset[int]) -> bool:
-    """Earlier versions wrote a bundle's limits there."""
+    """Check whether the reason must be hidden: earlier versions wrote a bundle's limits there."""
     return event.id in sealed and event.entity in ("bundle_release", "stored_file")
 
 
 def changes(db: Session, event: AuditEvent, caller: Caller, sealed: bool) -> list[tuple[str, str | None, str | None]]:
-    """Column, value before, value after of what an event changed; arms only through the blinding gate.
+    """List column, value before and value after of an event's changes; arms only through the blinding gate.
 
     Args:
         sealed: whether the row is one of a blinded plan whose key is sealed, or of its sessions.
@@ -203,7 +203,7 @@ def _may_know_arm(db: Session, session_id: str, caller: Caller) -> bool:
 
 
 def _short(value: Any) -> str | None:
-    """A value as text; long ones are cut, the database has them whole."""
+    """Write a value as text; long ones are cut, the database has them whole."""
     if value is None:
         return None
     text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
@@ -216,13 +216,13 @@ COLUMNS = ("number", "time_utc", "who", "what", "reason", "action", "table", "ro
 
 
 def as_csv(db: Session, within: ColumnElement[bool], wanted: TrailFilter, caller: Caller) -> Iterator[str]:
-    """The rows that match, newest first, a piece at a time, so that a long trail needs no more memory than a short one.
+    """Yield the rows that match, newest first, a piece at a time, so that a long trail needs no more memory than a short one.
 
     The export is recorded before the first piece. The caller commits.
     """
     stated = wanted.stated()
     if "words" in stated:
-        stated["words"] = "stated"  # what somebody types may be a name
+        stated["words"] = "stated"  # typed words may be a name
     record(db, "export", "audit", "trail", {"filters": stated})
     return in_pieces(COLUMNS, _batches(db, within, wanted, caller))
 

@@ -1,4 +1,4 @@
-"""What a change of a row means to a reader: each audited table has its sentence, without the actor, who stands beside it."""
+"""Meaning of a row's change for a reader: each audited table has its sentence, without the actor, who is shown next to it."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ _ENTERED = {
 
 
 def with_article(words: str) -> str:
-    """Words after "a" or "an"."""
+    """Put "a" or "an" before words."""
     sounds_open = words[:1].lower() in "aeiou" and not words.lower().startswith(("uni", "use", "one", "eu"))
     return f"{'an' if sounds_open else 'a'} {words}"
 
 
 def _taken_back(before: Row, after: Row) -> bool:
-    """Whether a change marks a row as one that counts no more."""
+    """Check whether a change marks a row as removed."""
     return bool(after.get("removed_at")) and not before.get("removed_at")
 
 
 def _key(before: Row, after: Row, name: str) -> int | None:
-    """A foreign key of a row; the one that it had before where what it named was deleted."""
+    """Return a foreign key of a row; the one that it had before where what it named was deleted."""
     now: int | None = after.get(name)
     was: int | None = before.get(name)
     return was if now is None else now
 
 
 def _left(before: Row, after: Row, name: str) -> bool:
-    """Whether what a row belonged to was deleted, and the row stays."""
+    """Check whether what a row belonged to was deleted, and the row stays."""
     return bool(after) and after.get(name) is None and before.get(name) is not None
 
 
@@ -249,7 +249,7 @@ def _event_revision(_before: Row, after: Row, names: Names) -> str:
 
 
 def about(row: Row, names: Names) -> str:
-    """What a data query is about: a value in words, and where it stands."""
+    """Describe the subject of a data query: a value in words, and its record."""
     field = str(row["field"])
     value = ASKED_ABOUT.get(field, field.replace("_", " "))
     whose = names.participant(row["participant_id"])

@@ -1,4 +1,4 @@
-"""Names of the rows that the audit trail tells of, by their numbers."""
+"""Names of the rows in the audit trail, by their numbers."""
 
 from __future__ import annotations
 
@@ -52,73 +52,73 @@ class Names:
     snapshots: Mapping[int, int] = field(default_factory=dict)
 
     def participant(self, number: int | None) -> str:
-        """Its code."""
+        """Return a participant's code."""
         return self.participants.get(number or 0, f"participant {number}")
 
     def visit(self, number: int | None) -> str:
-        """A visit with its participant."""
+        """Name a visit with its participant."""
         if number is None or number not in self.visits:
             return f"a visit that is gone ({number})"
         ordinal, participant = self.visits[number]
         return f"visit {ordinal} of {self.participant(participant)}"
 
     def session(self, number: int | None, row: Row | None = None) -> str:
-        """A session with its visit; `row` where the session may be gone."""
+        """Name a session with its visit; `row` where the session may be gone."""
         place = self.sessions.get(number or 0) or ((row["ordinal"], row["visit_id"]) if row and "visit_id" in row else None)
         return f"session {place[0]} of {self.visit(place[1])}" if place else f"session {number}"
 
     def policy(self, number: int) -> str:
-        """A policy with its participant."""
+        """Name a policy with its participant."""
         name, participant = self.policies.get(number, (f"policy {number}", None))
         return f"policy {name} of {self.participant(participant)}" if participant is not None else name
 
     def plan(self, number: int) -> str:
-        """A plan with its visit."""
+        """Name a plan with its visit."""
         visit = self.plans.get(number)
         return f"plan {number}" + (f" for {self.visit(visit)}" if visit is not None else "")
 
     def slot(self, number: int | None, plan: int) -> str:
-        """A planned session with its plan; the plan alone where none is named."""
+        """Name a planned session with its plan; the plan alone where none is named."""
         item = self.items.get(number or 0)
         return f"session {item[0]} of {self.plan(item[1])}" if item else self.plan(plan)
 
     def event(self, number: int) -> str:
-        """Whose adverse event, and at which visit."""
+        """Name the participant of an adverse event, and the visit."""
         participant, visit = self.events.get(number, (None, None))
         return self.at(participant, visit)
 
     def at(self, participant: int | None, visit: int | None) -> str:
-        """A participant, at a visit where one is named."""
+        """Name a participant, at a visit where one is named."""
         known = self.visits.get(visit or 0)
         return self.participant(participant) + (f" at visit {known[0]}" if known else "")
 
     def sweep(self, number: int) -> str:
-        """A sweep with its participant."""
+        """Name a sweep with its participant."""
         name, participant = self.sweeps.get(number, (f"sweep {number}", None))
         return f"{name} of {self.participant(participant)}" if participant is not None else name
 
     def person(self, number: int | None) -> str:
-        """Somebody's address."""
+        """Return a person's address."""
         return self.people.get(number or 0, f"account {number}")
 
     def place(self, study: int | None, site: int | None) -> str:
-        """A study, and a site of it where one is named."""
+        """Name a study, and a site of it where one is named."""
         which = f"study {self.studies.get(study or 0, study)}"
         return which if site is None else f"{which}, site {self.sites.get(site, site)}"
 
 
-# Queries of the audit trail: the rows that a reader asks for, names of what they tell of, and which of them hide what ran.
+# Queries of the audit trail: the rows that a reader asks for, names of their subjects, and which of them hide what ran.
 
 _BATCH = 500
 _SEALED_BY = {"session": "visit_id", "plan_item": "plan_id", "session_proposal": "session_id", "session_conditions": "session_id",
               "bundle_release": "plan_item_id", "stored_file": "sha256", "plan": "id", "adverse_event": "visit_id"}  # fmt: skip
-"""Tables whose rows would tell what ran under a sealed key, and the column by which they belong to a visit, plan, session, or file."""
+"""Tables whose rows would reveal what ran under a sealed key, and the column by which they belong to a visit, plan, session, or file."""
 
 
 def audit_events(
     db: Session, within: ColumnElement[bool], wanted: TrailFilter, limit: int, offset: int
 ) -> tuple[Sequence[AuditEvent], int]:
-    """A page of the audit trail, newest first, and how many rows match. `within`: rows that may be read."""
+    """Load a page of the audit trail, newest first, and how many rows match. `within`: rows that may be read."""
     query = _matching(db, within, wanted)
     rows = db.scalars(query.order_by(AuditEvent.id.desc()).limit(limit).offset(offset)).all()
     if (rows and len(rows) < limit) or (not rows and offset == 0):
@@ -127,7 +127,7 @@ def audit_events(
 
 
 def batches(db: Session, within: ColumnElement[bool], wanted: TrailFilter) -> Iterator[Sequence[AuditEvent]]:
-    """All rows that match, newest first, some hundred at a time: those that stand in the trail when the first are read."""
+    """Yield all rows that match, newest first, some hundred at a time: those that are in the trail when the first are read."""
     query = _matching(db, within, wanted)
     last: int | None = None
     while True:
@@ -140,7 +140,7 @@ def batches(db: Session, within: ColumnElement[bool], wanted: TrailFilter) -> It
 
 
 def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
-    """Names of the rows that these events are about, in a query per kind of row."""
+    """Load names of the rows that these events are about, in a query per kind of row."""
     rows = [(e.entity, row) for e in events for row in (e.before, e.after) if row]
     noted = [(e.entity, int(e.entity_id)) for e in events if e.action not in ("insert", "update", "delete") and e.entity_id.isdecimal()]
     signed = [(row["subject_kind"], row["subject_id"]) for name, row in rows if name == "signature"]
@@ -150,7 +150,7 @@ def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
         return own | {int(r[c]) for _, r in rows for c in columns if r.get(c) is not None and str(r[c]).isdecimal()}
 
     def read(name: str, wanted: Collection[int], *columns: str) -> dict[int, tuple[Any, ...]]:
-        """Those of the table's rows that are still there."""
+        """Read those of the table's rows that still exist."""
         if not wanted:
             return {}
         table = Base.metadata.tables[name]
@@ -203,7 +203,7 @@ def audit_names(db: Session, events: Sequence[AuditEvent]) -> Names:
 
 
 def sealed_events(db: Session, events: Sequence[AuditEvent]) -> frozenset[int]:
-    """Those of the events that changed a blinded plan whose key is sealed, a row of it, a file of its bundles, or sessions of its visit."""
+    """Find events about a blinded plan whose key is sealed: of the plan, its rows, its bundles' files, or sessions of its visit."""
     hidden = hidden_rows(db)
     if hidden is None or not events:
         return frozenset()
@@ -211,7 +211,7 @@ def sealed_events(db: Session, events: Sequence[AuditEvent]) -> frozenset[int]:
 
 
 def hidden_rows(db: Session) -> ColumnElement[bool] | None:
-    """Condition on `AuditEvent`: rows that would tell what ran at a visit whose key is sealed; None while no key is."""
+    """Build the condition on `AuditEvent` for rows that would reveal what ran at a visit whose key is sealed; None while no key is."""
     plans = set(db.scalars(select(Plan.id).where(SEALED)))
     if not plans:
         return None
@@ -248,7 +248,7 @@ def _first(rows: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
 
 
 def _matching(db: Session, within: ColumnElement[bool], wanted: TrailFilter) -> Select[AuditEvent]:
-    """The rows of a filter. Values that are hidden from every reader are not searched either: a search that finds tells them."""
+    """Query the rows of a filter. Values that are hidden from every reader are not searched either: a hit would reveal them."""
     query: Select[AuditEvent] = select(AuditEvent).where(within)
     for column, value in (
         (AuditEvent.entity, wanted.entity),
@@ -282,13 +282,13 @@ def _midnight(day: dt.date) -> dt.datetime:
 
 
 def _mentions(db: Session, word: str, hidden: ColumnElement[bool] | None) -> ColumnElement[bool]:
-    """Whether a row's sentence, or a value of it, has a word: who, what kind of act, what it was done to, whose, why, from and to what."""
+    """Build the condition that a row's sentence, or a value of it, has a word."""
 
     def holds(value: ColumnElement[Any] | QueryableAttribute[Any]) -> ColumnElement[bool]:
         return func.coalesce(value.icontains(word, autoescape=True), false())
 
     def has_value(row: QueryableAttribute[Any]) -> ColumnElement[bool]:
-        """Names of columns are no values: every row of a session would be found by "visit"."""
+        """Search values only: names of columns are none, else every row of a session would be found by "visit"."""
         value = func.jsonb_each_text(cast(row, JSONB)).table_valued("key", "value")
         return select(value.c.key).where(value.c.value.icontains(word, autoescape=True)).exists()
 

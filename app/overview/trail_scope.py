@@ -1,4 +1,4 @@
-"""What somebody asks of the audit trail."""
+"""Search filters of the audit trail."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SHOWN_NAMES = {
 
 @dataclass(frozen=True)
 class Kind:
-    """Acts that somebody looks for together: by their action, or as a new row of a table."""
+    """Acts that are searched together: by their action, or as a new row of a table."""
 
     said: str
     actions: tuple[str, ...] = ()
@@ -52,9 +52,9 @@ KINDS = {
 
 
 class TrailFilter(Model):
-    """What is looked for; what is left empty matches all."""
+    """Filter of the trail; an empty field matches all."""
 
-    words: Text = Field("", max_length=200, description="Each must stand in the sentence or in a value.")
+    words: Text = Field("", max_length=200, description="Each must be in the sentence or in a value.")
     participant: Text = Field("", max_length=40, description="Code.")
     action: Text = Field("", max_length=20)
     entity: Text = Field("", max_length=63)
@@ -74,7 +74,7 @@ class TrailFilter(Model):
         return self
 
     def stated(self) -> dict[str, str]:
-        """What is not left empty, by name."""
+        """Return the fields that are not empty, by name."""
         return {name: str(value) for name, value in self.model_dump().items() if value not in ("", None)}
 
 
@@ -82,7 +82,7 @@ MOST_WORDS = 8
 """Each word is a look through the whole trail."""
 
 
-# Which rows of the audit trail are of a reader's studies and sites, or of a participant: by the foreign keys of what they tell of.
+# Rows of the audit trail in a reader's studies and sites, or of a participant: by the foreign keys of the rows concerned.
 
 _ROOTS = ("participant", "site", "study")
 _SIGNED = ("plan", "policy", "visit_lock", "margins_lock", "declared_confirmation")
@@ -94,9 +94,9 @@ _NUMBER = r"^[0-9]{1,9}$"
 
 
 def of_reader(caller: Caller) -> ColumnElement[bool]:
-    """Condition on `AuditEvent`: rows of the studies and sites in which the caller reads the trail.
+    """Build the condition on `AuditEvent`: rows of the studies and sites in which the caller reads the trail.
 
-    Rows of accounts, sign-ins, tokens and stored files belong to no study and are left out; so are refused sign-ins, and looks at results
+    Rows of accounts, sign-ins, tokens and stored files belong to no study and are excluded. So are refused sign-ins, and looks at results
     of several participants. A row that was moved counts where both its old and its new place do.
     """
     grants = caller.grants_with(READ_AUDIT)
@@ -106,7 +106,7 @@ def of_reader(caller: Caller) -> ColumnElement[bool]:
 
 
 def of_participants(numbers: Sequence[int]) -> ColumnElement[bool]:
-    """Condition on `AuditEvent`: rows of these participants, whatever of theirs they tell of; moved rows count for both."""
+    """Build the condition on `AuditEvent`: rows of these participants and all that is theirs; moved rows count for both."""
     participant = Base.metadata.tables["participant"]
     return _within(_Scope(select(participant.c.site_id).where(false()), (), participant.c.id.in_(list(numbers))), or_)
 
@@ -125,7 +125,7 @@ class _Scope:
     """Sites and studies, or participants alone, and conditions that lead to them.
 
     Args:
-        sites: their numbers. studies: whose own rows belong to it. participants: condition on the table, by its site when left out.
+        sites: their numbers. studies: whose own rows belong to it. participants: condition on the table, by its site by default.
     """
 
     def __init__(self, sites: Select[int], studies: Sequence[int], participants: ColumnElement[bool] | None = None) -> None:
@@ -136,7 +136,7 @@ class _Scope:
         self.tables = {name for name in AUDITED if name == "signature" or _leads_to_root(Base.metadata.tables[name])}
 
     def told(self, name: str, first: QueryableAttribute[Any], second: QueryableAttribute[Any]) -> ColumnElement[bool]:
-        """Whether a change of a row of a table is in scope, by the row as it was told."""
+        """Build the condition that a change of a row of a table is in scope, by the row as recorded."""
         row = cast(func.coalesce(first, second), JSONB)
         if name == "signature":
             number = row["subject_id"].as_integer()
@@ -145,12 +145,12 @@ class _Scope:
             return self._inside(name, row["id"].as_integer())
         key = _key(Base.metadata.tables[name])
         assert key is not None
-        # a row outlasts what its key named where that was deleted: the key is empty from then on, and what it was tells whose row it is
+        # A row outlasts what its key named where that was deleted. The key is then empty, and its earlier value says whose row it is
         named = (cast(side, JSONB)[key.name].as_integer() for side in (first, second))
         return self._inside(_parent(key), func.coalesce(*named))
 
     def recorded(self) -> ColumnElement[bool]:
-        """Whether something that changed no row is in scope: exports, downloads, looks at one participant's results."""
+        """Build the condition that an event without a changed row is in scope: exports, downloads, looks at one participant's results."""
         number = case((AuditEvent.entity_id.regexp_match(_NUMBER), cast(AuditEvent.entity_id, Integer)), else_=None)
         code = func.substring(AuditEvent.entity_id, "/participants/([^/?]+)")
         by_code = code.in_(self._codes)
@@ -158,9 +158,10 @@ class _Scope:
         return case(named | {"results": by_code}, value=AuditEvent.entity, else_=false())
 
     def _inside(self, name: str, number: ColumnElement[int], removed: bool = True) -> ColumnElement[bool]:
-        """Whether the row of a table with this number belongs to the reader's sites.
+        """Build the condition that the row of a table with this number belongs to the reader's sites.
 
-        `removed`: it may be gone since, and is looked up in the trail's own row of its removal then; what a present row names is there.
+        `removed`: it may be deleted since, and is then looked up in the trail's own row of its removal. What a present row names still
+        exists.
         """
         if name == "site":
             return number.in_(self._sites)
@@ -187,13 +188,13 @@ def _leads_to_root(table: Table) -> bool:
 
 
 def _key(table: Table) -> Column[int] | None:
-    """The foreign key that leads from a table to a participant, site or study over the fewest others; None where none does."""
+    """Find the foreign key that leads from a table to a participant, site or study over the fewest others; None where none does."""
     found = min(((length, name) for name, length in _lengths(table)), default=None)
     return None if found is None else table.c[found[1]]
 
 
 def _lengths(table: Table, seen: frozenset[str] = frozenset()) -> list[tuple[str, int]]:
-    """(column, keys up to a root) of each foreign key by number that leads to one; a key that may be empty counts as the longer way."""
+    """List (column, keys up to a root) of each foreign key by number that leads to a root; an optional key counts as longer."""
     found = []
     for key in table.foreign_keys:
         parent = key.column.table

@@ -34,7 +34,7 @@ LABELS = {
 
 @pages.get("/audit")
 def audit(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) -> HTMLResponse:
-    """Who did what, when and why, newest first; of the studies and sites in which the caller reads it."""
+    """Show who did what, when and why, newest first; of the studies and sites in which the caller reads the trail."""
     caller.require(can.READ_AUDIT)
     typed, problem = _typed(request), None
     try:
@@ -61,22 +61,22 @@ def audit(request: Request, db: Db, caller: CurrentCaller, paging: PagingQuery) 
 
 @pages.get("/audit.csv")
 def audit_table(request: Request, db: Db, caller: CurrentCaller) -> Response:
-    """The rows that the page's filters leave, all of them; the export is one of the trail's rows."""
+    """Download the rows that the page's filters leave, all of them; the export is one of the trail's rows."""
     caller.require(can.READ_AUDIT)
     pieces = as_csv(db, within(db, caller), _wanted(_typed(request)), caller)
     return stream(pieces, "audit-trail.csv")
 
 
 def within(db: Session, caller: Caller) -> ColumnElement[bool]:
-    """Condition on the trail: the rows that the caller reads."""
+    """Build the condition on the trail: the rows that the caller reads."""
     return true() if reads_whole_audit(db, caller) else of_reader(caller)
 
 
 def _typed(request: Request) -> dict[str, str]:
-    """The filters of an address that say something."""
+    """Return the filters of an address that are not empty."""
     return {name: value for name in TrailFilter.model_fields if (value := request.query_params.get(name, "").strip())}
 
 
 def _wanted(typed: dict[str, str]) -> TrailFilter:
-    """Raises Invalid, naming the field."""
+    """Parse the filters. Raises Invalid, naming the field."""
     return parse(TrailFilter, typed, LABELS)

@@ -119,7 +119,7 @@ def mismatch(settings: SettingsVersion, trace: Trace | None) -> str:
     unstated = [name for name, value in (("unit", settings.beta_unit), ("source", settings.beta_source)) if not value]
     if unstated:
         return (
-            f"Nobody has stated the {' and the '.join(unstated)} of the threshold of {settings.xi_beta:g}; this trace is in "
+            f"No person has stated the {' and the '.join(unstated)} of the threshold of {settings.xi_beta:g}; this trace is in "
             f"{trace.unit} from {trace.source}. State unit and source in the participant's settings."
         )
     wanted = (settings.beta_unit, settings.beta_source)

@@ -117,7 +117,7 @@ class CriticConfig(TrainConfig):
     critic_memory: bool = field(
         default=False,
         metadata={
-            "doc": "Whether the critics see means of past amplitudes beside the beta window (`ml.rl.memory`); the policy never does."
+            "doc": "Whether the critics see means of past amplitudes besides the beta window (`ml.rl.memory`); the policy never does."
         },
     )
 

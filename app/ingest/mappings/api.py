@@ -16,7 +16,7 @@ router = APIRouter(tags=["uploads"], responses=problems(401, 403, 404, 422))
 
 @router.get("/uploaded-files/{file_id}/preview")
 def preview(file_id: RowId, db: Db, caller: CurrentCaller) -> PreviewOut:
-    """The first lines of a table that could not be read, screened for identity, so that its columns can be named."""
+    """Return the first lines of a table that could not be read, screened for identity, so that its columns can be named."""
     return preview_out(service.waiting_table(db, file_id, caller))
 
 
@@ -31,7 +31,7 @@ def read_by_mapping(file_id: RowId, wanted: MappingIn, db: Db, caller: CurrentCa
 
 @router.get("/studies/{study_code}/column-mappings")
 def list_mappings(study_code: str, db: Db, caller: CurrentCaller) -> list[MappingOut]:
-    """Every version of a study's column mappings, newest first."""
+    """List every version of a study's column mappings, newest first."""
     study = repository.study_of(db, study_code, caller)
     return mappings_out(repository.versions(db, study.id), repository.present(db, study.id))
 

@@ -31,7 +31,7 @@ Role = Literal[
 
 
 class MappedColumnIn(Model):
-    """What one column holds; columns that are left out are removed from the table before it is stored."""
+    """Role of one column; omitted columns are removed from the table before it is stored."""
 
     number: Int = Field(ge=1, le=64, description="Of the column, from 1.")
     role: Role
@@ -41,7 +41,7 @@ class MappedColumnIn(Model):
 
 
 class MappingIn(Model):
-    """How tables with the header of a waiting table are read in its study."""
+    """Reading of tables in a study that have the header of a waiting table."""
 
     name: Text = Field(min_length=1, max_length=100, description="What such tables are called in the study.")
     header_line: Int = Field(ge=1, le=21, description="Line that names the columns; lines above it are titles.")
@@ -50,13 +50,13 @@ class MappingIn(Model):
     time_format: TimeFormat = Field(description="From the session's start, Unix time, or dates: year, day or month first.")
     zone: Text | None = Field(None, max_length=60, description="IANA name of the zone of written dates, e.g. Europe/Berlin or UTC.")
     rate_hz: Number | None = Field(None, gt=0, le=1e5, description="Samples a second, where times are numbers of samples.")
-    time_at: Literal["begin", "end"] | None = Field(None, description="Whether the time of a step stands at its begin or its end.")
+    time_at: Literal["begin", "end"] | None = Field(None, description="Whether the time of a step is that of its begin or its end.")
     columns: list[MappedColumnIn] = Field(min_length=1, max_length=64)
     reason: Text | None = Field(None, max_length=1000, description="Kept with the version and in the audit trail.")
 
 
 class RemovalIn(Model):
-    """Why a mapping is removed."""
+    """Reason why a mapping is removed."""
 
     reason: Text = Field(min_length=1, max_length=1000)
 

@@ -120,7 +120,7 @@ def remove(db: Session, mapping_id: int, reason: str, caller: Caller) -> ColumnM
     if not may_remove(caller, row.study_id, row.created_by):
         raise Forbidden(
             "Tables of every site of the study are read by this column mapping, and you work at one of them.",
-            f"Ask somebody who works at all sites of the study, or {row.created_by}, who made it.",
+            f"Ask a person who works at all sites of the study, or {row.created_by}, who made it.",
         )
     newest = repository.newest(db, row.study_id, row.header)
     if newest is None or newest.id != row.id or row.removed:

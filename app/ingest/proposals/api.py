@@ -43,19 +43,19 @@ router = APIRouter(tags=["proposals"], responses=problems(401, 403, 404, 422))
 
 @router.get("/participants/{code}/proposals")
 def list_proposals(participant: CurrentParticipant, db: Db, caller: CurrentCaller) -> list[ProposalOut]:
-    """Sessions of a participant that wait for confirmation, by visit and start."""
+    """List sessions of a participant that wait for confirmation, by visit and start."""
     return proposals_out(db, participant.id, caller)
 
 
 @router.get("/proposals/{session_id}")
 def read_proposal(session: CurrentProposal, db: Db, caller: CurrentCaller) -> ProposalOut:
-    """One proposed session; NotFound once it counts."""
+    """Return one proposed session; NotFound once it counts."""
     return _one(db, session, caller)
 
 
 @router.patch("/proposals/{session_id}", responses=problems(409))
 def correct_proposal(session: CurrentProposal, change: ProposalChange, db: Db, caller: CurrentCaller) -> ProposalOut:
-    """Correct a proposal without confirming it. 409 where somebody changed it after the stated version."""
+    """Correct a proposal without confirming it. 409 where it was changed after the stated version."""
     row = proposals.change(db, session, change, caller)
     return proposal_out(db, session, row, caller)
 
@@ -98,7 +98,7 @@ def split_proposal(session: CurrentProposal, parts: SplitIn, db: Db, caller: Cur
 
 @router.post("/proposals/{session_id}/discard", status_code=204, responses=problems(409))
 def discard_proposal(session: CurrentProposal, why: DiscardIn, db: Db, caller: CurrentCaller) -> None:
-    """Say that a proposal is no session; its recordings stay, and the same file sent again proposes it anew."""
+    """Say that a proposal is no session; its recordings stay, and the same file sent again proposes it again."""
     proposals.discard(db, session, why.version, why.reason, caller)
 
 

@@ -219,7 +219,7 @@ def _seconds(session: StudySession, text: str) -> float:
             raise ValueError(f"'{text}' is no date and time (as in {_clock(begin)})") from None
         seconds = (moment.replace(tzinfo=moment.tzinfo or UTC) - begin).total_seconds()
         if seconds < -1:
-            raise ValueError(f"{text} lies before the recording, which begins at {_clock(begin)} UTC")
+            raise ValueError(f"{text} is before the recording, which begins at {_clock(begin)} UTC")
         return max(seconds, 0.0)
     minutes, colon, seconds_text = text.partition(":")
     try:

@@ -253,8 +253,8 @@ def _move_to_visit(db: Session, session: StudySession, proposal: SessionProposal
     slot = controller_log.slot_of_recording(db, control_recording(session))
     if slot is not None and slot.planned is not None and slot.planned.sealed and visit.id not in (session.visit_id, slot.planned.visit_id):
         raise Conflict(
-            f"Session {session.id} stays at its visit: its log is of a session of visit {slot.visit_number}, whose plan's key is sealed, "
-            f"and visit {number} would show what ran.",
+            f"Session {session.id} stays at its visit. Its log is of a session of visit {slot.visit_number}, whose plan's key is sealed; "
+            f"visit {number} would show what ran.",
             "A clinician opens the key on the page of the plan; then it can be moved.",
             field="visit",
         )

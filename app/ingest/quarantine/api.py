@@ -18,7 +18,7 @@ router = APIRouter(tags=["quarantine"], responses=problems(401, 403, 404, 422))
 
 @router.get("/participants/{code}/quarantine")
 def list_quarantine(participant: CurrentParticipant, db: Db) -> list[QuarantinedOut]:
-    """Files of a participant that could not all be read, newest first, with what was decided on them."""
+    """List files of a participant that could not all be read, newest first, with the decisions on them."""
     return [quarantined_out(f) for f in repository.quarantined_files(db, participant.id)]
 
 
@@ -28,7 +28,7 @@ def list_quarantine(participant: CurrentParticipant, db: Db) -> list[Quarantined
     responses=problems(409) | {200: {"content": {"application/octet-stream": {}}, "description": "The original bytes."}},
 )
 def review(file_id: RowId, db: Db, caller: CurrentCaller) -> Response:
-    """The original bytes, which may identify the participant; the audit trail says who looked."""
+    """Return the original bytes, which may identify the participant; the audit trail records who looked."""
     return original(quarantine.review(db, file_id, caller), file_id)
 
 

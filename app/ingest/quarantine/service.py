@@ -116,7 +116,7 @@ def release_as_is(db: Session, file_id: int, reason: str, caller: Caller) -> Upl
     """Store a reviewed file as it came, decrypted. Raises Conflict: not in quarantine, or not reviewed."""
     file, _ = _held(db, file_id, caller)
     if file.reviewed_at is None:
-        raise Conflict(f"Nobody has looked at file {file.id} yet.", "Review its content first: it may name the participant.")
+        raise Conflict(f"No person has looked at file {file.id} yet.", "Review its content first: it may name the participant.")
     with _original(file) as original:
         draft = files.draft_path()
         try:

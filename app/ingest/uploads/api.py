@@ -42,18 +42,18 @@ def upload(
     file: Annotated[
         list[UploadFile],
         File(
-            description="Any number of files: RC+S session folders as zip or as loose JSON files (bundled by the folder in their names), "
-            "Percept reports, tables (CSV, Parquet), StrivePD and grasp tables."
+            description="Any number of files: RC+S session folders, Percept reports, tables (CSV, Parquet), StrivePD and grasp tables. "
+            "A session folder is a zip or loose JSON files, bundled by the folder in their names."
         ),
     ],
     participant: Annotated[Text, Form(max_length=40, description="Code of the participant.")],
-    visit: Annotated[int | None, Form(ge=1, le=2**31 - 1, description="Number of the visit; left out, it is proposed by its date.")] = None,
-    controller: Annotated[Controller | None, Form(description="What drove the stimulation; left out, sessions are proposed.")] = None,
+    visit: Annotated[int | None, Form(ge=1, le=2**31 - 1, description="Number of the visit; by default proposed by its date.")] = None,
+    controller: Annotated[Controller | None, Form(description="What drove the stimulation; by default sessions are proposed.")] = None,
     policy: Annotated[Text | None, Form(max_length=100, description="Name or number of the policy that ran.")] = None,
     started_at: Annotated[Moment | None, Form(description="Start of the session; without an offset: UTC.")] = None,
-    hemisphere: Annotated[Hemisphere | None, Form(description="Side of the controlled implant, where the file does not tell.")] = None,
-    beta_unit: Annotated[Text | None, Form(max_length=40, description="Unit of a table's beta; the participant's when left out.")] = None,
-    beta_source: Annotated[BetaSource | None, Form(description="Where a table's beta comes from; the participant's when left out.")] = None,
+    hemisphere: Annotated[Hemisphere | None, Form(description="Side of the controlled implant, where the file does not say.")] = None,
+    beta_unit: Annotated[Text | None, Form(max_length=40, description="Unit of a table's beta; the participant's by default.")] = None,
+    beta_source: Annotated[BetaSource | None, Form(description="Where a table's beta comes from; the participant's by default.")] = None,
     lfp_unit: Annotated[Text | None, Form(max_length=40, description="Unit of a table's LFP, where its header states none.")] = None,
     confirm: Annotated[bool, Form(description="Whether sessions with a stated controller count at once; false proposes them.")] = True,
     session: Annotated[int | None, Form(ge=1, le=2**31 - 1, description="Session of grasp files, which name no clock.")] = None,
@@ -74,18 +74,18 @@ def upload(
 
 @router.get("/uploads/{upload_id}")
 def read_upload(upload_id: RowId, db: Db, caller: CurrentCaller) -> UploadOut:
-    """One upload with its reports."""
+    """Return one upload with its reports."""
     row, person = repository.upload(db, upload_id, caller)
     return upload_out(db, UploadOutcome(row, person, service.stored_outcomes(db, row)), caller)
 
 
 def unusable(outcome: UploadOutcome) -> UnusableUpload:
-    """The problem document of an upload of which nothing can be used: the first file, the place, the hint; and every report."""
+    """Build the problem document of an upload of which nothing can be used: the first file, the place, the hint; and every report."""
     first = next((r for r in outcome.reports_for_sender if r.problem), None)
     reports = [FileReportOut.model_validate(r).model_dump() for r in outcome.reports_for_sender]
     if first is None or first.problem is None:
         return UnusableUpload("No file in this upload holds a recording.", "Choose the files of a session.", report=reports)
-    # what is said of several files together (two recordings' loose files) comes before the first file's own problem
+    # the report on several files together (two recordings' loose files) comes before the first file's own problem
     together = [sentence for aside in outcome.asides for sentence in aside.flagged]
     kept = any(f.row.stored_sha256 for f in outcome.files if f.name == first.name)
     what = f"{first.name}: {first.problem.what} ({first.problem.where}). {'The file is kept.' if kept else 'Nothing of it was kept.'}"
@@ -102,7 +102,7 @@ def unusable(outcome: UploadOutcome) -> UnusableUpload:
 
 
 def upload_out(db: Session, outcome: UploadOutcome, caller: Caller) -> UploadOut:
-    """An upload for the API."""
+    """Convert an upload for the API."""
     sessions = [study.session(db, i, caller) for i in outcome.session_ids]
     behind = repository.proposals(db, [s.id for s in sessions if s.status == "proposed"])
     return UploadOut(

@@ -55,7 +55,7 @@ def stored_reports(row: UploadFile) -> list[FileReport]:
 
 
 def unreadable_members(row: UploadFile) -> list[str]:
-    """Members of a stored file that could not be read, and why."""
+    """List members of a stored file that could not be read, and why."""
     found: list[str] = (row.report or {}).get("unreadable", [])
     return found
 

@@ -188,7 +188,7 @@ def _check_reachable(asked: Path, place: Path, user: SystemUser) -> None:
     closed = next(p for p in [*reversed(place.parents), place] if not may_enter(p, user))
     raise RuntimeError(
         f"The database of {asked.parent} is in {place}, and PostgreSQL, which runs as the system user '{user.name}', can no longer get"
-        f" there: {closed} is closed (mode {stat.S_IMODE(closed.stat().st_mode):o}). Let it pass: chmod o+x {closed}."
+        f" there: {closed} is closed (mode {stat.S_IMODE(closed.stat().st_mode):o}). Open it: chmod o+x {closed}."
         " Nothing was changed, and no other database was made."
     )
 

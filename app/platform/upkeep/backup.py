@@ -82,7 +82,7 @@ def read_key(path: Path, *apart_from: Path) -> bytes:
     """
     for folder in apart_from:
         if path.resolve().is_relative_to(folder.resolve()):
-            raise BackupError(f"The key {path} lies in {folder}, beside what it protects.", "Keep it on another medium.")
+            raise BackupError(f"The key {path} is in {folder}, next to what it protects.", "Keep it on another medium.")
     try:
         key = bytes.fromhex(path.read_text().strip())
     except (OSError, ValueError, UnicodeDecodeError):

@@ -59,7 +59,7 @@ def _upgrade(engine: Engine) -> None:
             command.upgrade(config, "head")
         except CommandError as error:
             raise RuntimeError(
-                f"this version of betaloop does not know the schema of its database ({error}): install the version that last ran on it,"
+                f"this version of betaloop does not know the schema of its database ({error}). Install the version that last ran on it,"
                 " or restore a backup that this version made"
             ) from error
 

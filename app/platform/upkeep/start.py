@@ -154,7 +154,7 @@ class Watchdog:
         self._silent_s = 0.0
 
     def _watch(self) -> None:
-        # Looks are counted and not the clock: while the whole process stands still, as on a machine that sleeps, nothing is overdue.
+        # Looks are counted and not the clock: while the whole process pauses, as on a machine that sleeps, nothing is overdue.
         while not self._stop.wait(_LOOK_S):
             if self._silent_s is None:
                 continue

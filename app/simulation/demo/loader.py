@@ -161,11 +161,11 @@ def _checked(answer: httpx.Response) -> Any:
     return answer.json()
 
 
-def run_all(state: State, lines: Sequence[Sequence[Step]], told: Callable[[int, int], None]) -> None:
+def run_all(state: State, lines: Sequence[Sequence[Step]], report: Callable[[int, int], None]) -> None:
     """Do the remaining steps of every line, the lines in parallel, each in its order.
 
     Args:
-        told: called with how many steps are done, and how many there are.
+        report: called with how many steps are done, and how many there are.
 
     Raises:
         BetaloopError: the error of the first line that failed; the others end after their present step.
@@ -184,7 +184,7 @@ def run_all(state: State, lines: Sequence[Sequence[Step]], told: Callable[[int, 
                     failed.set()
                     raise
                 state.finish(name)
-            told(len(state.done), total)
+            report(len(state.done), total)
 
     with ThreadPoolExecutor(len(lines)) as pool:
         for walked in [pool.submit(walk, line) for line in lines]:

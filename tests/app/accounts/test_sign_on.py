@@ -120,7 +120,7 @@ def test_an_address_that_was_given_to_somebody_else_opens_no_account(
 ) -> None:
     assert signed_on(browser).status_code == 303
     hospital.present, hospital.person = None, theirs.Person("new-colleague", ADA.email)
-    assert "somebody else" in signed_on(browser).text
+    assert "another person" in signed_on(browser).text
     assert trail(db, "sign_on") == [("refuse", "unknown")], "whoever came is not the owner of the account"
     first = browser.get("/account").status_code
     done = CliRunner().invoke(cli.app, ["user", "remove-sign-on", ADA.email])

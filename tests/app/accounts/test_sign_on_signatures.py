@@ -102,7 +102,7 @@ def test_nobody_else_confirms_and_an_old_sign_on_does_not(browser: TestClient, h
         assert signed_on(browser).status_code == 303
     hospital.person = BOB
     refused = signed_on(browser, "/sign-on/confirm")
-    assert (refused.status_code, "Somebody else" in refused.text) == (403, True)
+    assert (refused.status_code, "Another person" in refused.text) == (403, True)
     hospital.person = ADA
     hospital.change["auth_time"] = int(time.time()) - 120
     assert "not asked you again" in signed_on(browser, "/sign-on/confirm").text

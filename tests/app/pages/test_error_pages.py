@@ -79,7 +79,7 @@ def test_what_an_expired_sign_in_gives_back_is_sent_again_by_its_writer_alone(br
     assert browser.cookies[COOKIE] != live
     stopped = browser.post(target, data=entered)
     assert stopped.status_code == 409
-    assert "Somebody else had signed in when this was entered" in stopped.text
+    assert "Another person had signed in when this was entered" in stopped.text
     assert "slept badly" not in stopped.text
     assert "2026-03-30" not in browser.get("/participants/P1").text
     with transaction("test") as db:

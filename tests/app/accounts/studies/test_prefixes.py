@@ -74,7 +74,7 @@ def test_a_prefix_is_not_held_for_a_name_and_the_rest_is(client: TestClient) -> 
 
 @pytest.mark.parametrize(
     ("prefix", "said"),
-    [("adapt-", "cannot be told apart"), ("AD", "cannot be told apart"), ("ADAPT-N", "cannot be told apart"), ("P", "begin with 'P'")],
+    [("adapt-", "cannot be distinguished"), ("AD", "cannot be distinguished"), ("ADAPT-N", "be distinguished"), ("P", "begin with 'P'")],
 )
 def test_prefixes_that_cannot_be_told_apart_or_are_in_use_are_refused(client: TestClient, prefix: str, said: str) -> None:
     assert add(client, "ADAPT").status_code == 201

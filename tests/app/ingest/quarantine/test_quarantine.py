@@ -74,7 +74,7 @@ def test_a_discarded_file_loses_its_bytes_and_keeps_its_row(held: dict[str, Any]
 def test_a_file_is_released_as_it_is_only_after_somebody_looked(held: dict[str, Any], client: TestClient, db: Session) -> None:
     refused = decide(client, held, "release", how="as_is", reason="a calibration without names")
     assert refused.status_code == 409
-    assert "Nobody has looked" in refused.json()["detail"]
+    assert "No person has looked" in refused.json()["detail"]
     decide(client, held, "review")
     assert decide(client, held, "release", how="as_is", reason="a calibration without names").json()["status"] == "released"
     row = db.get_one(UploadFile, held["id"])
