@@ -33,7 +33,7 @@ def default_methods() -> list[str]:
 
 
 def names() -> dict[str, str]:
-    """What pages call the methods, by key."""
+    """Return the names of the methods on pages, by key."""
     return {m.key: m.name for m in registry.methods()}
 
 

@@ -18,14 +18,15 @@ Rows = list[dict[str, Any]]
 
 
 def newest_evaluation(db: Session, participant_id: int) -> Evaluation | None:
-    """The participant's last evaluation; its estimates, with all their draws, are read when something asks for them."""
+    """Load the participant's last evaluation; its estimates, with all their draws, are read on first use."""
     return db.scalar(select(Evaluation).where(Evaluation.participant_id == participant_id).order_by(Evaluation.id.desc()).limit(1))
 
 
 def diagnostics_of_others(db: Session, participant: Participant, member: str) -> dict[int, dict[str, Any]]:
-    """One member of the diagnostics of the newest evaluation of every other participant of the site who has not withdrawn, by its number.
+    """Return one member of the diagnostics of the newest evaluation of every other participant of the site who has not withdrawn, by its
+    number.
 
-    Evaluations without that member are left out.
+    Evaluations without that member are ignored.
     """
     newest = (
         select(func.max(Evaluation.id))
@@ -38,7 +39,7 @@ def diagnostics_of_others(db: Session, participant: Participant, member: str) ->
 
 
 def lock_job(db: Session, job_id: str) -> None:
-    """Let one call at a time store the evaluation of a job; held to the end of the transaction."""
+    """Let one call at a time store the evaluation of a job; the lock lasts to the end of the transaction."""
     db.execute(text("select pg_advisory_xact_lock(hashtextextended(:key, 0))"), {"key": f"evaluation:{job_id}"})
 
 
@@ -48,31 +49,31 @@ def evaluation_of_job(db: Session, job_id: str, *, first_answer: bool = False) -
 
 
 def evaluation(db: Session, participant_id: int, evaluation_id: int) -> Evaluation | None:
-    """A participant's evaluation by its number."""
+    """Find a participant's evaluation by its number."""
     return db.scalar(select(Evaluation).where(Evaluation.participant_id == participant_id, Evaluation.id == evaluation_id))
 
 
 def evaluation_times(db: Session, participant_id: int) -> dict[int, datetime]:
-    """When each of the participant's evaluations was stored, by its number."""
+    """Return when each of the participant's evaluations was stored, by its number."""
     query = select(Evaluation.id, Evaluation.created_at).where(Evaluation.participant_id == participant_id)
     return {row.id: row.created_at for row in db.execute(query.order_by(Evaluation.id))}
 
 
 def policies_by_id(db: Session, ids: Sequence[int]) -> dict[int, Policy]:
-    """Policies by their number; their curves and other metrics are read when something asks for them."""
+    """Load policies by their number; their curves and other metrics are read on first use."""
     query = select(Policy).where(Policy.id.in_(ids)).options(defer(Policy.metrics))
     return {p.id: p for p in db.scalars(query)}
 
 
 def methods(db: Session, evaluation_id: int) -> set[str]:
-    """Methods that an evaluation has estimates of."""
+    """List methods that an evaluation has estimates of."""
     return set(db.scalars(select(EstimateRow.method).where(EstimateRow.evaluation_id == evaluation_id).distinct()))
 
 
 class PolicyHead(NamedTuple):
-    """What a ranking says of a policy and judges it by, as values: two equal heads are judged equally.
+    """Facts of a policy that a ranking shows and judges it by, as values: two equal heads are judged equally.
 
-    `amplitude` is what a constant holds, fraction of cDBS; None for every other policy.
+    `amplitude` is that of a constant, fraction of cDBS; None for every other policy.
     """
 
     id: int
@@ -85,18 +86,18 @@ class PolicyHead(NamedTuple):
 
     @property
     def is_cdbs(self) -> bool:
-        """Whether it is the reference that holds the cDBS amplitude."""
+        """True for the reference with the constant cDBS amplitude."""
         return self.kind == "baseline" and self.algorithm == "constant" and self.amplitude == 1.0
 
 
 def head_of(policy: Policy) -> PolicyHead:
-    """The same of a policy that is at hand."""
+    """Build the head of a loaded policy."""
     held = _amplitude(policy.config.get("amplitude"))
     return PolicyHead(policy.id, policy.name, policy.kind, policy.algorithm, policy.teacher_id, policy.retired_reason, held)
 
 
 def policy_heads(db: Session, evaluation_id: int) -> dict[int, PolicyHead]:
-    """Every policy that an evaluation estimated, as it is now, by its number."""
+    """Load the present head of every policy that an evaluation estimated, by its number."""
     estimated = select(EstimateRow.policy_id).where(EstimateRow.evaluation_id == evaluation_id)
     columns = (Policy.id, Policy.name, Policy.kind, Policy.algorithm, Policy.teacher_id, Policy.retired_reason)
     query = select(*columns, Policy.config["amplitude"].label("held")).where(Policy.id.in_(estimated)).order_by(Policy.id)
@@ -111,9 +112,9 @@ def _amplitude(stored: Any) -> float | None:
 
 
 def changed_since(db: Session, moment: datetime, wanted: Mapping[str, tuple[str, Collection[int]]]) -> dict[str, tuple[Rows, Rows]]:
-    """Rows as they were at a moment and as they are now, of those that the audit trail has a change of since, by table.
+    """Load rows at a moment and at present, of those that the audit trail has a change of since, by table.
 
-    Changes are chained from row to row, not by key, because a key may change too. What was changed back stands on both sides.
+    Changes are chained from row to row, not by key, because a key may change too. What was changed back is on both sides.
 
     Args:
         wanted: by table, a column, and the values of it that are looked for.

@@ -15,7 +15,7 @@ from ml.outcomes import FIELDS
 
 
 class EvaluateParams(Model):
-    """What `evaluate` takes."""
+    """Parameters of `evaluate`."""
 
     preset: Preset = Field("full", description="`full`: sizes for a study; `quick`: for a first look.")
     policies: PolicyIds = Field(default_factory=list, description="Policies to rank; empty: every one that is not retired.")
@@ -33,7 +33,7 @@ class ReasonOut(Model):
 
     code: str
     value: float | None = Field(description="What was measured; null where the finding has no number.")
-    limit: float | None = Field(description="What the value is held against.")
+    limit: float | None = Field(description="Limit that the value is compared with.")
     unit: str
 
 
@@ -44,7 +44,7 @@ class FlagOut(ReasonOut):
 
 
 class EstimateSummary(Model):
-    """What every view of an estimate has."""
+    """Members that every view of an estimate has."""
 
     value: float
     low: float
@@ -101,7 +101,7 @@ else:
 
 
 class TestedBefore(_Means):
-    """What a policy did where it ran: actual returns with the H and gamma of the estimates, and differences to the same visit's cDBS."""
+    """Results of a policy where it ran: actual returns with the H and gamma of the estimates, and differences to the same visit's cDBS."""
 
     __test__ = False
 
@@ -128,7 +128,7 @@ class CheckOut(Model):
         description="`outside_range`, `thin`, `far`, `below_random_bound`, `unseen_dose` (shares of steps), `distance`, "
         "`effective_sessions`, `largest_weight_share`, `horizon_of_ten` (steps)."
     )
-    value: float | None = Field(description="Null where the data cannot tell.")
+    value: float | None = Field(description="Null where the data cannot decide.")
     limit: float | None = Field(description="Null where the value has no limit.")
     at_least: bool = Field(description="Whether the limit is the least value that passes; else it is the greatest.")
     verdict: Literal["passed", "refused", "weights", "noted", "told"] = Field(
@@ -138,7 +138,7 @@ class CheckOut(Model):
 
 
 class CoverageOut(Model):
-    """What the data can say about one policy, checked before it was estimated."""
+    """Coverage of one policy by the data, checked before it was estimated."""
 
     supported: bool
     sessions: int = Field(description="Sessions that have importance weights.")
@@ -179,7 +179,7 @@ class RankedPolicy(Model):
 
 
 class RankedSnapshot(Model):
-    """What the ranking rests on."""
+    """Snapshot that the ranking rests on."""
 
     id: int
     created_at: datetime
@@ -191,7 +191,7 @@ class RankedSnapshot(Model):
 
 
 class RankingOut(Model):
-    """Candidate policies from best to worst by the default method, the posterior, and references beside them."""
+    """Candidate policies from best to worst by the default method, the posterior, and references besides them."""
 
     participant: str
     evaluation_id: int
@@ -221,7 +221,7 @@ Kind = Literal["trained", "distilled", "external"]
 
 
 class RankingFilter(Model):
-    """Which candidates to show; ranks stay those among all."""
+    """Filter of candidates; ranks stay those among all."""
 
     supported: bool = Field(False, description="Only policies that the data support.")
     kind: Kind | None = Field(None, description="Only policies of this kind.")

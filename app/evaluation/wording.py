@@ -1,4 +1,4 @@
-"""Every sentence of evaluation, made from typed flags at the last moment. Nothing is ever concluded from what stands here."""
+"""Every sentence of evaluation, made from typed flags at the last moment. Nothing is ever concluded from these texts."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ UNSUPPORTED = "not supported by the data"
 
 
 def sentence(flag: Flag) -> str:
-    """One flag in words, without a full stop, for lists and tooltips; a code that this betaloop does not know is shown as it is."""
+    """Write one flag in words, without a full stop, for lists and tooltips; an unknown code is shown unchanged."""
     made = _SENTENCES.get(flag.code)
     return made(flag) if made is not None else flag.code.replace("_", " ")
 
 
 def joined(flags: Sequence[Flag]) -> str:
-    """Several flags in one line."""
+    """Write several flags in one line."""
     return "; ".join(sentence(flag) for flag in flags)
 
 
@@ -35,33 +35,33 @@ def amplitude(fraction: float, value_ma: float | None) -> str:
 
 
 def chance(share: float) -> str:
-    """A probability from some hundred draws: they can show none of 0 and none of 1."""
+    """Write a probability from some hundred draws: they can show none of 0 and none of 1."""
     return "> 99 %" if share > 0.99 else "< 1 %" if share < 0.01 else percent(share)
 
 
 def method_name(key: str) -> str:
-    """What pages call a method; its key where this betaloop has no such method."""
+    """Return the name of a method on pages; its key where this betaloop has no such method."""
     return shown(key).name
 
 
 def signed(value: float, digits: int = 1) -> str:
-    """A difference with its sign."""
+    """Write a difference with its sign."""
     shown = round(value, digits)
     return f"{shown:+.{digits}f}".replace("-", "\N{MINUS SIGN}") if shown else f"{0:.{digits}f}"
 
 
 def percent(share: float | None) -> str:
-    """A share in whole per cent."""
+    """Write a share in whole per cent."""
     return f"{100 * (share or 0.0):.0f} %"
 
 
 def number(flag: Flag) -> float:
-    """The number that a flag is about."""
+    """Return the number that a flag is about."""
     return flag.value if flag.value is not None else float("nan")
 
 
 def _refusal(flag: Flag) -> str:
-    """The beginning of a finding about support: its verdict, and the steps that it is about."""
+    """Write the beginning of a finding about support: its verdict, and the steps that it is about."""
     return (f"{UNSUPPORTED}: " if flag.refuses else "") + ("in its simulated sessions, " if flag.source == "simulated" else "")
 
 
@@ -72,7 +72,7 @@ def _thin(flag: Flag) -> str:
 
 
 def shape_pooling(outcome: str, told: Mapping[str, Any]) -> str:
-    """What came of pooling an outcome's dose shapes over participants (`ml.ope.outcomes.pooling.Proof.to_json`), for engineers."""
+    """Describe the result of pooling an outcome's dose shapes (`ml.ope.outcomes.pooling.Proof.to_json`), for engineers."""
     n, gain, error = told["participants"] - 1, told["gain"], told["standard_error"]
     others, needed = counted(n, "other participant"), told["fewest"] - 1
     if n < needed:

@@ -1,4 +1,4 @@
-"""What a policy is planned by: the verdicts of the ranking behind the plan and of the newest one, and adverse events, ranked or not."""
+"""Reasons for and against planning a policy: verdicts of two rankings, and adverse events."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _STRICTEST_FIRST = ("unsafe", "likely_worse", "test_with_care")
 
 @dataclass(frozen=True)
 class Finding:
-    """What is said of one policy, taken together: a plan goes by the strictest of it.
+    """Verdicts and events of one policy, taken together: a plan follows the strictest of them.
 
     Attributes:
-        said: of the ranking behind the plan, then of the newest one; after a serious adverse event that neither holds, by that alone.
+        `said`: verdicts of the ranking behind the plan, then of the newest one. Without either, that of a serious adverse event alone.
     """
 
     said: tuple[Decided, ...]
@@ -43,7 +43,7 @@ class Finding:
 
     @property
     def with_care(self) -> bool:
-        """Whether it is to be tested with care by any."""
+        """True where any verdict is a test with care."""
         return any(decided.decision == "test_with_care" for decided in self.said)
 
     @property
@@ -65,7 +65,7 @@ class Grounds:
     events: Events
 
     def of(self, policy_id: int) -> Finding | None:
-        """What is said of a policy; None where nothing is known of it."""
+        """Return the finding on a policy; None where nothing is known of it."""
         ranked = [one for ranking in self.rankings if (one := ranking.of(policy_id)) is not None]
         said = tuple(one.planned for one in ranked if one.planned is not None)
         if not said and policy_id in self.events:
@@ -74,9 +74,9 @@ class Grounds:
 
 
 def grounds(db: Session, participant: Participant, evaluation: Evaluation | None) -> Grounds:
-    """What plans of a participant go by now.
+    """Collect what plans of a participant follow at present.
 
-    A plan may rest on an older ranking, so that what it predicted can be held against what sessions show, but is made no more leniently.
+    A plan may rest on an older ranking, so that its predictions can be compared with the sessions. Its rules are no more lenient.
 
     Args:
         evaluation: that the plan rests on; None where there is none.
@@ -88,10 +88,10 @@ def grounds(db: Session, participant: Participant, evaluation: Evaluation | None
 
 
 def unanswered(plan: Plan, events: Events) -> Events:
-    """By policy of a plan, the events that keep it from being signed and run.
+    """Return, by policy of a plan, the events that keep it from being signed and run.
 
-    An event is answered where the plan says why the policy is tested all the same, and was drafted after the event was last described: who
-    gave a reason before cannot have meant it.
+    An event is answered where the plan says why the policy is tested all the same, and was drafted after the event was last described. An
+    earlier reason cannot be about that event.
 
     Args:
         events: as `events_against` gives them.

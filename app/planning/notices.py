@@ -1,4 +1,4 @@
-"""What speaks against a plan, as typed records; their sentences are made in `app.planning.plans.wording`."""
+"""Warnings against a plan, as typed records; their sentences are made in `app.planning.plans.wording`."""
 
 from __future__ import annotations
 
@@ -52,6 +52,6 @@ class PlanWarning:
 
 
 def without_policies(warnings: Sequence[PlanWarning]) -> list[PlanWarning]:
-    """Those that name no policy: what a blinded reader may see. That a plan may not run after an adverse event is told, and not why."""
+    """Select those that name no policy, for a blinded reader. It is shown that a plan may not run after an adverse event, but not why."""
     told = [w for w in warnings if w.policy_id is None and w.code is not Code.RANKING_NOTE]
     return told + [PlanWarning(Code.ADVERSE_EVENT)] * any(w.code is Code.ADVERSE_EVENT for w in warnings)

@@ -28,10 +28,10 @@ TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Release:
-    """What became of a policy's release.
+    """State of a policy's release.
 
     Attributes:
-        signature: the newest, standing or not; None where nobody released the policy.
+        signature: the newest, standing or not; None where the policy is not released.
     """
 
     state: SignatureState
@@ -44,7 +44,7 @@ class Release:
 
 
 def brought_by(db: Session, policy: Policy, caller: Caller) -> Policy | None:
-    """What the caller brought from elsewhere of a policy and of those that it was distilled or tuned from; None where nothing."""
+    """Find the policy that the caller imported, among a policy and those that it was distilled or tuned from; None where none."""
     line: list[Policy] = [policy]
     for one in line:  # grows by what each was made from; a policy is never changed, so that no line leads back
         if one.kind == FOREIGN and one.created_by == caller.label:
@@ -54,16 +54,16 @@ def brought_by(db: Session, policy: Policy, caller: Caller) -> Policy | None:
 
 
 def release_of(db: Session, participant: Participant, policy: Policy) -> Release:
-    """Whether a policy is released, and whether it is still what was released."""
+    """Return whether a policy is released, and whether it is still what was released."""
     return _judged(db, participant, policy, signatures.newest_of_each(db, KIND, [policy.id]).get(policy.id))
 
 
 def refuse_unreleased(db: Session, participant: Participant, planned: Sequence[tuple[Policy, PlanItem]]) -> None:
-    """Hold the sessions of a plan that is to be approved against the releases of their policies.
+    """Check the sessions of a plan that is to be approved against the releases of their policies.
 
     Raises:
-        Conflict: a policy that was changed since it was released, or a session that goes beyond the limits of the release; and, where this
-            installation asks for it (`BETALOOP_REQUIRE_RELEASED_POLICIES`), a policy that nobody released.
+        Conflict: a policy that was changed since it was released, or a session that goes beyond the limits of the release. Also a policy
+            without a release, where this installation requires one (`BETALOOP_REQUIRE_RELEASED_POLICIES`).
     """
     found = signatures.newest_of_each(db, KIND, sorted({policy.id for policy, _ in planned}))
     for policy, item in planned:
@@ -90,7 +90,7 @@ def _judged(db: Session, participant: Participant, policy: Policy, newest: Signa
 
 
 def _refuse_beyond(policy: Policy, item: PlanItem, limits: dict[str, Any]) -> None:
-    """Raises Conflict where a planned session goes beyond what its policy was released for."""
+    """Raise Conflict where a planned session goes beyond what its policy was released for."""
     side = limits["hemisphere"]
     beyond = (
         (item.min_ma is not None and item.min_ma < limits["min_ma"] - TOLERANCE)
@@ -102,12 +102,12 @@ def _refuse_beyond(policy: Policy, item: PlanItem, limits: dict[str, Any]) -> No
         within = f"{limits['min_ma']:g} to {limits['max_ma']:g} mA, ramp {limits['ramp_ma_per_s']:g} mA/s{f', {side}' if side else ''}"
         raise Conflict(
             f"Session {item.position} goes beyond the limits within which policy '{policy.name}' was released: {within}.",
-            "Draft the visit anew within them, or have a clinician release the policy with other limits.",
+            "Draft the visit again within them, or have a clinician release the policy with other limits.",
         )
 
 
 def signed_content(db: Session, participant: Participant, policy: Policy) -> dict[str, Any]:
-    """All that a signature under a policy covers, but the limits: its bytes, and what it was made of."""
+    """Build the content that a signature under a policy covers, but the limits: its bytes, and what it was made of."""
     snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id else None
     teacher = db.get(Policy, policy.teacher_id) if policy.teacher_id else None
     return {

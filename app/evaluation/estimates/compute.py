@@ -1,4 +1,4 @@
-"""What the child processes of evaluation run: check coverage, fit one DLSM ensemble member, estimate, test methods."""
+"""Child processes of evaluation: check coverage, fit one DLSM ensemble member, estimate, test methods."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def fit_dlsm(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[
 
 
 def _ended(course: Sequence[tuple[int, float, float]], steps: int) -> str:
-    """How a member's training ended, from its (update, loss, held-out score) and the updates that it might have taken."""
+    """Describe how a member's training ended, from its (update, loss, held-out score) and the updates that it might have taken."""
     last, (best, _, score) = course[-1][0], min(course, key=lambda check: check[2] if math.isfinite(check[2]) else math.inf)
     end = "ran to its last update" if last >= steps else f"was stopped early, at update {last} of {steps}"
     return f"{end}: the best held-out score, {number(score, 4)}, was that of update {best}, which is kept"
@@ -85,11 +85,11 @@ def evaluate_method(params: dict[str, Any], workdir: Path, report: StepReport) -
     """Estimate every policy by one method.
 
     Args:
-        params: `snapshot_sha256`, `preset`, `seed`, `method`, `horizon_steps`, `policies` as [{`id`, `sha256`}], and for the DLSM
-            `members`, the stored files of its ensemble; or `failed`, the reason why its ensemble could not be fitted; for the posterior
-            `tests`, tested sessions as the fields of `TestedDifference`; `tested`, policies beside these that tests are of, which get no
-            estimate; `tests_left_out`, how many sessions are not among the tests, as arguments of `not_counted_tests`; and `others`, of
-            every participant whose dose shapes are pooled the log evidence by outcome; each absent where there is none.
+        params: `snapshot_sha256`, `preset`, `seed`, `method`, `horizon_steps` and `policies` as [{`id`, `sha256`}]. For the DLSM
+            `members`, the stored files of its ensemble, or `failed`, the reason why its ensemble could not be fitted. The posterior has
+            more, each absent where there is none. `tests`: tested sessions as the fields of `TestedDifference`. `tested`: other
+            policies that were tested, which get no estimate. `tests_left_out`: how many sessions are not among the tests, as arguments
+            of `not_counted_tests`. `others`: the log evidence by outcome of every participant whose dose shapes are pooled.
         workdir: scratch.
         report: progress, and learning curves where the method trains a network.
 
@@ -163,7 +163,7 @@ def check_coverage(params: dict[str, Any], workdir: Path, report: StepReport) ->
 
 
 def choose_method(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
-    """Hold the methods that are fitted within seconds against controllers that were left out of their fits.
+    """Test the methods that are fitted within seconds on held-out controllers.
 
     Args:
         params: `snapshot_sha256`, `seed`, `methods` asked for, `horizon_steps`, and `policies` that drove logged sessions as
@@ -194,7 +194,7 @@ def choose_method(params: dict[str, Any], workdir: Path, report: StepReport) -> 
 
 
 def dlsm_members(preset: str, seed: int) -> int:
-    """Ensemble size of a preset."""
+    """Return the ensemble size of a preset."""
     return DlsmConfig.of_size(_size({"preset": preset}), seed).members
 
 
@@ -207,7 +207,7 @@ def _policies(named: list[dict[str, Any]], buffer: ReplayBuffer) -> dict[str, Po
 
 
 def _of_member(fraction: float, members: int) -> tuple[float, str]:
-    """A fraction of the whole fit as a fraction of one member's, and the ending of its curve's name."""
+    """Convert a fraction of the whole fit to a fraction of one member's, and the ending of its curve's name."""
     if members == 1:
         return fraction, ""
     k = min(max(math.ceil(fraction * members - 1e-9) - 1, 0), members - 1)
@@ -215,7 +215,7 @@ def _of_member(fraction: float, members: int) -> tuple[float, str]:
 
 
 def _finite(value: Any) -> Any:
-    """A copy that JSON can hold: what is not a finite number becomes null."""
+    """Copy a value for JSON: what is not a finite number becomes null."""
     if isinstance(value, dict):
         return {name: _finite(v) for name, v in value.items()}
     if isinstance(value, list | tuple):

@@ -1,6 +1,6 @@
-"""What the data can say about each policy: checks that are made before any estimate and stored with the evaluation.
+"""Coverage of each policy by the data: checks that are made before any estimate and stored with the evaluation.
 
-A check that refuses a policy counts for every method; a note is to be known before the policy is picked and refuses nothing.
+A check that refuses a policy counts for every method; a note informs those who pick the policy and refuses nothing.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ _SHARES = {"outside_range", "thin", "far", "below_random_bound", "unseen_dose", 
 
 
 def refused(estimates: Mapping[str, Mapping[str, Estimate]], outcome: Mapping[str, Any] | None) -> dict[str, dict[str, Estimate]]:
-    """The estimates with those of refused policies marked as not supported, by every method, the failing checks first among their flags.
+    """Mark the estimates of refused policies as not supported, by every method, the failing checks first among their flags.
 
     Args:
         estimates: method -> policy id -> estimate.
@@ -108,13 +108,13 @@ def refused(estimates: Mapping[str, Mapping[str, Estimate]], outcome: Mapping[st
 
 
 def coverage_by_policy(evaluation: Evaluation) -> dict[int, CoverageOut]:
-    """The checks of every policy of an evaluation; empty for one that was made before they were stored, or where they failed."""
+    """Return the checks of every policy of an evaluation; empty for one that was made before they were stored, or where they failed."""
     stored = evaluation.diagnostics.get(STORED) or {}
     return {int(i): _out(found) for i, found in stored.get("policies", {}).items()}
 
 
 def coverage_failed(evaluation: Evaluation) -> str | None:
-    """Why nothing could be checked; None where it was, or where the evaluation was made before checks were stored."""
+    """Explain why nothing could be checked; None where it was, or where the evaluation was made before checks were stored."""
     reason = (evaluation.diagnostics.get(STORED) or {}).get("failed")
     return None if reason is None else str(reason)
 
@@ -136,7 +136,7 @@ def _flags(found: Mapping[str, Any], name: str) -> list[Flag]:
 
 
 def shown_value(check: CheckOut, sessions: int | None = None) -> str:
-    """A check's value for the page, with what it is out of where that helps."""
+    """Write a check's value for the page, with its total where that helps."""
     if check.value is None:
         return "\u2014"
     if check.name in _SHARES:
@@ -149,7 +149,7 @@ def shown_value(check: CheckOut, sessions: int | None = None) -> str:
 
 
 def shown_limit(check: CheckOut) -> str:
-    """A check's limit for the page; empty where it has none."""
+    """Write a check's limit for the page; empty where it has none."""
     if check.limit is None:
         return ""
     words = "at least" if check.at_least else "at most"
@@ -157,10 +157,10 @@ def shown_limit(check: CheckOut) -> str:
 
 
 def _percent(share: float) -> str:
-    """A share in percent; one that is not nothing does not look like nothing."""
+    """Write a share in percent; a small one does not look like nothing."""
     return "< 1" if 0 < share < 0.005 else f"{100 * share:.0f}"
 
 
 def refusals(checks: Sequence[CheckOut]) -> list[str]:
-    """Labels of the checks that refuse a policy."""
+    """List labels of the checks that refuse a policy."""
     return [CHECKS[c.name].label for c in checks if c.verdict == "refused" and c.name in CHECKS]

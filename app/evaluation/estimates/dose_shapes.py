@@ -26,7 +26,7 @@ KNOWN = [list(shape) for shape in SHAPES]
 
 
 def found(fitted: FittedPosterior) -> dict[str, Any]:
-    """What a fit says of dose shapes, JSON-able.
+    """Return the evidence of a fit on dose shapes, JSON-able.
 
     Returns:
         `shapes`; `evidence`, by outcome the log evidence of each by these data alone; `pooling`, by outcome what came of pooling them,
@@ -37,13 +37,13 @@ def found(fitted: FittedPosterior) -> dict[str, Any]:
 
 
 def of_others(db: Session, participant: Participant, settings: SettingsVersion) -> dict[str, Any] | None:
-    """What the newest evaluations of the site's other participants say of dose shapes; None where the settings do not ask for it.
+    """Return the dose shapes in the newest evaluations of the site's other participants; None where the settings do not ask for them.
 
-    Who has withdrawn is left out, and who belongs to another site: those who read this participant's results may not read theirs. Sessions
+    Withdrawn participants are excluded, and those of another site: those who read this participant's results may not read theirs. Sessions
     under a sealed key are in no evaluation.
 
     Returns:
-        `evidence` of each of them by outcome, and `evaluations`, the numbers that it stands with.
+        `evidence` of each of them by outcome, and `evaluations`, their numbers.
     """
     if not settings.pool_shapes:
         return None
@@ -53,6 +53,6 @@ def of_others(db: Session, participant: Participant, settings: SettingsVersion) 
 
 
 def pooling(evaluation: Evaluation) -> Mapping[str, Mapping[str, Any]]:
-    """By outcome what came of pooling its dose shapes in an evaluation (`Proof.to_json`); empty where others were not asked."""
+    """Return by outcome the result of pooling its dose shapes in an evaluation (`Proof.to_json`); empty where others were not used."""
     found: Mapping[str, Mapping[str, Any]] = (evaluation.diagnostics.get(STORED) or {}).get("pooling") or {}
     return found

@@ -1,6 +1,6 @@
-"""What controllers that were left out of the fits showed of each method, stored with the evaluation and shown beside the methods.
+"""Results of each method on held-out controllers, stored with the evaluation and shown next to the methods.
 
-A method's intervals are widened by it, and the combination of all methods leaves out methods whose bias it does not tell.
+A method's intervals are widened by it, and the combination of all methods excludes methods whose bias it does not show.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ Tables = Mapping[str, Mapping[str, Estimate]]
 
 
 def stored(outcome: Mapping[str, Any] | None, methods: Iterable[str]) -> dict[str, Any]:
-    """What left-out controllers showed of the methods, JSON-able for the evaluation's diagnostics.
+    """Convert the results of the methods on held-out controllers to JSON for the evaluation's diagnostics.
 
     Args:
         outcome: what the compute function `choose_method` gave; None where it was not run. methods: those with estimates.
 
     Returns:
         `table` of held-out skill, `no_difference_error`, `predictions`, `failed` by method (or one reason for all under the key "") and
-        `not_compared`, the methods with estimates that were not held against left-out controllers.
+        `not_compared`, the methods with estimates that were not tested on held-out controllers.
     """
     held: Mapping[str, Any] = (outcome or {}).get("held_out") or {}
     table = list(held.get("table", []))
@@ -44,15 +44,15 @@ def stored(outcome: Mapping[str, Any] | None, methods: Iterable[str]) -> dict[st
 
 
 def of_evaluation(evaluation: Evaluation) -> dict[str, Any]:
-    """What `stored` gave when an evaluation was made; empty for one without."""
+    """Return what `stored` gave when an evaluation was made; empty for one without."""
     kept = evaluation.diagnostics.get(STORED) or {}
     return {"table": [], "no_difference_error": None, "predictions": [], "failed": {}, "not_compared": []} | kept if kept else {}
 
 
 def widened(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, dict[str, Estimate]]:
-    """The estimates with their intervals widened by what left-out controllers showed of each method's errors, where they showed any.
+    """Widen the intervals of the estimates by each method's errors on held-out controllers, where these are known.
 
-    Resampled sessions see how uncertain a model's numbers are, not that the model is wrong. Beside the widened interval an estimate keeps
+    Resampled sessions see how uncertain a model's numbers are, not that the model is wrong. Besides the widened interval an estimate keeps
     `held_out_difference_error`, the error of differences beyond the noise of the observed means, for the interval of a gain. The
     combination takes those of its parts by their weights.
     """
@@ -72,7 +72,8 @@ def widened(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, d
 
 
 def difference_errors(predictions: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Root mean squared error of predicted differences between two controllers beyond the noise of their observed means, by method.
+    """Compute the root mean squared error of predicted differences between two controllers beyond the noise of their observed means, by
+    method.
 
     Over pairs of controllers that the method supported though it had not seen them; over all pairs where there is no such pair.
     """
@@ -91,7 +92,7 @@ def _squared_error(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
 
 
 def no_difference_error(predictions: Sequence[Mapping[str, Any]]) -> float | None:
-    """Error of differences, share of the observed range, of a prediction that all controllers return the same; None below two."""
+    """Compute the error of differences, share of the observed range, of predicting equal returns for all controllers; None below two."""
     by_method: dict[str, dict[str, float]] = defaultdict(dict)
     for p in predictions:
         by_method[p["method"]][p["controller"]] = float(p["observed"])
@@ -108,7 +109,7 @@ def _name(method: str) -> str:
 
 
 def combined(estimates: Tables, outcome: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The combination as one more method's result: `{"estimates": {policy id: Estimate}}` or `{"failed": reason}`.
+    """Combine the methods to one more method's result: `{"estimates": {policy id: Estimate}}` or `{"failed": reason}`.
 
     The posterior, an average of its own, is no part of it. A method's error has a part that no resampling shows: its bias. Where left-out
     controllers have shown it, only methods of known bias take part, so that an unknown bias is not taken for none.

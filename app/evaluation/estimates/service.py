@@ -26,7 +26,7 @@ from ml.ope import AGGREGATE, POSTERIOR, Estimate, default_method, shown
 
 
 def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams, *, least: int = 1) -> list[Policy]:
-    """The candidates of an evaluation.
+    """Choose the candidates of an evaluation.
 
     Args:
         least: 0 where references alone are an answer too.
@@ -73,8 +73,8 @@ def store_evaluation(
 ) -> Evaluation:
     """Store every method's estimates of every policy; a job that has stored its evaluation gets that one.
 
-    The ranking follows the posterior; where it could not speak, the first method of the usual order that supports a candidate, and then no
-    candidate is proposed.
+    The ranking follows the posterior. Where that failed, it follows the first method of the usual order that supports a candidate, and then
+    no candidate is proposed.
 
     Args:
         db: the session. job_id: the job. created_by: who asked for it.
@@ -82,7 +82,7 @@ def store_evaluation(
         candidates: ids of the policies that are ranked; the others are references.
         results: by method `{"estimates": {policy id: Estimate.to_json()}}`, of the posterior with `dose_shapes`, or `{"failed": reason}`.
         config: how the methods ran; where its `methods` name the combination, that is computed here from the others.
-        skill: what `choose_method` found out on left-out controllers: it widens the intervals of the single methods.
+        skill: results of `choose_method` on held-out controllers: they widen the intervals of the single methods.
         coverage: what `check_coverage` found out; a policy that it refuses is not supported by the data, whatever a method says of it.
         first_answer: whether it is the job's first answer, which its own evaluation follows.
 
@@ -90,7 +90,7 @@ def store_evaluation(
         Invalid: no method could speak; lists why.
     """
     if job_id is not None:
-        # the job's row is locked by whoever stores for it; this covers direct calls too
+        # the job's row is locked by the call that stores for it; this covers direct calls too
         repository.lock_job(db, job_id)
         known = repository.evaluation_of_job(db, job_id, first_answer=first_answer)
         if known is not None:
@@ -143,7 +143,7 @@ _COLUMNS = {column.key for column in EstimateRow.__table__.columns}
 
 
 def row_of(policy_id: int, estimate: Estimate) -> EstimateRow:
-    """An estimate as it is stored."""
+    """Convert an estimate to its stored row."""
     stored = estimate.to_json()
     details = stored.pop("details") | {name: stored.pop(name) for name in list(stored) if name not in _COLUMNS}
     # an interval of a skewed bootstrap may miss the estimate itself; the table keeps it inside
@@ -153,7 +153,7 @@ def row_of(policy_id: int, estimate: Estimate) -> EstimateRow:
 
 
 def estimate_of(row: EstimateRow) -> Estimate:
-    """A stored estimate of any version."""
+    """Read a stored estimate of any version."""
     details = dict(row.details)
     apart = {name: details.pop(name) for name in ("step_return", "end_reward", "n", "version") if name in details}
     stored = {name: getattr(row, name) for name in _COLUMNS} | apart | {"details": details}

@@ -1,4 +1,4 @@
-"""What policies would have asked for on a recorded session's beta, beside each other. No forecast: under them beta would have differed."""
+"""Amplitudes that policies would have requested on a recorded session's beta. No forecast: under them beta would have differed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from ml.policies.onnx_policy import PolicyFileError
 
 
 class AskedOut(Model):
-    """What one policy would have asked for."""
+    """Amplitudes that one policy would have requested."""
 
     policy_id: int
     name: str
@@ -51,7 +51,7 @@ class AskedOut(Model):
 
 
 class DifferenceOut(Model):
-    """How far two policies are apart, over the steps that both answer."""
+    """Distance of two policies, over the steps that both answer."""
 
     policy_id: int
     other_id: int
@@ -84,7 +84,7 @@ TWO = 2
 
 
 def best_first(db: Session, participant: Participant, policies: Sequence[Policy], caller: Caller) -> list[Policy]:
-    """Policies by what the ranking says of them, as `ordered` has it; as given where there is no ranking."""
+    """Sort policies by the ranking, as `ordered` does; as given where there is no ranking."""
     try:
         return ordered(policies, current(db, participant, caller).answer)
     except NotFound:
@@ -92,9 +92,10 @@ def best_first(db: Session, participant: Participant, policies: Sequence[Policy]
 
 
 def ordered(policies: Sequence[Policy], answered: Answer) -> list[Policy]:
-    """What may be planned, what to test first; then what acts like cDBS, and what is not advised; each behaviour once before any twice.
+    """Sort policies: those that may be planned, what to test first; then those like cDBS, and those not advised; each behaviour once before
+    any twice.
 
-    Policies that the ranking does not hold come last, as given.
+    Policies that are not in the ranking come last, as given.
     """
     distinct = (*answered.rows, *answered.like_cdbs, *answered.like_off)
     heads = [r.one.policy.id for r in sorted(distinct, key=lambda r: r.decided.needs_override)]
@@ -103,7 +104,7 @@ def ordered(policies: Sequence[Policy], answered: Answer) -> list[Policy]:
 
 
 def other_than(policy: Policy, policies: Sequence[Policy], answered: Answer | None) -> Policy | None:
-    """The best of some policies to hold one against: of another behaviour where there is one; None where there is no other."""
+    """Choose the best of some policies to compare one with: of another behaviour where there is one; None where there is no other."""
     heads = answered.heads() if answered is not None else {}
     others = [p for p in (ordered(policies, answered) if answered is not None else policies) if p.id != policy.id]
     unlike = (p for p in others if heads.get(p.id, p.id) != heads.get(policy.id, policy.id))
@@ -125,27 +126,27 @@ Floats = NDArray[np.float64]
 
 
 def sessions_to_replay(db: Session, participant: Participant) -> Sequence[StudySession]:
-    """Sessions over whose beta policies may be run, newest first; none of a blinded plan whose key is sealed."""
+    """List sessions over whose beta policies may be run, newest first; none of a blinded plan whose key is sealed."""
     found = study_repository.sessions_of_participant(db, participant.id)
     return [s for s in reversed(found) if s.excluded_reason is None and not s.visit.sealed]
 
 
 def replay(db: Session, participant: Participant, session_id: int, policies: Sequence[Policy], caller: Caller) -> ReplayOut:
-    """What policies would have asked for before every step of a session.
+    """Compute what policies would have requested before every step of a session.
 
     Args:
         db: the session. participant: whose session and policies. session_id: of the recorded session. policies: one to three.
         caller: must be allowed to know what ran.
 
     Raises:
-        NotFound: no such session. Forbidden: what ran is hidden from the caller. Invalid: none or too many policies, a session without
-            beta or too long, beta of another unit or source than a policy learned from, or a file that cannot be run.
+        NotFound: no such session. Forbidden: what ran is hidden from the caller. Invalid: none or too many policies, or a file that cannot
+            be run. Also a session without beta or too long, or beta of another unit or source than a policy learned from.
     """
     return replay_over(db, participant, recorded(db, participant, session_id, caller), policies)
 
 
 def recorded(db: Session, participant: Participant, session_id: int, caller: Caller) -> SessionData:
-    """A session over which policies may be run. Raises NotFound and Forbidden as `replay` does."""
+    """Load a session over which policies may be run. Raises NotFound and Forbidden as `replay` does."""
     session = study_repository.session(db, session_id, caller)
     access.require_own(participant, session.visit, f"session {session_id}")
     require_known(session.visit, caller)
@@ -153,7 +154,7 @@ def recorded(db: Session, participant: Participant, session_id: int, caller: Cal
 
 
 def fitting(db: Session, participant: Participant, data: SessionData, policies: Sequence[Policy]) -> list[Policy]:
-    """Of some policies those that take beta as the session has it, in the same order; all of them where it has none."""
+    """Filter policies: those that take beta as the session has it, in the same order; all of them where it has none."""
     trace = data.table.beta_trace
     return [p for p in policies if trace is None or _signal(db, participant, p) == (trace.unit, trace.source)]
 
@@ -161,7 +162,7 @@ def fitting(db: Session, participant: Participant, data: SessionData, policies: 
 def newest_fitting(
     db: Session, participant: Participant, sessions: Sequence[StudySession], policies: Sequence[Policy], caller: Caller, *, every: bool
 ) -> SessionData | None:
-    """The first of some sessions, newest first, whose beta policies take; None where none of the first MOST_TRIED has it.
+    """Find the first of some sessions, newest first, whose beta policies take; None where none of the first MOST_TRIED has it.
 
     Args:
         db, participant, caller: as in `replay`. sessions: as `sessions_to_replay` gives them. policies: at least one.
@@ -186,7 +187,7 @@ def newest_fitting(
 
 
 def replay_over(db: Session, participant: Participant, data: SessionData, policies: Sequence[Policy]) -> ReplayOut:
-    """The same over a session that `recorded` gave. Raises Invalid as `replay` does."""
+    """Compute the replay over a session that `recorded` gave. Raises Invalid as `replay` does."""
     if not 1 <= len(policies) <= MOST:
         raise Invalid(f"{len(policies)} policies cannot be compared.", f"Choose one to {MOST}.")
     session, session_id = data.session, data.session.id
@@ -219,7 +220,7 @@ def replay_over(db: Session, participant: Participant, data: SessionData, polici
 
 
 def _rows(table: StepTable, window: int) -> Floats:
-    """Beta of the W rows before the session and of the session, [W + T]."""
+    """Return beta of the W rows before the session and of the session, [W + T]."""
     during = table.beta[table.t_s > 0]
     lead = table.beta[table.t_s <= 0][-window:]
     return np.concatenate([np.full(window - lead.size, np.nan), lead, during])
@@ -248,7 +249,7 @@ def _run(policies: Sequence[Policy], rows: Floats, window: int, period_s: float)
 
 
 def _signal(db: Session, participant: Participant, policy: Policy) -> tuple[str | None, str | None]:
-    """Unit and source of the beta that a policy takes; the participant's own for one that was made elsewhere."""
+    """Return unit and source of the beta that a policy takes; the participant's own for one that was made elsewhere."""
     snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id is not None else None
     settings = participant.current_settings
     return (snapshot.beta_unit, snapshot.beta_source) if snapshot else (settings.beta_unit, settings.beta_source)
@@ -277,7 +278,7 @@ def _summary(policy: Policy, asked: Floats) -> AskedOut:
 
 
 def _difference(one: Policy, other: Policy, asked: Mapping[int, Floats], begins: Floats) -> DifferenceOut | None:
-    """How far two are apart; None where no step has an answer of both."""
+    """Compute the distance of two policies; None where no step has an answer of both."""
     apart = asked[one.id] - asked[other.id]
     known = np.isfinite(apart)
     if not known.any():
@@ -304,7 +305,7 @@ ALIKE = 0.005
 
 
 def amplitude(found: ReplayOut, fraction: float | None) -> str:
-    """An amplitude in mA; as a share of cDBS where that is not known in mA."""
+    """Write an amplitude in mA; as a share of cDBS where that is not known in mA."""
     if fraction is None:
         return "—"
     cdbs = found.cdbs_amplitude_ma
@@ -312,7 +313,7 @@ def amplitude(found: ReplayOut, fraction: float | None) -> str:
 
 
 def differences(found: ReplayOut) -> list[str]:
-    """How the policies differ, a sentence for each pair."""
+    """Describe how the policies differ, a sentence for each pair."""
     names = {a.policy_id: a.name for a in found.asked}
     return [_difference_words(found, d, names[d.policy_id], names[d.other_id]) for d in found.differences]
 

@@ -14,7 +14,7 @@ from ml.policies.onnx_policy import OnnxPolicy, PolicyFileError
 
 
 def ask(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
-    """What each policy asks for before every step.
+    """Compute what each policy requests before every step.
 
     Args:
         params: `policies` as [{`id`, `file` (path)}], `window` (W), `period_s`, `beta`: one value per period or None, the W before the
@@ -38,7 +38,7 @@ def ask(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, 
 
 
 def run(network: PolicyWindow, beta: list[float | None], window: int, period_s: float) -> list[float | None]:
-    """One policy in the tablet's loop. `beta` [W + T] as in `ask`; the answers of steps 0 to T - 1."""
+    """Run one policy in the tablet's loop. `beta` [W + T] as in `ask`; the answers of steps 0 to T - 1."""
     signal = Signal("recorded", "recorded")  # units were compared before
     limits = EnvelopeLimits(min_ma=0.0, max_ma=1.0, cdbs_ma=1.0, ramp_ma_per_s=1.0 / period_s, window=window, period_s=period_s)
     loop = BoundedController(network, limits, signal)

@@ -42,15 +42,15 @@ LOOKS = (("rl", ""), ("accent", "7 3"), ("distilled", "2 3"))
 
 W, LEFT, RIGHT = 1100.0, 60.0, 132.0
 NAME_LETTERS = 16
-"""Of a policy's name that fit beside its line; the table below has all of it."""
+"""Letters of a policy's name that fit next to its line; the table below has all of it."""
 BETA_H, AMPLITUDE_H, TOP, BETWEEN, BOTTOM = 120.0, 220.0, 30.0, 62.0, 44.0
 
 
 def figure(found: ReplayOut, step: int) -> Markup:
-    """Beta above, amplitudes below: recorded in grey, a line for each policy with its name, and where the reader is.
+    """Draw beta above, amplitudes below: recorded in grey, a line for each policy with its name, and the cursor.
 
     Args:
-        found: the comparison. step: at which the cursor stands.
+        found: the comparison. step: of the cursor.
     """
     unit_ma = found.cdbs_amplitude_ma
     factor, unit = (unit_ma, "mA") if unit_ma is not None else (100.0, "% of cDBS")
@@ -83,7 +83,7 @@ def figure(found: ReplayOut, step: int) -> Markup:
 
 
 def _names(plane: Plane, lines: Sequence[tuple[str, str, Sequence[tuple[float, float | None]]]]) -> None:
-    """The name of each line in its colour, beside its last value; a line without any has none."""
+    """Place the name of each line in its colour, next to its last value; a line without any has none."""
     ends = [(name, colour, next((v for _, v in reversed(values) if v is not None), None)) for name, colour, values in lines]
     known = [(name, colour, plane.at_y(value) + 4) for name, colour, value in ends if value is not None]
     places = apart([y for _, _, y in known], low=plane.top + 4, high=plane.top + plane.height)
@@ -92,7 +92,7 @@ def _names(plane: Plane, lines: Sequence[tuple[str, str, Sequence[tuple[float, f
 
 
 def frame(found: ReplayOut) -> dict[str, Any]:
-    """What moving along the session needs: where the figure begins and ends, and the numbers of every step."""
+    """Return the data for moving along the session: where the figure begins and ends, and the numbers of every step."""
     return {
         "left": LEFT,
         "width": W - LEFT - RIGHT,
@@ -120,7 +120,7 @@ def read_replay(
     session: Annotated[RowId, Query(description="A recorded session of the participant.")],
     policy: Annotated[list[RowId], Query(min_length=1, max_length=MOST, description="Policies to compare.")],
 ) -> ReplayOut:
-    """What policies would have asked for on a recorded session's beta: not what would have happened."""
+    """Return what policies would have requested on a recorded session's beta: not what would have happened."""
     return replay(db, participant, session, learning.policies_named(db, participant.id, list(dict.fromkeys(policy))), caller)
 
 
@@ -137,8 +137,9 @@ def compare(
     policy: Annotated[list[RowId] | None, Query(max_length=20)] = None,
     at: Annotated[int, Query(ge=0, le=10**6)] = 0,
 ) -> HTMLResponse:
-    """Two or three policies over a session: what each would have asked. Where no session is named, the newest whose beta they take; where
-    no policies are, the two best of the ranking that take its beta."""
+    """Compare two or three policies over a session. By default it is the newest session whose beta they take, and the two best of the
+    ranking that take its beta.
+    """
     sessions = sessions_to_replay(db, participant)
     available = list(learning.candidates(db, participant.id))
     best = best_first(db, participant, available, caller) if not policy else []

@@ -1,4 +1,4 @@
-"""What sessions of policies showed, as the posterior takes it: of every policy that ran, whether it is still a candidate or not."""
+"""Results of policies' sessions, for the posterior: of every policy that ran, candidate or not."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class Tested:
     left_out: dict[str, int]
 
     def beside(self, evaluated: Collection[int]) -> list[dict[str, Any]]:
-        """The policies that are not evaluated themselves, as [{`id`, `sha256`}]: they are replayed beside those that are."""
+        """Return the policies that are not evaluated themselves, as [{`id`, `sha256`}]: they are replayed besides those that are."""
         return [{"id": p.id, "sha256": p.onnx_sha256} for p in self.policies.values() if p.id not in evaluated]
 
 
 def tested(db: Session, snapshot: BufferSnapshot, buffer: ReplayBuffer, horizon_steps: int, caller: Caller) -> Tested:
-    """What policies and cDBS showed in confirmed sessions, under the settings of a snapshot.
+    """Collect the results of policies and cDBS in confirmed sessions, under the settings of a snapshot.
 
     Args:
         db: the session. snapshot: what the estimates rest on. buffer: the same, read. horizon_steps: of the estimates.
@@ -65,7 +65,7 @@ def tested(db: Session, snapshot: BufferSnapshot, buffer: ReplayBuffer, horizon_
 
 
 def replayable(policy: Policy, window: int) -> bool:
-    """Whether a policy can be replayed on windows of that many beta amplitudes; not where its file is gone."""
+    """Check whether a policy can be replayed on windows of that many beta amplitudes; not where its file is gone."""
     try:
         onnx_of(policy)
         return window_of(policy) == window

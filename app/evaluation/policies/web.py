@@ -38,7 +38,7 @@ _LABELS = {"retired_reason": "Reason"}
 
 @pages.get("/participants/{code}/policies/{policy_id}", dependencies=[ResultsViewed])
 def policy_page(request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """One policy: its verdict and picture, where it comes from, its learning curves, its bundle."""
+    """Show one policy: its verdict and picture, where it comes from, its learning curves, its bundle."""
     return _page(request, participant, policy, db, caller)
 
 
@@ -69,7 +69,7 @@ def _page(
     error: BetaloopError | None = None,
     reason: str = "",
 ) -> HTMLResponse:
-    """The page; `reason` is that of the form which was refused."""
+    """Render the page; `reason` is that of the form which was refused."""
     try:
         judged = current(db, participant, caller)
     except NotFound:
@@ -108,13 +108,13 @@ def _page(
 
 
 def _same(policy: Policy, answered: Answer) -> list[PolicyHead]:
-    """The other policies of its row in the ranking."""
+    """List the other policies of its row in the ranking."""
     heads = answered.heads()
     return [row.one.policy for i, row in answered.everyone().items() if i != policy.id and heads[i] == heads.get(policy.id)]
 
 
 def _lineage(db: Session, policy: Policy) -> list[tuple[str, Policy]]:
-    """What a policy was made from, the nearest first: how, and from which one."""
+    """List what a policy was made from, the nearest first: how, and from which one."""
     found: list[tuple[str, Policy]] = []
     seen = {policy.id}
     at: Policy | None = policy

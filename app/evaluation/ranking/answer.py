@@ -1,4 +1,4 @@
-"""What the ranking page answers first: what to test, at what cost and risk, one row per distinct behaviour. Values only, no sentences."""
+"""First answer of the ranking page: what to test, at what cost and risk, one row per distinct behaviour. Values only, no sentences."""
 
 from __future__ import annotations
 
@@ -37,8 +37,7 @@ SAME_SHARE = 0.02
 """Two policies do the same only where their shares of time nearly off differ by less, whatever they ask for on average."""
 
 AS_THE_TEACHER = 0.02
-"""Of a ranking without a map of behaviours: a student whose mean amplitude and distance to cDBS differ from its teacher's by less does
-what its teacher does; of other pairs nothing is known there."""
+"""Limit below which a student equals its teacher in mean amplitude and distance to cDBS, in rankings without a map of behaviours."""
 
 OFF_SHARE = 0.8
 """A policy that is nearly off in more than this share of its steps acts like no stimulation."""
@@ -68,7 +67,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Fixed:
-    """The best amplitude held all the time by the scores that rank, where that is another than cDBS: what a controller has to beat.
+    """The best constant amplitude by the scores that rank, where that is another than cDBS: what a controller has to beat.
 
     Attributes:
         fraction: of the cDBS amplitude. ma: mA; None where the cDBS amplitude is not known.
@@ -115,7 +114,7 @@ class Row:
 
     @property
     def may_be_picked(self) -> bool:
-        """Whether a visit may be planned with it, without a clinician's reason, and would show anything."""
+        """True where a visit may be planned with it without a clinician's reason, and would show anything."""
         return (
             self.decided.standing not in ("unsafe", "likely_worse", "not_advised", "same_as_cdbs")
             and self.one.policy.retired_reason is None
@@ -156,56 +155,56 @@ class Answer:
         return {name: rows for name, rows in found.items() if rows}
 
     def of(self, code: str) -> list[Row]:
-        """Rows that stand so and are not retired."""
+        """Return the rows of a standing that are not retired."""
         return [r for r in self.rows if r.decided.standing == code and r.one.policy.retired_reason is None]
 
     @property
     def hazards(self) -> list[Row]:
-        """What is not to be run without a clinician's word, whatever its verdict, events first; less what `off` holds."""
+        """Rows that need a clinician's clearance to run, whatever their verdict, events first; without those of `off`."""
         found = [r for r in (*self.rows, *self.like_off) if _held_back(r) and r not in self.off]
         return sorted(found, key=lambda r: (not _happened(r), not r.decided.hazards))
 
     @property
     def off(self) -> list[Row]:
-        """What is not to be run without a clinician's word because it is no stimulation by another name, and for nothing that happened."""
+        """Rows that need a clinician's clearance to run because they are no stimulation by another name, and for nothing that happened."""
         return [r for r in self.like_off if _held_back(r) and not _happened(r)]
 
     @property
     def undecided(self) -> list[Row]:
-        """What may be run and yet is not worth a visit now."""
+        """Rows that may be run and yet are not worth a visit now."""
         return [r for r in self.rows if r.decided.standing in ("undecided", "cannot_tell") and r.one.policy.retired_reason is None]
 
     @property
     def pickable(self) -> bool:
-        """Whether there is a candidate that a visit may be planned with, without a clinician's reason."""
+        """True where a visit may be planned with a candidate without a clinician's reason."""
         return any(r.may_be_picked for r in (*self.rows, *self.like_cdbs, *self.like_off))
 
     @property
     def tested(self) -> bool:
-        """Whether some candidate that was trained here ran in a session, so that a next generation can go on from it."""
+        """True where some candidate that was trained here ran in a session, so that a next generation can go on from it."""
         everyone = (row.one for row in self.everyone().values())
         return any(a.tested is not None and a.policy.kind in ("trained", "distilled") for a in everyone)
 
     @staticmethod
     def counted(rows: Sequence[Row]) -> int:
-        """How many policies rows hold, those that do the same among them."""
+        """Count the policies of rows, those that do the same among them."""
         return sum(1 + len(row.twins) for row in rows)
 
     def everyone(self) -> dict[int, Row]:
-        """Every candidate's own row by the id of its policy, as ordered, twins after what they do the same as."""
+        """Map every candidate's own row by the id of its policy, as ordered, twins after what they do the same as."""
         rows = (*self.rows, *self.like_cdbs, *self.like_off)
         return {own.one.policy.id: own for r in rows for own in (r, *r.twins)}
 
     def heads(self) -> dict[int, int]:
-        """By the id of every candidate that of the one whose row it is in."""
+        """Map the id of every candidate to that of the one whose row it is in."""
         rows = (*self.rows, *self.like_cdbs, *self.like_off)
         return {own.one.policy.id: r.one.policy.id for r in rows for own in (r, *r.twins)}
 
     @property
     def cheapest(self) -> list[Row]:
-        """The rows that the fewest further sessions would tell, what saves most and is likely within the margins first.
+        """Rows that the fewest further sessions would decide, what saves most and is likely within the margins first.
 
-        What is expected to save less than `LEAST_SAVING` is left out, unless nothing else is there: to know of it helps nobody.
+        What is expected to save less than `LEAST_SAVING` is excluded, unless nothing else is there: to know of it helps no patient.
         """
         told = [(n, r) for r in self.undecided for n in [_needed(r)] if n is not None]
         worth = [(n, r) for n, r in told if r.saving >= LEAST_SAVING] or told
@@ -214,7 +213,7 @@ class Answer:
 
 
 def answer(found: Assessment) -> Answer:
-    """What to say of an assessment's candidates."""
+    """Build the answer about an assessment's candidates."""
     known = map_of(found.evaluation)
     rows = [_row(found, known, one, tuple(_row(found, known, twin) for twin in twins)) for one, *twins in behaviours(found)]
     if not found.ordered:
@@ -228,7 +227,7 @@ def answer(found: Assessment) -> Answer:
 
 
 def differences(own: Estimate | None, cdbs: Estimate | None) -> dict[str, Difference]:
-    """Predicted quantities less those under cDBS, from aligned draws."""
+    """Compute predicted quantities less those under cDBS, from aligned draws."""
     found: dict[str, Difference] = {}
     if own is None or cdbs is None:
         return found
@@ -242,17 +241,17 @@ def differences(own: Estimate | None, cdbs: Estimate | None) -> dict[str, Differ
 
 
 def map_of(evaluation: Evaluation) -> BehaviourMap | None:
-    """What its policies ask for at which beta, and how far they are apart; None of an evaluation without a map."""
+    """Read the map of what its policies request at which beta, and how far they are apart; None of an evaluation without a map."""
     stored = (evaluation.diagnostics.get(STORED) or {}).get(MAP)
     return BehaviourMap.from_json(stored) if stored else None
 
 
 def behaviours(found: Assessment) -> list[list[Assessed]]:
-    """The candidates by what they do, in the order of the assessment; first in each group the one that stands for it.
+    """Group the candidates by what they do, in the order of the assessment; the first of each group represents it.
 
-    A policy joins a group where it does the same as the one that stands for it: the same verdict for the same hazards, amplitudes that are
-    at most `SAME_AMPLITUDE` of cDBS apart on average over the recorded states, by which *same as cDBS* is judged too, and as much time
-    nearly off. One that was tested stands before one that was not, and a teacher before its student.
+    A policy joins a group where it does the same as the one that represents it. They have the same verdict for the same hazards, and as
+    much time nearly off. Their amplitudes are at most `SAME_AMPLITUDE` of cDBS apart on average over the recorded states; *same as cDBS* is
+    judged by that too. A tested policy comes before one that was not, and a teacher before its student.
     """
     known = map_of(found.evaluation)
     candidates = [a for a in found.candidates if a.decided is not None]
@@ -268,7 +267,7 @@ def behaviours(found: Assessment) -> list[list[Assessed]]:
 
 
 def _nearly_off(estimate: Estimate | None) -> float:
-    """Share of time in which a policy asks for less than 20 % of cDBS; 0 where it is not known."""
+    """Return the share of time in which a policy requests less than 20 % of cDBS; 0 where it is not known."""
     return float(_behaviour(estimate).get("below_cdbs_20_percent") or 0.0)
 
 

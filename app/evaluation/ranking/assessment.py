@@ -1,4 +1,4 @@
-"""What one evaluation says of every policy: its place, its verdict, what the data cover, and what its sessions showed."""
+"""Assessment of every policy in one evaluation: its place, its verdict, what the data cover, and the results of its sessions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ml.trajectories import SessionTrajectory
 # What sessions really brought, in the terms of the estimates: the same horizon H, the same discount, the same constants of the reward.
 
 QUANTITIES = ("energy", "mean_beta", *FIELDS)
-"""What methods predict beside the return and sessions show: mean a^2, mean beta (participant's unit), outcomes."""
+"""Quantities that methods predict besides the return and that sessions show: mean a^2, mean beta (participant's unit), outcomes."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Actual(ActualReturn):
 
 
 def actual(session: SessionTrajectory, settings: MdpSettings, horizon_steps: int) -> Actual:
-    """A session's actual return over H steps; QoCs, energy and beta are of the whole session, whatever H is."""
+    """Compute a session's actual return over H steps; QoCs, energy and beta are of the whole session, whatever H is."""
     found = actual_return(session, settings, horizon_steps)
     return Actual(found.step_return, found.end_reward, _shown(session))
 
@@ -61,7 +61,7 @@ def _shown(session: SessionTrajectory) -> dict[str, float]:
 
 
 def mean_of(values: Sequence[float | None]) -> float | None:
-    """Mean of the known values; None where there is none."""
+    """Average the known values; None where there is none."""
     known = [v for v in values if v is not None]
     return float(np.mean(known)) if known else None
 
@@ -78,8 +78,8 @@ class Assessed:
         reference: `cdbs`, `constant`, `best_constant`, `proportional`, `cloning`; None for a candidate.
         estimate: by the ranking's method; None where it has none. estimates: of every method.
         rank: 1 is best; None for references, and where the data cannot order policies. probability_best: likewise.
-        decided: the verdict; None for references. planned: the same for candidates, and for references the verdict by which a plan takes
-            them; None for cDBS. coverage: None where nothing was checked. tested: None where it never ran.
+        decided: the verdict; None for references. planned: the same for candidates, and for references the verdict that a plan uses; None
+            for cDBS. coverage: None where nothing was checked. tested: None where it never ran.
     """
 
     policy: PolicyHead
@@ -95,7 +95,7 @@ class Assessed:
 
     @property
     def posterior(self) -> Estimate | None:
-        """What the verdict rests on."""
+        """Posterior estimate, the basis of the verdict."""
         return self.estimates.get(POSTERIOR)
 
 
@@ -119,12 +119,12 @@ class Assessment:
 
     @property
     def candidates(self) -> list[Assessed]:
-        """What is ranked."""
+        """Policies that are ranked."""
         return [a for a in self.assessed if a.reference is None]
 
     @property
     def references(self) -> list[Assessed]:
-        """What candidates are held against."""
+        """References that candidates are compared with."""
         return [a for a in self.assessed if a.reference is not None]
 
     @property
@@ -144,7 +144,7 @@ class Assessment:
 
     @property
     def weights(self) -> Mapping[str, float]:
-        """How the structures behind the posterior were averaged, the same for all policies; empty where there is no posterior."""
+        """Weights of the structures behind the posterior, the same for all policies; empty where there is no posterior."""
         return self._posterior_detail("weights")
 
     @property
@@ -160,7 +160,7 @@ class Assessment:
 
     @property
     def left_out_outcomes(self) -> Mapping[str, Mapping[str, float | None]]:
-        """How well outcomes of left-out sessions and visits are predicted (`EndModel.predictability`); empty without a posterior."""
+        """Skill of the predicted outcomes of held-out sessions and visits (`EndModel.predictability`); empty without a posterior."""
         return self._posterior_detail("left_out_outcomes")
 
     def _posterior_detail(self, name: str) -> Mapping[str, Any]:
@@ -168,11 +168,11 @@ class Assessment:
         return (found.details.get(name) or {}) if found is not None else {}
 
     def of(self, policy_id: int) -> Assessed | None:
-        """One policy; None where the evaluation does not have it."""
+        """Find one policy; None where the evaluation does not have it."""
         return next((a for a in self.assessed if a.policy.id == policy_id), None)
 
     def with_tests(self, tested: Mapping[int, TestedBefore]) -> Assessment:
-        """The same with what sessions showed, by policy."""
+        """Add the results of sessions, by policy."""
         return replace(self, assessed=tuple(replace(a, tested=tested.get(a.policy.id)) for a in self.assessed))
 
 
@@ -185,7 +185,7 @@ def assess(
     cdbs_ma: float | None,
     harms: Mapping[int, tuple[Flag, ...]] | None = None,
 ) -> Assessment:
-    """What an evaluation says of its policies by one method, with the verdicts by the participant's margins of now.
+    """Assess the policies of an evaluation by one method, with the verdicts by the participant's present margins.
 
     Args:
         evaluation: with its estimates. policies: all of them, by id. method: whose estimates rank; one of the evaluation's.
@@ -258,7 +258,7 @@ def _tier(verdict: Decided, estimate: Estimate) -> int:
 
 
 def _references(policies: Mapping[int, PolicyHead], by_method: Mapping[int, Estimate]) -> dict[int, str]:
-    """Kinds of the policies that are not ranked; the best constant is so by its own estimate."""
+    """Return the kinds of the policies that are not ranked; the best constant is so by its own estimate."""
     references = {i: _reference(p) for i, p in policies.items() if p.kind == "baseline"}
     constants = {i: by_method[i] for i, r in references.items() if r in ("cdbs", "constant") and i in by_method and by_method[i].supported}
     if constants:
@@ -275,7 +275,7 @@ def _reference(policy: PolicyHead) -> str:
 
 
 def cdbs_amplitude_now(participant: Participant) -> float | None:
-    """The cDBS amplitude, mA; None where nobody stated one, or each side has its own: amplitudes are then told as shares of cDBS."""
+    """Return the cDBS amplitude, mA; None where none is stated, or each side has its own: amplitudes are then shares of cDBS."""
     try:
         return cdbs_amplitude.in_force_now(participant, None)
     except Invalid:

@@ -9,18 +9,18 @@ from ml.ope import shown
 
 
 def style(method: str) -> dict[str, str]:
-    """Colour and symbol of a method's marks."""
+    """Return colour and symbol of a method's marks."""
     found = shown(method)
     return {"color": f"token:{found.colour}", "symbol": found.symbol}
 
 
 def shown_references(ranking: RankingOut) -> list[RankedPolicy]:
-    """References for the page: cDBS, the best constant, proportional control, the behaviour clone; the API has every constant."""
+    """Select references for the page: cDBS, the best constant, proportional control, the behaviour clone; the API has every constant."""
     return [p for p in ranking.references if p.reference != "constant"]
 
 
 def label(policy: RankedPolicy) -> str:
-    """A policy's name in the ranking's charts and tables."""
+    """Return a policy's name in the ranking's charts and tables."""
     names = {
         "cdbs": "cDBS (reference)",
         "best_constant": f"best constant: {policy.name}",

@@ -22,16 +22,16 @@ SESSION_NOISE = "session_noise"
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What verdicts of one evaluation share.
+    """Inputs that verdicts of one evaluation share.
 
     Attributes:
         evaluation_id, evaluated_at: of the evaluation.
         margins: of the participant, in force now: those of the newest lock, else the newest. levels: the newest version, locked or not.
-        unchecked: why what the data cover could not be checked; None where it was.
-        noise: of a session, by outcome. place: within what a plan holds sessions near an amplitude, B among it.
+        unchecked: why the coverage by the data could not be checked; None where it was.
+        noise: of a session, by outcome. place: range in which a plan may keep sessions near an amplitude, B among it.
         cdbs_ma: the cDBS amplitude, mA; None where it is not known.
-        held: what constants would do, the amplitude (fraction of cDBS) of each with its posterior: by them it is known what sessions held
-            near an amplitude would show.
+        `held`: constants, the amplitude (fraction of cDBS) of each with its posterior: they show what sessions near an amplitude would
+            show.
     """
 
     evaluation_id: int
@@ -61,12 +61,12 @@ class Decided:
 
     @property
     def needs_override(self) -> bool:
-        """Whether it may only be planned with a clinician's stated reason."""
+        """True where it may only be planned with a clinician's stated reason."""
         return self.decision in ("unsafe", "likely_worse") or bool(self.hazards)
 
     @property
     def standing(self) -> Standing:
-        """The verdict as a page shows it: what is dangerous is not advised, also where the data cannot tell the rest."""
+        """The verdict as a page shows it: what is dangerous is not advised, also where the data cannot decide the rest."""
         return "not_advised" if self.hazards and self.decision != "unsafe" else self.decision
 
     @property
@@ -85,9 +85,9 @@ def decide(
     retired_reason: str | None = None,
     harms: tuple[Flag, ...] = (),
 ) -> Decided:
-    """The verdict on one candidate.
+    """Decide the verdict on one candidate.
 
-    A retired policy cannot be told: it is not proposed, whatever is predicted. Nor can one of an evaluation without a posterior: a single
+    A retired policy has no verdict: it is not proposed, whatever is predicted. Nor can one of an evaluation without a posterior: a single
     method knows no chance of keeping within the margins. It is unsafe where the whole interval of its gain over cDBS is below 0. A serious
     adverse event and a stop count whatever else is known.
 
@@ -110,7 +110,7 @@ def decide(
     if found.code != "undecided" or found.reasons[0].code not in SETTLED_BY_SESSIONS or not ordered:
         return Decided(found.code, found.reasons, found)
     if not given.noise:
-        return Decided(found.code, found.reasons, found)  # how much a session tells is not known
+        return Decided(found.code, found.reasons, found)  # how much a session shows is not known
     further = _further(own, reference, given, levels, policy_id)
     return Decided(found.code, (*found.reasons, *_of_sessions(further, given.cdbs_ma)), found, further)
 
@@ -123,17 +123,17 @@ def findings_of(events: Sequence[AdverseEvent]) -> tuple[Flag, ...]:
 
 
 def levels_of(margins: MarginsVersion) -> Levels:
-    """The levels of a version, for science."""
+    """Convert the levels of a version for the analyses."""
     return Levels(margins.test_within, margins.test_saves, margins.unsafe_beyond, margins.nearly_off_share)
 
 
 def ordering_told(posterior: Mapping[int, Estimate]) -> bool:
-    """Whether the data can order policies; True where an evaluation has no posterior, and its order is that of a single method."""
+    """Check whether the data can order policies; True where an evaluation has no posterior, and its order is that of a single method."""
     return all((e.details.get("skill") or {}).get("told", False) for e in posterior.values())
 
 
 def session_noise(evaluation: Evaluation) -> dict[str, float]:
-    """Standard deviation of each outcome from session to session, as it was when the evaluation was made; empty where it is not known."""
+    """Return the standard deviation of each outcome from session to session when the evaluation was made; empty where it is not known."""
     stored: Mapping[str, Any] = evaluation.diagnostics.get("coverage") or {}
     return {name: float(v) for name, v in (stored.get(SESSION_NOISE) or {}).items()}
 
@@ -153,7 +153,7 @@ _KEPT = 5000
 
 
 def _further(own: Estimate, cdbs: Estimate | None, given: Circumstances, levels: Levels, policy_id: int) -> Further | None:
-    """How many further sessions near which amplitude would tell; None where none would that a plan can hold."""
+    """Find how many further sessions near which amplitude would decide; None where none would that a plan can contain."""
     if cdbs is None:
         return None
     key = (given.evaluation_id, given.evaluated_at, policy_id, given.margins.id, given.levels.id)
@@ -165,7 +165,7 @@ def _further(own: Estimate, cdbs: Estimate | None, given: Circumstances, levels:
 
 
 def _of_sessions(further: Further | None, cdbs_ma: float | None) -> tuple[Flag, ...]:
-    """What would tell as findings, or that nothing would."""
+    """List the sessions that would decide as findings, or that none would."""
     if further is None:
         return (Flag("not_settled_by_sessions"),)
     at = Flag("near_amplitude", further.fraction, None, "of cDBS")

@@ -1,9 +1,9 @@
-"""An evaluation as it is judged now: what follows from its draws is computed once and kept by this process under all that it depends on.
+"""Cache of verdicts per evaluation, kept by this process under all that a verdict depends on.
 
-An evaluation and its estimates never change. Verdicts also depend on the margins and levels in force, the policies as they are now, the
-cDBS amplitude and what happened under which policy; a page also on the sessions so far. All of these are in the key as values or, for
-sessions, as their rows' versions, so that whatever changes makes a new key. The draws themselves, a megabyte of JSON, are read only where
-something is not kept yet.
+An evaluation and its estimates never change. Verdicts also depend on the margins and levels in force, the present policies, the cDBS
+amplitude and what happened under which policy. A page also depends on the sessions so far. All of these are in the key as values or, for
+sessions, as their rows' versions, so that every change makes a new key. The draws themselves, a megabyte of JSON, are read only where
+something is not cached yet.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ from ml.ope import Estimate, Flag, method_keys
 T = TypeVar("T")
 
 DRAWS = ("draws", "outcome_draws")
-"""What is left out of the details of an estimate that is kept."""
+"""Details of a cached estimate that are removed."""
 
 
 @dataclass
 class Judged:
-    """One evaluation of a participant, by one method, as it is judged now; of one request.
+    """One evaluation of a participant, by one method, under its present verdicts; of one request.
 
     Attributes:
-        heads: its policies as they are now, by id. happened: by policy, serious events and stops that no clinician has cleared.
-        caller, sessions: who asks what sessions showed, and the participant's; both None where nobody asks for that.
+        heads: its present policies, by id. happened: by policy, serious events and stops that no clinician has cleared.
+        caller, sessions: who requests the results of sessions, and the participant's; both None without that request.
     """
 
     db: Session
@@ -63,7 +63,7 @@ class Judged:
 
     @cached_property
     def key(self) -> Hashable:
-        """Everything that what is kept depends on, beside this code."""
+        """Everything that cached results depend on, besides this code."""
         margins, levels = self.participant.margins_in_force.id, self.participant.current_margins.id
         heads, happened = tuple(self.heads.values()), tuple(self.happened.items())
         judged = (self.evaluation.id, self.evaluation.created_at, self.method, heads, happened, self.cdbs_ma)
@@ -73,12 +73,12 @@ class Judged:
         return (*judged, margins, levels, shown)
 
     def kept(self, name: Hashable, compute: Callable[[], T]) -> T:
-        """What follows from this under a name that says what else it depends on."""
+        """Return a cached result; the name must include its other inputs."""
         return kept((name, self.key), compute)
 
     @cached_property
     def tested(self) -> dict[int, TestedBefore]:
-        """What sessions showed, by policy; empty where nobody asks."""
+        """Results of sessions, by policy; empty where they are not requested."""
         if self.caller is None or self.sessions is None:
             return {}
         cdbs = next((i for i, head in self.heads.items() if head.is_cdbs), None)
@@ -86,7 +86,7 @@ class Judged:
 
     @cached_property
     def with_draws(self) -> Assessment:
-        """The assessment with every draw, read and judged anew. For computing what is kept."""
+        """The assessment with every draw, read and judged again. For computing what is cached."""
         version = study_repository.settings_version(self.db, self.evaluation.settings_version_id)
         found = assess(self.evaluation, self.heads, self.method, self.participant, version, self.cdbs_ma, self.happened)
         return found.with_tests(self.tested)
@@ -107,7 +107,7 @@ class Judged:
 
     @cached_property
     def answer(self) -> Answer:
-        """What to test and what not; its estimates are without draws."""
+        """Candidates to test and not to test; the estimates are without draws."""
 
         def read() -> Answer:
             found = self._answer_with_draws
@@ -118,13 +118,13 @@ class Judged:
         return self.kept("answer", read)
 
     def random_sessions(self, settings: SettingsVersion) -> RandomSessions | None:
-        """What random sessions have been for the participant so far; None without any, and where nobody asks what sessions showed."""
+        """Return measured results of random sessions so far; None without any, and where sessions are not requested."""
         if self.caller is None or self.sessions is None:
             return None
         return random_sessions(self.sessions.rows, self.caller, settings, self.participant.margins_in_force, self.cdbs_ma)
 
     def picture(self, bound: Bound, policy_id: int | None = None) -> Picture:
-        """The picture of the candidates, those that act like cDBS last, or of one candidate.
+        """Draw the picture of the candidates, those that act like cDBS last, or of one candidate.
 
         Args:
             bound: B, fraction of cDBS. policy_id: a candidate, which is drawn under its own name where it is a twin.
@@ -157,7 +157,7 @@ def judged(
     caller: Caller | None = None,
     sessions: ReadOnce | None = None,
 ) -> Judged:
-    """One evaluation, the newest or not, as it is judged now.
+    """Judge one evaluation, the newest or not, by the present inputs.
 
     Args:
         db, participant, evaluation: whose. method: whose estimates rank; the evaluation's default where not given.
@@ -179,7 +179,7 @@ def judged(
 
 
 class _WithoutDraws(dict[str, Any]):
-    """Details of an estimate whose draws were left out: to ask for them is an error, not an answer of nothing."""
+    """Details of an estimate whose draws were removed: to read them is an error, not an empty answer."""
 
     def __getitem__(self, name: str) -> Any:
         return super().__getitem__(_present(name))
@@ -193,7 +193,7 @@ class _WithoutDraws(dict[str, Any]):
 
 def _present(name: Any) -> Any:
     if name in DRAWS:
-        raise RuntimeError(f"the {name} of an estimate that is kept were left out: ask the assessment with draws")
+        raise RuntimeError(f"the {name} of a cached estimate were removed: use the assessment with draws")
     return name
 
 

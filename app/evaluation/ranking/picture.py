@@ -51,11 +51,11 @@ class Scale:
 
     @classmethod
     def of(cls, cdbs_ma: float | None) -> Scale:
-        """By the cDBS amplitude, mA."""
+        """Choose the scale by the cDBS amplitude, mA."""
         return cls(100.0, "% of cDBS") if cdbs_ma is None else cls(cdbs_ma, "mA")
 
     def words(self, fraction: float) -> str:
-        """An amplitude with its unit."""
+        """Write an amplitude with its unit."""
         digits = 0 if self.unit.startswith("%") else 1
         return f"{self.factor * fraction:.{digits}f} {self.unit}"
 
@@ -102,7 +102,7 @@ class Picture:
 
 
 def picture(found: Assessment, rows: Sequence[Row], unit: str, bound: Bound) -> Picture:
-    """The picture of some candidates.
+    """Draw the picture of some candidates.
 
     Args:
         found: the assessment. rows: candidates, what matters first. unit: of beta. bound: B, fraction of cDBS.
@@ -157,7 +157,7 @@ def _behaviour(known: BehaviourMap, behaviours: Sequence[Drawn], scale: Scale, u
     plane.level(bound * scale.factor, f"lowest of random sessions {scale.words(bound)}", "muted", "2 3")
     centres = [(a + b) / 2 for a, b in zip(known.edges[:-1], known.edges[1:], strict=True)]
     ends: list[tuple[Drawn, float]] = []
-    for d in reversed(behaviours):  # what matters first lies on top
+    for d in reversed(behaviours):  # what matters first is on top
         curve = known.policies.get(str(d.policy_id))
         if curve is None:
             continue
@@ -222,13 +222,13 @@ def _listed(shown: Sequence[Drawn], references: Sequence[Assessed]) -> list[tupl
 
 
 def _dose(estimate: Estimate | None) -> float | None:
-    """Mean amplitude that a policy asks for, fraction of cDBS."""
+    """Return the mean amplitude that a policy requests, fraction of cDBS."""
     value = ((estimate.details.get("behaviour") or {}) if estimate is not None else {}).get("mean_amplitude")
     return None if value is None else float(value)
 
 
 def _predicted(estimate: Estimate | None, name: str) -> tuple[float, float, float] | None:
-    """A predicted quantity with its 90 % interval."""
+    """Return a predicted quantity with its 90 % interval."""
     draws = outcome_draws(estimate, name) if estimate is not None else None
     if draws is None:
         return None

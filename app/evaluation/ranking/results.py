@@ -36,7 +36,7 @@ from ml.trajectories import SessionTrajectory
 
 @dataclass(frozen=True)
 class DrivenSession:
-    """One session of a policy (or of cDBS) that may be held against estimates, or why it may not.
+    """One session of a policy (or of cDBS) that may be compared with estimates, or why it may not.
 
     Attributes:
         session_id, visit: its number, and that of its visit.
@@ -54,14 +54,14 @@ class DrivenSession:
 
 
 def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller, sessions: ReadOnce | None = None) -> list[DrivenSession]:
-    """Every confirmed session of a policy or of cDBS, by visit and order, under a snapshot's settings, unit and source of beta.
+    """Load every confirmed session of a policy or of cDBS, by visit and order, under a snapshot's settings, unit and source of beta.
 
-    Those of a blinded plan whose key is sealed are left out, of what jobs compute for people too. The buffer's gate does not matter here:
-    it guards what is learnt from, and these sessions are only looked at.
+    Those of a blinded plan whose key is sealed are excluded, also from what jobs compute for people. The buffer's gate does not matter
+    here: it guards what is learnt from, and these sessions are only looked at.
 
     Args:
         db: the session. snapshot: what the estimates rest on. caller: decides which arms may be known.
-        sessions: of the participant, where somebody else reads them too.
+        sessions: of the participant, where other code reads them too.
     """
     sessions = sessions or ReadOnce(db, snapshot.participant_id)
     version = study_repository.settings_version(db, snapshot.settings_version_id)
@@ -81,7 +81,7 @@ def driven_sessions(db: Session, snapshot: BufferSnapshot, caller: Caller, sessi
 
 
 def results_by_policy(ran: list[DrivenSession], settings: MdpSettings, horizon_steps: int, cdbs: int | None) -> dict[int, TestedBefore]:
-    """Actual results by policy, under the settings, horizon and discount of the estimates; those of cDBS under its reference's id."""
+    """Collect actual results by policy, under the estimates' settings, horizon and discount; those of cDBS under its reference's id."""
     results: dict[int, list[Actual]] = defaultdict(list)
     by_visit: dict[int | None, dict[int, list[Actual]]] = defaultdict(lambda: defaultdict(list))
     stopped: Counter[int] = Counter()
@@ -134,12 +134,12 @@ def _apart(ours: Mapping[int, Sequence[Actual]], cdbs: Mapping[int, Sequence[Act
 def tested_before(
     db: Session, evaluation: Evaluation, participant: Participant, caller: Caller, cdbs: int | None, sessions: ReadOnce | None
 ) -> dict[int, TestedBefore]:
-    """The same of all sessions so far, kept by this process until a row of the participant's sessions changes.
+    """Return the results by policy of all sessions so far, cached by this process until a row of the participant's sessions changes.
 
     Args:
         db: the session. evaluation: whose settings, horizon and discount count. participant: whose.
         caller: decides which arms may be known. cdbs: id of the cDBS reference.
-        sessions: of the participant, where somebody else reads them too.
+        sessions: of the participant, where other code reads them too.
     """
     sessions = sessions or ReadOnce(db, participant.id)
     key = ("tested before", evaluation.id, evaluation.created_at, sessions.fingerprint, cdbs, *blinding.sights(db, [participant], caller))
@@ -155,7 +155,7 @@ def tested_before(
 def _read(
     session: StudySession, traces: TracesOf, arm: Arm, version: SettingsVersion, snapshot: BufferSnapshot, failed: Qoc
 ) -> SessionTrajectory | str:
-    """The session's steps, or why they cannot be held against estimates."""
+    """Read the session's steps, or the reason why they cannot be compared with estimates."""
     try:
         table = laid_out(session, version, traces)
     except Invalid as error:
@@ -172,9 +172,9 @@ class RandomSessions:
 
     Attributes:
         sessions, visits: how many, at how many visits. minutes: median length.
-        lowest, highest: B and the amplitude of cDBS, in `unit`. low: only the last `low_minutes` of a session may lie below it; None where
-            nothing is that low, or the design has no such rule.
-        hold_s: shortest and longest time for which an amplitude is held, s.
+        lowest, highest: B and the amplitude of cDBS, in `unit`. low: only the last `low_minutes` of a session may be below it; None where
+            no amplitude is that low, or the design has no such rule.
+        hold_s: shortest and longest time for which an amplitude lasts, s.
         differences: random less cDBS of the same visit, averaged over visits with both, by outcome. worst: of a single session, by outcome.
         beyond: outcomes that were worse than under cDBS by more than the margin, on average.
     """
@@ -196,7 +196,7 @@ class RandomSessions:
 def random_sessions(
     rows: Sequence[StudySession], caller: Caller, settings: SettingsVersion, margins: MarginsVersion, cdbs_ma: float | None
 ) -> RandomSessions | None:
-    """What random sessions have been so far; None without any.
+    """Summarise the random sessions so far; None without any.
 
     Args:
         rows: confirmed sessions. caller: decides which arms may be known. settings: design, B and period of the next one.
@@ -238,7 +238,7 @@ def random_sessions(
 
 
 def _is_beyond(outcome: Outcome, difference: float, margins: Margins, under_cdbs: float) -> bool:
-    """Whether an outcome is worse by more than its margin."""
+    """Check whether an outcome is worse by more than its margin."""
     return bool(outcome.loss(difference) > outcome.margin.amount(margins.of(outcome), under_cdbs))
 
 

@@ -1,4 +1,4 @@
-"""The ranking: newest evaluation, candidates from best to worst, references beside them, and whether it still fits the data."""
+"""The ranking: newest evaluation, candidates from best to worst, references besides them, and whether it still fits the data."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from ml.ope import Estimate, Flag, distinct, gain_over, method_keys
 def current_ranking(
     db: Session, participant: Participant, caller: Caller, method: str | None = None, shown: RankingFilter | None = None
 ) -> RankingOut:
-    """The ranking of the participant's newest evaluation: one snapshot, one settings version, never a mixture.
+    """Return the ranking of the participant's newest evaluation: one snapshot, one settings version, never a mixture.
 
     Args:
         db: the session. participant: whose.
-        caller: decides what may be said about sessions.
+        caller: decides what may be shown of sessions.
         method: whose estimates rank; the evaluation's default where not given. Verdicts are the posterior's all the same.
         shown: which candidates to give; all where not given.
 
@@ -44,7 +44,7 @@ def current_ranking(
 
 
 def current(db: Session, participant: Participant, caller: Caller, method: str | None = None) -> Judged:
-    """The newest evaluation, judged by the margins in force now, with what its policies showed in sessions. Raises as `current_ranking`."""
+    """Judge the newest evaluation by the margins in force now, with its policies' results in sessions. Raises as `current_ranking`."""
     access.require(caller, can.READ, participant)
     evaluation = repository.newest_evaluation(db, participant.id)
     if evaluation is None:
@@ -55,7 +55,7 @@ def current(db: Session, participant: Participant, caller: Caller, method: str |
 
 
 def ranking_of(found: Judged, shown: RankingFilter | None = None) -> RankingOut:
-    """A judged evaluation as the interface has it.
+    """Convert a judged evaluation for the interface.
 
     Args:
         found: the evaluation. shown: which candidates to give; all where not given.
@@ -88,13 +88,13 @@ def ranking_of(found: Judged, shown: RankingFilter | None = None) -> RankingOut:
 
 
 def evaluation_notes(found: Judged) -> list[str]:
-    """The notes of an evaluation's ranking by its own method, whether or not it is the newest."""
+    """Return the notes of an evaluation's ranking by its own method, whether or not it is the newest."""
     return _kept(found).notes
 
 
 @dataclass(frozen=True)
 class _Ranked:
-    """What the interface says of an evaluation's policies; kept, and so never changed."""
+    """Policies of an evaluation for the interface; cached, and so never changed."""
 
     candidates: list[RankedPolicy]
     references: list[RankedPolicy]
@@ -113,7 +113,7 @@ def _read(found: Assessment) -> _Ranked:
 
 
 def _passes(policy: RankedPolicy, shown: RankingFilter | None) -> bool:
-    """Whether a candidate is among those asked for."""
+    """Check whether a candidate passes the filter."""
     if shown is None:
         return True
     tested = "yes" if policy.tested else "no"
@@ -147,7 +147,7 @@ def _ranked(found: Assessment, one: Assessed) -> RankedPolicy:
 
 
 def _flags(estimate: Estimate | None, coverage: CoverageOut | None, is_reference: bool) -> list[FlagOut]:
-    """What to know of a policy. That a reference holds one amplitude is its purpose and no warning."""
+    """List the flags of a policy. A reference with one amplitude gets no warning for that: it is its purpose."""
     own = distinct(estimate.flags) if estimate else ()
     shown = [flag_out(f) for f in own if not (is_reference and f.code == "no_closed_loop")]
     return shown + [note for note in (coverage.notes if coverage else ()) if note not in shown]
@@ -166,11 +166,11 @@ def _snapshot_out(db: Session, row: BufferSnapshot) -> RankedSnapshot:
 
 
 def ranking_notes(policies: Sequence[RankedPolicy], references: Sequence[RankedPolicy], method: str) -> list[Flag]:
-    """What stands above a ranking.
+    """Collect the notes above a ranking.
 
     Args:
         policies: candidates; retired ones, and those without an estimate by the method, say nothing here.
-        references: policies beside them, cDBS among them or not.
+        references: policies besides them, cDBS among them or not.
         method: whose estimates rank.
     """
     present = [(p, p.estimates[method]) for p in policies if method in p.estimates and not p.retired]
@@ -190,7 +190,7 @@ def ranking_notes(policies: Sequence[RankedPolicy], references: Sequence[RankedP
 
 
 def _against_cdbs(cdbs: EstimateOut, supported: Sequence[tuple[RankedPolicy, EstimateOut]], above_all: bool) -> list[Flag]:
-    """The best supported candidate against cDBS; nothing to say where its whole interval lies above that of cDBS."""
+    """Compare the best supported candidate with cDBS; empty where its whole interval is above that of cDBS."""
     best, e = max(supported, key=lambda pair: pair[1].value)
     overlap = e.low <= cdbs.high and cdbs.low <= e.high
     if cdbs.value >= e.value:

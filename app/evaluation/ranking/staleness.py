@@ -1,7 +1,7 @@
-"""Whether a ranking still speaks about the study as it is, and what has changed since where it does not, as typed flags.
+"""Check of a ranking against the present study: whether it is still current, and what has changed since where it is not, as typed flags.
 
-The snapshot's pins are held against the rows of today: settings version, sessions, QoC revisions, traces, cDBS amplitudes, the gate, and,
-by the audit trail, whatever else of a session decides on its steps. No trace and no buffer is read for it.
+The snapshot's pins are compared with the present rows: settings version, sessions, QoC revisions, traces, cDBS amplitudes, the gate. By the
+audit trail, all else of a session that decides on its steps is compared too. No trace and no buffer is read for it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NAMED = 5
 """Policies that are named where a ranking lacks some."""
 
 OF_STEPS = ("controller", "policy_id", "duration_s", "control_stream", "control_channel")
-"""Columns of a session that its steps in a buffer depend on, beside what a snapshot pins."""
+"""Columns of a session that its steps in a buffer depend on, besides what a snapshot pins."""
 
 TIMED = "started_at"
 """Column that places the session among the others and among the visit's doses."""
@@ -43,11 +43,11 @@ STOPPED = "stopped_reason"
 
 
 def stale_reasons(db: Session, participant: Participant, evaluation: Evaluation, sessions: ReadOnce | None = None) -> list[Flag]:
-    """Why the ranking no longer speaks about the study as it is; empty when it does.
+    """List the reasons why the ranking no longer matches the present study; empty when it does.
 
     Args:
         db: the session. participant: whose. evaluation: the ranking's.
-        sessions: of the participant, where somebody else reads them too.
+        sessions: of the participant, where other code reads them too.
     """
     reasons: list[Flag] = []
     settings = participant.current_settings
@@ -66,7 +66,7 @@ def stale_reasons(db: Session, participant: Participant, evaluation: Evaluation,
 
 
 def _kept_changes(db: Session, participant: Participant, snapshot: BufferSnapshot, sessions: ReadOnce) -> list[Flag]:
-    """The same as `_changes`, kept by this process until a row of the participant's sessions changes, or the gate is decided on.
+    """Return the result of `_changes`, cached by this process until a row of the participant's sessions changes, or the gate is decided on.
 
     What this transaction has read before may be older than the key says, so that settings are read again, as `sessions` are.
     """
@@ -83,7 +83,7 @@ def _kept_changes(db: Session, participant: Participant, snapshot: BufferSnapsho
 
 
 def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot, sessions: Sequence[StudySession]) -> list[Flag]:
-    """What happened to the sessions since a snapshot."""
+    """List what happened to the sessions since a snapshot."""
     before = {m.session_id: m for m in learning.snapshot_members(db, snapshot.id)}
     now = {s.id: s for s in sessions}
     added = [s for s in sessions if s.id not in before]
@@ -113,7 +113,7 @@ def _changes(db: Session, participant: Participant, snapshot: BufferSnapshot, se
 
 
 def _sources(session: StudySession, settings: SettingsVersion, heads: Mapping[int, Any]) -> Sources | None:
-    """What the session's steps are read from now; None where its side is not known, so that they cannot be read."""
+    """Find what the session's steps are read from now; None where its side is not known, so that they cannot be read."""
     try:
         return sources(session, settings, heads)
     except Invalid:
@@ -121,7 +121,7 @@ def _sources(session: StudySession, settings: SettingsVersion, heads: Mapping[in
 
 
 def _was_read(pinned: SnapshotSession) -> bool:
-    """Whether the snapshot could read the session's steps at all: what it could not read it has no pins of."""
+    """Check whether the snapshot could read the session's steps at all: what it could not read it has no pins of."""
     return pinned.left_out_reason is None or any(
         pin is not None for pin in (pinned.beta_trace_id, pinned.amplitude_trace_id, pinned.cdbs_amplitude_ma)
     )
@@ -154,6 +154,6 @@ def _edited(db: Session, sessions: Sequence[StudySession], moment: datetime) -> 
 
 
 def _pairs(then: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Rows that were there then and are there now."""
+    """Pair the rows that existed then and exist now."""
     present = {row["id"]: row for row in now}
     return [(row, present[row["id"]]) for row in then if row["id"] in present]

@@ -40,7 +40,7 @@ GROUP_NAMES: dict[Group, str] = {
 
 
 def decision(reasons: Sequence[Flag]) -> str:
-    """The reasons of a verdict in one line.
+    """Write the reasons of a verdict in one line.
 
     Args:
         reasons: as `app.evaluation.ranking.decisions.decide` gives them.
@@ -51,7 +51,7 @@ def decision(reasons: Sequence[Flag]) -> str:
 
 
 def plainly(reasons: Sequence[Flag], limit: float | None = None, limit_ma: float | None = None) -> str:
-    """A verdict's reason for a reader in a hurry: the deciding finding in plain words, without methods.
+    """Write a verdict's reason for a reader in a hurry: the deciding finding in plain words, without methods.
 
     Args:
         reasons: of the verdict. limit, limit_ma: lowest amplitude of a test with care, fraction of cDBS and mA.
@@ -64,14 +64,14 @@ def plainly(reasons: Sequence[Flag], limit: float | None = None, limit_ma: float
 
 
 def _undecided(reasons: Sequence[Flag]) -> str:
-    """What a test asks for and the policy does not reach; which of the two probabilities that every verdict states is too low."""
+    """Describe what a test requires and the policy does not reach: which of the two probabilities of a verdict is too low."""
     low = {r.code: r for r in reasons if r.code in _TEST_ASKS and r.value is not None and r.limit is not None and r.value < r.limit}
     told = [f"a test asks for {percent(low[code].limit)} {words}" for code, words in _TEST_ASKS.items() if code in low]
     return f"not sure enough: {', and '.join(told)}" if told else "whether it is no worse than cDBS is still open"
 
 
 def likely(within: float) -> str:
-    """The chance that no outcome is worse than its margin allows; always in these words, as a shorter form reads as another claim.
+    """Write the chance that no outcome is worse than its margin allows; always in these words, as a shorter form reads as another claim.
 
     Args:
         within: that probability.
@@ -80,7 +80,7 @@ def likely(within: float) -> str:
 
 
 def further_sessions(reasons: Sequence[Flag]) -> str:
-    """How many further sessions near which amplitude, on how many visits, would tell; empty where none is named."""
+    """Describe how many further sessions near which amplitude, on how many visits, would decide; empty where none is named."""
     by_code = {reason.code: reason for reason in reasons}
     if not {"sessions_needed", "near_amplitude"} <= by_code.keys():
         return ""
@@ -89,20 +89,20 @@ def further_sessions(reasons: Sequence[Flag]) -> str:
 
 
 def random_effects(found: RandomSessions) -> tuple[list[str], list[str]]:
-    """What random sessions changed against cDBS, and the worst of a single one, by outcome."""
+    """Describe what random sessions changed against cDBS, and the worst of a single one, by outcome."""
     known = [o for o in OUTCOMES if o.field in found.differences]
     apart = [change(o.noun, found.differences[o.field], o.decimals, o.difference_words) for o in known]
     return apart, [f"{o.noun} {found.worst[o.field]:.{0 if o.whole else o.decimals}f} {o.sentence_unit}" for o in known]
 
 
 def usual(under_cdbs: Mapping[str, float]) -> list[str]:
-    """What is to be expected under cDBS, by outcome."""
+    """Describe what is to be expected under cDBS, by outcome."""
     known = [o for o in OUTCOMES if o.field in under_cdbs]
     return [f"{o.noun} {under_cdbs[o.field]:.{o.decimals}f} {o.sentence_unit} {o.note}".rstrip() for o in known]
 
 
 def allowed(margins: Margins, under_cdbs: Mapping[str, float]) -> list[str]:
-    """How much worse than under cDBS each outcome may be, and what that is of the value to expect."""
+    """Describe how much worse than under cDBS each outcome may be, and what that is of the value to expect."""
     return [_allowed(o, margins.of(o), under_cdbs.get(o.field)) for o in OUTCOMES]
 
 
@@ -117,7 +117,7 @@ def _allowed(outcome: Outcome, margin: float, under_cdbs: float | None) -> str:
 
 
 def effect(differences: Mapping[str, Difference], within: float | None = None) -> str:
-    """What a policy is expected to change against cDBS, in one line.
+    """Describe what a policy is expected to change against cDBS, in one line.
 
     Args:
         differences: by quantity, as the answer's rows have them. within: as `likely` has it; no word of it where that is None.
@@ -172,7 +172,7 @@ def test_results(results: TestedBefore | None) -> str:
 
 
 def change(name: str, difference: float, digits: int, unit: str) -> str:
-    """What changes by how much: signed, with its unit, of one point in the singular; unchanged where it rounds to nothing.
+    """Write what changes by how much: signed, with its unit, of one point in the singular; unchanged where it rounds to nothing.
 
     Args:
         name: of what changes. difference: by how much, in the unit. digits: after the point. unit: its symbol, or a noun in the plural.
@@ -220,14 +220,14 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "acts_like_cdbs": lambda f: f"{percent(f.value)} of the cDBS amplitude away from it on average",
     "not_settled_by_sessions": lambda f: "more sessions near its amplitude would not settle it",
 }
-"""For the first screen of the ranking, and for plans, by code; what is not here is told further down alone."""
+"""Texts for the first screen of the ranking, and for plans, by code; codes without one are shown only further down."""
 
 
 # What to test next, in a few sentences: the first that the ranking and the participant's page say, made and kept once.
 
 
 def what_next(judged: Judged, *, may_run: bool) -> Markup:
-    """The sentences, as HTML.
+    """Write the sentences on what to do next, as HTML.
 
     Args:
         judged: the ranking. may_run: whether who reads them may start jobs.

@@ -63,8 +63,8 @@ _COVERAGE = tuple(CHECKS)
 
 
 def to_csv(ranking: RankingOut) -> str:
-    """One row per policy and method. Rank, decision, gain over cDBS and probability of being best are by the default method, coverage is of
-    the policy whatever the method; `supported` and what follows are of the row's own method.
+    """Write one row per policy and method. Rank, decision, gain over cDBS and probability of being best are by the default method. Coverage
+    is of the policy whatever the method; `supported` and the later columns are of the row's own method.
     """
     sink = io.StringIO()
     out = csv.writer(sink, lineterminator="\n")
@@ -92,7 +92,7 @@ def _coverage_columns() -> list[str]:
 
 
 def _coverage(p: RankedPolicy) -> list[object]:
-    """The checks of a policy; empty cells where they were not made."""
+    """Return the checks of a policy; empty cells where they were not made."""
     if p.coverage is None:
         return [None] * len(_coverage_columns())
     values = {c.name: c.value for c in p.coverage.checks}
@@ -100,7 +100,7 @@ def _coverage(p: RankedPolicy) -> list[object]:
 
 
 def csv_of(found: RankingOut) -> Response:
-    """A ranking as a CSV download."""
+    """Serve a ranking as a CSV download."""
     return download(to_csv(found), f"{found.participant}-ranking-{found.evaluation_id}.csv")
 
 
@@ -126,7 +126,7 @@ def read_ranking(
     kind: Annotated[Kind | None, Query(description="Only candidates of this kind.")] = None,
     tested: Annotated[Literal["yes", "no"] | None, Query(description="Only candidates that ran in a session, or that did not.")] = None,
 ) -> RankingOut | Response:
-    """Candidate policies from best to worst on one snapshot, with every method's estimate, and references beside them."""
+    """Return candidate policies from best to worst on one snapshot, with every method's estimate, and references besides them."""
     shown = RankingFilter(supported=supported, kind=kind, tested=tested)
     found = ranking.current_ranking(db, participant, caller, method, shown)
     standings = make_part(Part.STANDINGS, db, participant, caller)
@@ -151,7 +151,7 @@ def ranking_page(
     kind: str = "",
     tested: str = "",
 ) -> HTMLResponse:
-    """Policies and ranking; the filter form leaves empty what it does not ask for."""
+    """Show policies and ranking; an empty field of the filter form matches all."""
     shown = parse(RankingFilter, {"supported": supported, "kind": kind, "tested": tested})
     judged: Judged | None = None
     found: RankingOut | None = None
@@ -189,7 +189,7 @@ def ranking_page(
 
 
 def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: bool, may_run: bool, *, unfolded: bool) -> str:
-    """The page below its notes, which is kept: it is made of nothing but what is named here."""
+    """Render the page below its notes, which is cached: it is made of nothing but what is named here."""
     participant, unfolded = judged.participant, unfolded or shown != RankingFilter()
     settings = participant.current_settings
 
@@ -240,13 +240,13 @@ def _body(judged: Judged, found: RankingOut, shown: RankingFilter, may_plan: boo
 
 @pages.get("/glossary")
 def glossary(request: Request, caller: CurrentCaller) -> HTMLResponse:
-    """What the words of the pages mean."""
+    """Show what the words of the pages mean."""
     return HTMLResponse(render(request, "evaluation/glossary.html"))
 
 
 @pages.get("/participants/{code}/ranking.csv", dependencies=[ResultsViewed])
 def ranking_csv(participant: CurrentParticipant, db: Db, caller: CurrentCaller, method: str | None = None) -> Response:
-    """The ranking as CSV, by the method that the page ranks by."""
+    """Download the ranking as CSV, by the method that the page ranks by."""
     return csv_of(ranking.current_ranking(db, participant, caller, method))
 
 

@@ -46,10 +46,10 @@ def read_bundle(
     ramp_ma_per_s: Annotated[float | None, Query(gt=0, le=100, allow_inf_nan=False, description="Fastest change, mA/s.")] = None,
     hemisphere: Annotated[Hemisphere | None, Query(description="Needed where a visit states several cDBS amplitudes.")] = None,
 ) -> Response:
-    """The signed controller bundle as a ZIP: network, C header, reference runner, test vectors, the clinician's limits, a sheet.
+    """Return the signed controller bundle as a ZIP: network, C header, reference runner, test vectors, the clinician's limits, a sheet.
 
-    It is stored when it is first taken; who takes the same again gets the same bytes, with the name of who took it first. The audit trail
-    says of each time who took it, for whom and within which limits.
+    It is stored when it is first taken. Taken again, it has the same bytes, with the name of the first taker. The audit trail records each
+    time who took it, for whom and within which limits.
     """
     participant = db.get_one(Participant, policy.participant_id)
     content = bundles.bundle(db, participant, policy, bundles.Limits(min_ma, max_ma, ramp_ma_per_s), hemisphere, caller)
@@ -149,11 +149,11 @@ def _port_check_out(row: PortCheck) -> PortCheckOut:
 def read_session_bundle(
     visit: CurrentVisit, db: Db, caller: CurrentCaller, position: Annotated[int, Path(ge=1, le=1000, description="Of the session.")]
 ) -> Response:
-    """The signed bundle of one session of the visit's signed plan: it runs on the day of the visit, once.
+    """Return the signed bundle of one session of the visit's signed plan: it runs on the day of the visit, once.
 
-    Sessions of policies hold the network, random and cDBS sessions their schedule. A plan that is not signed, was changed since, or holds
-    a withdrawn policy has none; nor has one with a policy under which something serious happened since, until a clinician clears it. It
-    is stored when it is first taken; later it is the same bytes, and the audit trail has each time.
+    Sessions of policies contain the network, random and cDBS sessions their schedule. A plan that is not signed, was changed since, or has
+    a withdrawn policy has none. Nor has one with a policy under which a serious event happened since, until a clinician clears it. The
+    bundle is stored when it is first taken; later it is the same bytes, and the audit trail has each time.
     """
     name, content = slots.bundle(db, visit, position, caller)
     return Response(content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}"'})
@@ -161,7 +161,7 @@ def read_session_bundle(
 
 @router.get("/bundle-withdrawals", response_class=PlainTextResponse)
 def read_withdrawals(db: Db, caller: CurrentCaller) -> PlainTextResponse:
-    """Policies and plans that were withdrawn, signed: bring it to the tablet, which then refuses their bundles.
+    """Return withdrawn policies and plans, signed: bring it to the tablet, which then refuses their bundles.
 
     Plans that may not run after a serious adverse event are among them, until a clinician has cleared it.
     """
@@ -170,7 +170,7 @@ def read_withdrawals(db: Db, caller: CurrentCaller) -> PlainTextResponse:
 
 @router.get("/bundle-key", response_class=PlainTextResponse)
 def read_bundle_key(caller: CurrentCaller) -> str:
-    """The public key that this installation's bundles are signed with: 64 hexadecimal digits. Give it to a tablet once."""
+    """Return the public key that this installation's bundles are signed with: 64 hexadecimal digits. Give it to a tablet once."""
     return bundles.public_key() + "\n"
 
 
@@ -179,7 +179,7 @@ _PDF: dict[int | str, dict[str, Any]] = {200: {"content": {"application/pdf": {}
 
 @of_plans.get("/visits/{visit_id}/plan.pdf", response_class=Response, responses=_PDF)
 def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
-    """The plan as a sheet to print: sessions in order, estimates, blanks to fill in, signatures. A draft says so across every page."""
+    """Return the plan as a sheet to print: sessions in order, estimates, blanks, signatures. A draft is marked across every page."""
     view = read_plan(db, visit, caller)
     record(db, "download", "plan", view.plan.id)
     name = f"plan-{visit.participant.code}-visit-{visit.number}.pdf"
@@ -191,6 +191,6 @@ def print_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> Response:
 
 
 def _bundles(db: Session, view: PlanView) -> dict[int, str]:
-    """The newest bundle that was taken for each session, by the number of its plan item."""
+    """Find the newest bundle that was taken for each session, by the number of its plan item."""
     newest_last = reversed(releases_of_slots(db, [line.item.id for line in view.lines]))
     return {row.plan_item_id: row.sha256 for row in newest_last if row.plan_item_id is not None}

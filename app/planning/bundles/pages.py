@@ -53,7 +53,7 @@ class StatedLimits(BaseModel):
 
 @router.get("/participants/{code}/policies/{policy_id}/bundle", dependencies=[ResultsViewed])
 def bundle_page(request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """What the bundle would hold under the default limits."""
+    """Show what the bundle would contain under the default limits."""
     return _page(request, participant, policy, db, caller)
 
 
@@ -61,7 +61,7 @@ def bundle_page(request: Request, participant: CurrentParticipant, policy: Curre
 def take_bundle(
     request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller, values: FormValues
 ) -> Response:
-    """The signed ZIP under the limits of the form; the page again, with what was typed, where they cannot be used."""
+    """Download the signed ZIP under the limits of the form; the page again, with what was typed, where they cannot be used."""
     typed = {name: str(values.get(name, "")) for name in LABELS}
     try:
         limits, hemisphere = _stated(typed)
@@ -112,7 +112,7 @@ def release_policy(
 
 @router.get("/visits/{visit_id}/bundles")
 def session_bundles(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """The bundles of a signed plan, one per session, and how they come to the tablet."""
+    """Show the bundles of a signed plan, one per session, and how to bring them to the tablet."""
     view = read_plan(db, visit, caller)
     problem = None
     try:
@@ -126,7 +126,7 @@ def session_bundles(request: Request, visit: CurrentVisit, db: Db, caller: Curre
         visit=visit,
         view=view,
         limits_ma=wording.limits_ma,
-        common=common_limits(view.plan.items) if view.sealed else None,  # the limits of one session tell what it runs
+        common=common_limits(view.plan.items) if view.sealed else None,  # the limits of one session reveal what it runs
         problem=problem,
         taken=Counter(r.plan_item_id for r in repository.releases_of_slots(db, [line.item.id for line in view.lines])),
         may_take=bundles.may_take(visit.participant, caller),
@@ -136,7 +136,7 @@ def session_bundles(request: Request, visit: CurrentVisit, db: Db, caller: Curre
 
 
 def _stated(typed: Mapping[str, str]) -> tuple[bundles.Limits, Hemisphere | None]:
-    """The limits and the side of a form. Raises Invalid, naming the field."""
+    """Parse the limits and the side of a form. Raises Invalid, naming the field."""
     stated = parse(StatedLimits, typed, LABELS)
     return bundles.Limits(stated.min_ma, stated.max_ma, stated.ramp_ma_per_s), stated.hemisphere
 

@@ -27,17 +27,17 @@ def release(
     password: str,
     code: str = "",
 ) -> Release:
-    """Sign a policy as released for testing in participants, within limits. A newer release takes the place of an older one.
+    """Sign a policy as released for testing in participants, within limits. A newer release replaces an older one.
 
     Args:
-        limits: what is left out takes the default of a bundle. password: of the caller, asked for again; empty where a fresh sign-on
-            stands for it. code: of the second factor.
+        limits: omitted ones take the default of a bundle. password: of the caller, asked for again; empty where a fresh sign-on replaces
+            it. code: of the second factor.
 
     Raises:
-        Forbidden: whoever brought a policy, or one that it was made from, from elsewhere; one who approves no plans; a wrong password.
+        Forbidden: a caller who imported the policy or one of its teachers, or approves no plans; a wrong password.
         TooMany: too many wrong ones.
         Conflict: a retired policy, or as `bundles.refuse_after_events`. Invalid: limits that contradict each other or leave the
-            stimulator's own; a damaged file; or nobody has stated the cDBS amplitude or the unit of beta.
+            stimulator's own; a damaged file; no stated cDBS amplitude or unit of beta.
     """
     access.require(caller, can.RELEASE, participant)
     access.require_own(participant, policy, f"policy {policy.id}")

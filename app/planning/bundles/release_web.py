@@ -43,7 +43,7 @@ class PolicyReleaseLimits(Model):
 
 
 class PolicyReleaseOut(Model):
-    """Whether a policy is released for testing in participants."""
+    """Release of a policy for testing in participants."""
 
     policy_id: int
     signature_state: SignatureState = Field(description="`none`: not released. `broken`: the policy was changed since.")
@@ -53,7 +53,7 @@ class PolicyReleaseOut(Model):
 
 @api.get("/policies/{policy_id}/release")
 def read_release(policy: CurrentPolicy, db: Db) -> PolicyReleaseOut:
-    """Whether a policy is released for testing in participants, within which limits, and whether the signature stands."""
+    """Return whether a policy is released for testing in participants, within which limits, and the state of the signature."""
     return _out(policy, releases.release_of(db, db.get_one(Participant, policy.participant_id), policy))
 
 
@@ -61,7 +61,7 @@ def read_release(policy: CurrentPolicy, db: Db) -> PolicyReleaseOut:
 def release_policy(policy: CurrentPolicy, wanted: PolicyReleaseIn, db: Db, caller: CurrentCaller) -> PolicyReleaseOut:
     """Sign a policy as released for testing in participants: its file, its snapshot and settings, and the limits in mA.
 
-    Those who approve plans alone, and a policy made elsewhere, and what was made from it, not by whoever added it.
+    Only those who approve plans may. A policy made elsewhere, and those made from it, cannot be released by the user who added it.
     """
     participant = db.get_one(Participant, policy.participant_id)
     limits = Limits(wanted.min_ma, wanted.max_ma, wanted.ramp_ma_per_s)

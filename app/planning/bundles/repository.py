@@ -13,14 +13,14 @@ from app.tables.visits import Visit
 
 
 def releases(db: Session, policy_id: int) -> Sequence[BundleRelease]:
-    """The bundles of a policy that left so far, newest first; without those of sealed plans (`plans.key`), whose time tells what ran."""
+    """List the released bundles of a policy, newest first; without those of sealed plans (`plans.key`), whose time reveals what ran."""
     sealed = select(PlanItem.id).join(Plan, Plan.id == PlanItem.plan_id).where(SEALED)
     told = or_(BundleRelease.plan_item_id.is_(None), BundleRelease.plan_item_id.not_in(sealed))
     return db.scalars(select(BundleRelease).where(BundleRelease.policy_id == policy_id, told).order_by(BundleRelease.id.desc())).all()
 
 
 def releases_of_slots(db: Session, item_ids: Sequence[int]) -> Sequence[BundleRelease]:
-    """Bundles that left for sessions of plans, newest first."""
+    """List bundles that left for sessions of plans, newest first."""
     return db.scalars(select(BundleRelease).where(BundleRelease.plan_item_id.in_(item_ids)).order_by(BundleRelease.id.desc())).all()
 
 
@@ -35,29 +35,29 @@ def lock_content(db: Session, content_sha256: str) -> None:
 
 
 def kept(db: Session, participant_id: int, content_sha256: str) -> str | None:
-    """The newest file of a participant's bundle with a content, by its SHA-256; None where nobody has taken it yet."""
+    """Find the newest file of a participant's bundle by the SHA-256 of its content; None where it was never taken."""
     mine = (BundleRelease.participant_id == participant_id) & (BundleRelease.content_sha256 == content_sha256)
     return db.scalar(select(BundleRelease.sha256).where(mine).order_by(BundleRelease.id.desc()).limit(1))
 
 
 def withdrawn_policies(db: Session) -> Sequence[int]:
-    """Policies of this installation that were retired."""
+    """List policies of this installation that were retired."""
     return db.scalars(select(Policy.id).where(Policy.retired_reason.is_not(None)).order_by(Policy.id)).all()
 
 
 def withdrawn_plans(db: Session) -> Sequence[int]:
-    """Plans of this installation that were signed and then replaced."""
+    """List plans of this installation that were signed and then replaced."""
     return db.scalars(select(Plan.id).where(Plan.status == "superseded", Plan.approved_at.is_not(None)).order_by(Plan.id)).all()
 
 
 def signed_plans(db: Session, participant_id: int) -> Sequence[Plan]:
-    """The participant's approved visit plans with their items."""
+    """Load the participant's approved visit plans with their items."""
     query = select(Plan).join(Visit, Visit.id == Plan.visit_id).where(Visit.participant_id == participant_id, Plan.status == "approved")
     return db.scalars(query.order_by(Plan.id).options(selectinload(Plan.items))).all()
 
 
 def planned_limits(db: Session, participant_id: int, policy_id: int) -> Sequence[float]:
-    """Lowest amplitudes, fractions of cDBS, that the participant's approved plans state for a policy, newest plan first."""
+    """List lowest amplitudes, fractions of cDBS, that the participant's approved plans state for a policy, newest plan first."""
     found = db.scalars(
         select(PlanItem.min_fraction)
         .join(Plan, Plan.id == PlanItem.plan_id)
@@ -69,7 +69,7 @@ def planned_limits(db: Session, participant_id: int, policy_id: int) -> Sequence
 
 
 def approved_plans(db: Session, participant_id: int, policy_id: int) -> Sequence[tuple[Plan, int]]:
-    """The participant's approved visit plans that a policy stands in, each with its visit's number."""
+    """List the participant's approved visit plans with a policy, each with its visit's number."""
     rows = db.execute(
         select(Plan, Visit.number)
         .join(Visit, Visit.id == Plan.visit_id)

@@ -1,4 +1,4 @@
-"""How a policy leaves as a controller bundle: whose limits, whose approval, signed by this installation. The caller commits."""
+"""Release of a policy as a controller bundle: whose limits, whose approval, signed by this installation. The caller commits."""
 
 from __future__ import annotations
 
@@ -50,8 +50,9 @@ MAKE = "app.planning.bundles.compute:make"
 class Limits:
     """The clinician's limits of a bundle, mA and mA/s; None takes the default.
 
-    Defaults: the stimulator's own lower limit, or 0 mA where no recording holds one, or that of a test with care in the newest approved
-    plan where it is higher, to the cDBS amplitude, and a ramp that covers this range within one period, as the study's sessions had it.
+    The default range begins at the stimulator's own lower limit, or 0 mA where no recording has one. Where the newest approved plan has a
+    test with care, its limit counts if it is higher. The range ends at the cDBS amplitude. The default ramp covers it within one period, as
+    in the study's sessions.
     """
 
     min_ma: float | None = None
@@ -60,7 +61,7 @@ class Limits:
 
     @property
     def stated(self) -> bool:
-        """Whether anything was stated."""
+        """True where anything was stated."""
         return any(v is not None for v in (self.min_ma, self.max_ma, self.ramp_ma_per_s))
 
 
@@ -86,17 +87,17 @@ class Tried(NamedTuple):
 
 
 def signing_key() -> Ed25519PrivateKey:
-    """The key of this installation, made at first use."""
+    """Load the key of this installation, made at first use."""
     return Ed25519PrivateKey.from_private_bytes(get_settings().secret(KEY))
 
 
 def public_key() -> str:
-    """The public half, 64 hexadecimal digits: what a tablet is given once, to check every bundle with."""
+    """Return the public half, 64 hexadecimal digits: a tablet gets it once, to check every bundle with."""
     return signing_key().public_key().public_bytes_raw().hex()
 
 
 def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller) -> bytes:
-    """The controller bundle of a policy, signed. It is stored when it is first taken; every release is recorded.
+    """Return the controller bundle of a policy, signed. It is stored when it is first taken; every release is recorded.
 
     Raises:
         NotFound: the policy is another participant's.
@@ -111,7 +112,7 @@ def bundle(db: Session, participant: Participant, policy: Policy, limits: Limits
 
 
 def refuse_after_events(db: Session, participant: Participant, policy: Policy) -> None:
-    """Raises Conflict for a policy under which something serious happened that no clinician has cleared, and no signed plan answers."""
+    """Raise Conflict for a policy with a serious event that no clinician has cleared, and no signed plan answers."""
     events = events_against(db, participant)
     plans = [plan for plan, _ in repository.approved_plans(db, participant.id, policy.id)]
     if policy.id in events and all(policy.id in unanswered(plan, events) for plan in plans):
@@ -120,7 +121,7 @@ def refuse_after_events(db: Session, participant: Participant, policy: Policy) -
 
 
 def policy_bundle(policy: Policy, manifest: BundleManifest, windows: Tried) -> bytes:
-    """The signed bundle of a policy. Raises Invalid where it cannot be made."""
+    """Build the signed bundle of a policy. Raises Invalid where it cannot be made."""
     try:
         return _signed(policy, manifest, windows)
     except (BundleError, PolicyFileError) as error:
@@ -128,11 +129,11 @@ def policy_bundle(policy: Policy, manifest: BundleManifest, windows: Tried) -> b
 
 
 def content_of(manifest: BundleManifest, windows: Tried | None, policy: Policy | None, stated_by: str | None) -> str:
-    """The SHA-256 of what a bundle holds, but who takes it and when.
+    """Hash what a bundle contains (SHA-256), except who takes it and when.
 
     Args:
-        manifest: as the bundle's, before its files are filled in. windows: of the test vectors, and policy: whose network runs; None where
-            a schedule does. stated_by: who stated the limits.
+        manifest: as the bundle's, before its files are filled in. windows: of the test vectors. policy: whose network runs. Both are None
+            where a schedule runs. stated_by: who stated the limits.
     """
     slot = manifest.slot and replace(manifest.slot, issued_at=datetime.min.replace(tzinfo=UTC).isoformat())
     digest = hashlib.sha256(replace(manifest, taken_by=None, limits_stated_by=stated_by, slot=slot).to_bytes())
@@ -153,9 +154,9 @@ def take(
     caller: Caller,
     plan_item_id: int | None = None,
 ) -> bytes:
-    """The signed bundle of a content: the bytes that left when it was first taken, or those that `make` makes, which are kept.
+    """Return the signed bundle of a content: the bytes that left when it was first taken, or those that `make` makes, which are stored.
 
-    The release is recorded either way. Bytes that were kept and have been lost or damaged are made anew; the doctor names them.
+    The release is recorded either way. Bytes that were kept and have been lost or damaged are made again; the doctor names them.
     """
     set_reason(db, wording.release_reason(manifest))
     repository.lock_content(db, content_sha256)
@@ -187,7 +188,7 @@ def take(
 def preview(
     db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
 ) -> BundleManifest:
-    """What the bundle would say of itself, all but its files; nothing is stored. Raises as `bundle` does, but whoever reads may look."""
+    """Describe the bundle, all but its files; nothing is stored. Raises as `bundle` does, but any reader may look."""
     manifest, windows = manifest_of(db, participant, policy, limits, hemisphere, caller)
     try:
         return _described(policy, manifest, windows)
@@ -196,7 +197,7 @@ def preview(
 
 
 def _signed(policy: Policy, manifest: BundleManifest, windows: Tried) -> bytes:
-    """The signed bundle. A policy made elsewhere is run in a child, one of ours here. Raises BundleError, PolicyFileError."""
+    """Build the signed bundle. A policy made elsewhere is run in a child, one of ours here. Raises BundleError, PolicyFileError."""
     content = onnx_of(policy)
     if policy.kind != FOREIGN:
         return sign(build_bundle(content, manifest, windows.probe, windows.by_visit()), signing_key())
@@ -206,7 +207,7 @@ def _signed(policy: Policy, manifest: BundleManifest, windows: Tried) -> bytes:
 
 
 def _described(policy: Policy, manifest: BundleManifest, windows: Tried) -> BundleManifest:
-    """The manifest alone, as `_signed`."""
+    """Build only the manifest, as `_signed`."""
     content = onnx_of(policy)
     if policy.kind != FOREIGN:
         return describe(content, manifest, windows.probe)
@@ -230,12 +231,12 @@ def _in_child(policy: Policy, manifest: BundleManifest, windows: Tried, target: 
 
 
 def may_take(participant: Participant, caller: Caller) -> bool:
-    """Whether somebody may take a bundle and state its limits."""
+    """Check whether the caller may take a bundle and state its limits."""
     return access.may(caller, can.TAKE_BUNDLES, participant)
 
 
 def approvals(db: Session, participant_id: int, policy_id: int) -> tuple[Approval, ...]:
-    """Sign-offs of the participant's approved visit plans that this policy stands in."""
+    """List sign-offs of the participant's approved visit plans with this policy."""
     return tuple(
         Approval(
             name=plan.approved_by,
@@ -251,7 +252,7 @@ def approvals(db: Session, participant_id: int, policy_id: int) -> tuple[Approva
 def manifest_of(
     db: Session, participant: Participant, policy: Policy, limits: Limits, hemisphere: Hemisphere | None, caller: Caller
 ) -> tuple[BundleManifest, Tried]:
-    """What the bundle says about itself, and the beta windows that it is tried on: logged ones, where there are any of its length."""
+    """Build the manifest of the bundle, and the beta windows that it is tried on: logged ones, where there are any of its length."""
     access.require_own(participant, policy, f"policy {policy.id}")
     version = study_repository.settings_version(db, policy.settings_version_id)
     snapshot = db.get(BufferSnapshot, policy.snapshot_id) if policy.snapshot_id else None
@@ -306,7 +307,7 @@ def manifest_of(
 
 
 def _at_fault(limits: Limits, device: DeviceLimits | None, cdbs_ma: float) -> dict[str, str]:
-    """The stated limit that leaves out the cDBS amplitude or leaves the stimulator's own, as a problem's `field`; empty where none does."""
+    """Name the stated limit that excludes the cDBS amplitude or leaves the stimulator's own, as a problem's `field`; else empty."""
     if limits.min_ma is not None and (limits.min_ma > cdbs_ma or (device and limits.min_ma < device.min_ma)):
         return {"field": "min_ma"}
     if limits.max_ma is not None and (limits.max_ma < cdbs_ma or (device and limits.max_ma > device.max_ma)):
@@ -324,7 +325,8 @@ def beta_limits(snapshot: BufferSnapshot | None, window: int) -> dict[str, Any]:
 
 
 def _lowest(db: Session, participant: Participant, policy: Policy, limits: Limits, device: DeviceLimits | None, cdbs_ma: float) -> float:
-    """The lower limit, mA: what is stated, else the highest of the stimulator's own and that of the newest approved plan with the policy.
+    """Return the lower limit, mA: the stated one, else the highest of the stimulator's own and that of the newest approved plan with the
+    policy.
 
     Raises:
         Invalid: a stated limit below that of the plan: the policy was approved to be tested with care, down to that amplitude.

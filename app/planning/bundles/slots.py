@@ -39,10 +39,11 @@ from ml.designs import Decision, DesignSettings, lay_out
 
 
 def bundle(db: Session, visit: Visit, position: int, caller: Caller, at: datetime | None = None) -> tuple[str, bytes]:
-    """The signed bundle of one session of a visit's signed plan, and its file name. Stored when first taken; each release is recorded.
+    """Return the signed bundle of one session of a visit's signed plan, and its file name. Stored when first taken; each release is
+    recorded.
 
     Args:
-        at: when it is taken; now, but in the study in silico, whose calendar lies in the past.
+        at: when it is taken; now, but in the study in silico, whose calendar is in the past.
 
     Raises:
         NotFound: no plan, or no such session. Conflict: the plan may not run, the visit has no date or is past, or the session has no
@@ -80,17 +81,17 @@ def bundle(db: Session, visit: Visit, position: int, caller: Caller, at: datetim
 
 
 def _blinded(view: PlanView, content: bytes) -> bytes:
-    """The bundle of a blinded plan, of which all sessions look alike."""
+    """Build the bundle of a blinded plan, of which all sessions look alike."""
     limits, settings = common_limits(view.plan.items), view.visit.participant.current_settings
     if limits is None:
-        raise Conflict(f"Plan {view.plan.id} has no limits in mA.", "Draft the visit anew.")
+        raise Conflict(f"Plan {view.plan.id} has no limits in mA.", "Draft the visit again.")
     common = Common(limits.min_ma, limits.max_ma, limits.ramp_ma_per_s, settings.window, settings.period_s)
     room = room_for(max((len(files.read(line.policy.onnx_sha256)) for line in view.lines if line.policy), default=0))
     return sign(blind(content, common, secrets.token_hex(16), room), service.signing_key())
 
 
 def runnable(view: PlanView, day: date | None = None) -> Signature:
-    """The signature under which a plan may run on a day, today where none is named. Raises Conflict, Invalid where it may not."""
+    """Return the signature under which a plan may run on a day, today where none is named. Raises Conflict, Invalid where it may not."""
     refuse_running(view)
     if view.visit.date is None:
         raise Conflict(f"Visit {view.visit.number} has no date, and a bundle runs on the day of its visit alone.", "Date the visit.")
@@ -102,7 +103,7 @@ def runnable(view: PlanView, day: date | None = None) -> Signature:
 
 
 def withdrawals(db: Session) -> bytes:
-    """What was withdrawn, as a tablet takes it: a line of JSON, and its signature in a second one.
+    """Return the withdrawals as a tablet takes them: a line of JSON, and its signature in a second one.
 
     Plans that may not run after an adverse event or a stop are among it until it is cleared: their bundles may have left before.
     """
@@ -114,7 +115,7 @@ def withdrawals(db: Session) -> bytes:
 
 
 def _stopped_plans(db: Session) -> frozenset[int]:
-    """Signed plans of this installation with a policy that has a serious event or a stop that nobody has cleared or answered."""
+    """List signed plans of this installation with a policy that has a serious event or a stop that is neither cleared nor answered."""
     found: set[int] = set()
     for participant in with_blocking_events(db):
         events = events_against(db, participant)
@@ -139,7 +140,7 @@ def _slot(view: PlanView, item: PlanItem, signature: Signature, at: datetime) ->
 
 
 def _card(db: Session, view: PlanView, line: PlanLine) -> PlanCard:
-    """What the plan's sheet says of a session; while the key is sealed no more than is shown there."""
+    """Build the sheet's card of a session; while the key is sealed no more than is shown there."""
     seen = shown(view)
     one = next(other for other in seen.lines if other.item.position == line.item.position)
     card = card_of(one, seen, None, {} if view.sealed or line.policy is None else ports.lines_of(db, [line.policy.id]))
@@ -159,7 +160,7 @@ def _stated_by(signature: Signature) -> str:
 
 
 def _scheduled(db: Session, view: PlanView, line: PlanLine, slot: Slot, signature: Signature, caller: Caller) -> BundleManifest:
-    """The manifest of a session whose amplitudes are laid out beforehand."""
+    """Build the manifest of a session whose amplitudes are laid out beforehand."""
     item, participant = line.item, view.visit.participant
     settings = participant.current_settings
     data = learning.newest_snapshot(db, participant.id)
@@ -167,7 +168,7 @@ def _scheduled(db: Session, view: PlanView, line: PlanLine, slot: Slot, signatur
     if unit is None or source is None:
         raise Invalid("The unit and source of beta are not known.", "Set beta_unit and beta_source in the participant's settings.")
     if item.cdbs_ma is None or item.min_ma is None or item.max_ma is None or item.ramp_ma_per_s is None:
-        raise Conflict(f"Session {item.position} has no limits in mA.", "Draft the visit anew.")
+        raise Conflict(f"Session {item.position} has no limits in mA.", "Draft the visit again.")
     schedule = _schedule(view, item, settings.period_s)
     side = Hemisphere(item.hemisphere) if item.hemisphere else None
     device = device_limits(db, participant, side)
@@ -205,7 +206,7 @@ def _scheduled(db: Session, view: PlanView, line: PlanLine, slot: Slot, signatur
 
 
 def _schedule(view: PlanView, item: PlanItem, period_s: float) -> Schedule:
-    """What the session delivers: cDBS throughout, or the holds of its design; the paper's draws are made here, from a seed of the slot."""
+    """Build what the session delivers: cDBS throughout, or the holds of its design; the paper's draws use a seed of the slot."""
     steps = max(1, round(60 * item.minutes / period_s))
     if item.controller == Controller.CDBS:
         return Schedule("constant", None, None, None, (ScheduledHold(0, steps, 1.0, None),))
@@ -215,12 +216,12 @@ def _schedule(view: PlanView, item: PlanItem, period_s: float) -> Schedule:
             "Switch the stimulation off, and on again, with the programmer.",
         )
     if item.design is None:
-        raise Conflict(f"Session {item.position} has neither policy nor design.", "Draft the visit anew.")
+        raise Conflict(f"Session {item.position} has neither policy nor design.", "Draft the visit again.")
     planned = Planned.from_json(item.design)
     if planned.period_s != period_s:
         raise Conflict(
             f"Session {item.position} was laid out in steps of {planned.period_s:g} s, and the period is {period_s:g} s now.",
-            "Draft the visit anew.",
+            "Draft the visit again.",
         )
     if planned.holds:
         return Schedule(planned.design, planned.level, planned.seed, planned.bound, _holds(planned.holds))

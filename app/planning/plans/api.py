@@ -35,7 +35,7 @@ router = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 422))
 
 @router.get("/visits/{visit_id}/plan", dependencies=[VisitViewed])
 def read_plan(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> PlanOut:
-    """The plan of a visit."""
+    """Return the plan of a visit."""
     return plan_out(plan_of(db, visit, caller))
 
 
@@ -86,7 +86,7 @@ def remove_visit(visit: CurrentVisit, removal: Removal, db: Db, caller: CurrentC
 
 
 def plan_out(view: PlanView) -> PlanOut:
-    """A plan for the API: of a sealed one what may be shown."""
+    """Convert a plan for the API: of a sealed one what may be shown."""
     view = shown(view)
     plan, visit, evaluation = view.plan, view.visit, view.evaluation
     return PlanOut(

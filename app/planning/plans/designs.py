@@ -1,4 +1,4 @@
-"""What the random sessions of a visit shall try, and those held near an amplitude: laid out, bounded in mA and signed with the plan."""
+"""Random sessions of a visit, and those near a stated amplitude: laid out, bounded in mA and signed with the plan."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ class SideBound:
 
 @dataclass(frozen=True)
 class Planned:
-    """What one random session shall try.
+    """Design of one random session.
 
     Attributes:
-        design: `paper`, where the device draws anew every step, `stratified`, `ladder` or `near`. level: of the session; None where it has
-            none.
+        design: `paper`, where the device draws again at every step, `stratified`, `ladder` or `near`. level: of the session; None where it
+            has none.
         seed: of the draws; None in the paper's design. lower_bound: B. period_s: of a step. holds: empty in the paper's design.
-        bounds: in milliamperes, as they stood when the plan was approved; empty before.
+        bounds: in milliamperes, at the plan's approval; empty before.
     """
 
     design: str
@@ -67,17 +67,17 @@ class Planned:
     bounds: tuple[SideBound, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """For storage."""
+        """Convert for storage."""
         return asdict(self) | {"holds": [asdict(h) for h in self.holds], "bounds": [asdict(b) for b in self.bounds]}
 
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> Planned:
-        """The inverse of `as_json`."""
+        """Read what `as_json` stored."""
         nested = {"holds": tuple(Decision(**h) for h in stored["holds"]), "bounds": tuple(SideBound(**b) for b in stored["bounds"])}
         return cls(**stored | nested)
 
     def first_steps(self, steps: int) -> NDArray[np.float64]:
-        """Amplitude fraction of so many steps, [steps]: cDBS after the last hold."""
+        """Return the amplitude fraction of so many steps, [steps]: cDBS after the last hold."""
         return amplitudes(self.holds, steps)
 
     @property
@@ -87,12 +87,12 @@ class Planned:
 
     @property
     def low_seconds(self) -> float:
-        """How long the session is below `LOW_AMPLITUDE`."""
+        """Time that the session is below `LOW_AMPLITUDE`, s."""
         return sum(h.steps for h in self.holds if h.amplitude < LOW_AMPLITUDE) * self.period_s
 
 
 def planned_sessions(settings: SettingsVersion, code: str, earlier_visits: int, count: int, minutes: float, bound: float) -> list[Planned]:
-    """What the random sessions of one visit shall try, by the participant's settings.
+    """Design the random sessions of one visit, by the participant's settings.
 
     Levels are spread over `early_visits` visits; after these a new round of strata begins. The draws depend on the participant's code and
     the round alone, so that drafting a plan again gives the same ones.
@@ -102,7 +102,7 @@ def planned_sessions(settings: SettingsVersion, code: str, earlier_visits: int, 
         count: random sessions of the visit. minutes: of each. bound: below which nothing is drawn, fraction of cDBS.
 
     Raises:
-        Invalid: nothing lies between the bound and cDBS.
+        Invalid: no amplitude is between the bound and cDBS.
     """
     if count == 0:
         return []
@@ -136,7 +136,7 @@ def near_sessions(
     bound: float,
     cdbs_ma: float | None = None,
 ) -> list[Planned]:
-    """Sessions that are held near stated amplitudes. Drafting the visit again gives the same draws.
+    """Design sessions near stated amplitudes. Drafting the visit again gives the same draws.
 
     Args:
         levels: fraction of cDBS of each session. settings: B and period. code: the participant's. visit_number, minutes: of the visit, and
@@ -172,16 +172,16 @@ def _amplitude(fraction: float, cdbs_ma: float | None) -> str:
 
 
 def seed_of(code: str, number: int) -> int:
-    """Seed of a participant's designs in one round of early visits."""
+    """Return the seed of a participant's designs in one round of early visits."""
     digest = hashlib.sha256(f"{code.upper()}/{number}".encode()).digest()
     return int.from_bytes(digest[:8], "big") % MAX_SEED
 
 
 def bounds_of(visit: Visit, settings: SettingsVersion, bound: Bound) -> tuple[SideBound, ...]:
-    """The bounds of a visit's random sessions in milliamperes, by side.
+    """Return the bounds of a visit's random sessions in milliamperes, by side.
 
     Raises:
-        Invalid: nobody has stated the cDBS amplitude, so that no bound in milliamperes can be signed; an amplitude that no device gives.
+        Invalid: the cDBS amplitude is not stated, so that no bound in milliamperes can be signed; an amplitude that no device gives.
     """
     stated = [
         (str(a.hemisphere), plausible(a.amplitude_ma, f"Visit {visit.number} states")) for a in visit.cdbs_amplitudes if a.program == 0
@@ -197,15 +197,15 @@ def bounds_of(visit: Visit, settings: SettingsVersion, bound: Bound) -> tuple[Si
 
 
 def rounded_up(milliamperes: float) -> float:
-    """The least amplitude that a stimulator gives and that is not below this one, mA."""
+    """Return the least amplitude that a stimulator gives and that is not below this one, mA."""
     return round(math.ceil(milliamperes / RESOLUTION_MA - 1e-6) * RESOLUTION_MA, 6)
 
 
 def offered(fraction: float, bound: Bound, cdbs_ma: float | None) -> str:
-    """An amplitude as the plan's form proposes it: in steps of 0.1 mA, or 0.01 of cDBS, and one that the plan takes.
+    """Write an amplitude as the plan's form proposes it: in steps of 0.1 mA, or 0.01 of cDBS, and one that the plan takes.
 
     Args:
-        fraction: of cDBS, that is to be held. bound: B. cdbs_ma: None where it is not known.
+        fraction: of cDBS, that is to be kept. bound: B. cdbs_ma: None where it is not known.
     """
     scale, step, digits = (1.0, 0.01, 2) if cdbs_ma is None else (cdbs_ma, RESOLUTION_MA, 1)
     least, below_cdbs = bound.steps(step / scale), math.ceil(scale / step - 1e-6) - 1
@@ -213,7 +213,7 @@ def offered(fraction: float, bound: Bound, cdbs_ma: float | None) -> str:
 
 
 def delivered_ma(fraction: float, bound: SideBound) -> float:
-    """What a stimulator gives for a fraction of cDBS: rounded to its resolution, within the bound and cDBS, mA.
+    """Return what a stimulator gives for a fraction of cDBS: rounded to its resolution, within the bound and cDBS, mA.
 
     Rounding makes no amplitude one of those at which a session stays for `LOW_SECONDS` at most.
     """

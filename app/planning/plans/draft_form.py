@@ -1,4 +1,4 @@
-"""What the form for a draft shows and sends: policies, sessions held near an amplitude, and the rules of the day."""
+"""Form for a draft: policies, sessions near a stated amplitude, and the rules of the day."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ MOST_ROWS = 5
 
 
 def draft_of(values: FormData) -> PlanIn:
-    """The form as the API's type."""
+    """Parse the form to the API's type."""
     ids = [str(v) for v in values.getlist("policy_ids")]
     wrong = [i for i in ids if not (i.isdecimal() and 0 < int(i) < 2**31)]
     if wrong:
@@ -85,7 +85,7 @@ def draft_of(values: FormData) -> PlanIn:
 
 
 def shown_of(db: Session, visit: Visit, caller: Caller, full: PlanView | None, values: FormData | None) -> dict[str, Any]:
-    """What the form for a draft shows."""
+    """Build the content of the form for a draft."""
     participant = visit.participant
     try:
         found: Judged | None = current(db, participant, caller)
@@ -118,8 +118,8 @@ class Choice:
     """A policy that may be planned, and what the ranking says of it.
 
     Attributes:
-        row: its own; None for what no ranking holds. harmful: serious adverse events and stops under it that no
-            clinician has cleared, in words. twins: policies that do the same by the ranking.
+        row: its own; None without a ranking of it. harmful: uncleared serious adverse events and stops under it, in words. twins: policies
+            that do the same by the ranking.
     """
 
     policy: Policy
@@ -129,7 +129,7 @@ class Choice:
 
 
 def _choices(db: Session, participant: Participant, answered: Answer | None) -> list[Choice]:
-    """Behaviours that may be planned, what to test first; policies that no ranking holds come last."""
+    """List behaviours that may be planned, what to test first; policies that no ranking contains come last."""
     rows, heads = (answered.everyone(), answered.heads()) if answered is not None else ({}, {})
     places = {i: k for k, i in enumerate(rows)}
     policies = sorted(learning.candidates(db, participant.id), key=lambda p: (places.get(p.id, len(places)), p.id))
@@ -151,7 +151,7 @@ def _chosen(view: PlanView | None, values: FormData | None) -> Sequence[int]:
 
 
 def _form_values(view: PlanView | None, values: FormData | None, choices: Sequence[Any]) -> dict[str, Any]:
-    """What the form shows: what was sent, else the present plan's note, else the defaults."""
+    """Return the values of the form: what was sent, else the present plan's note, else the defaults."""
     shown: dict[str, Any] = {k: f"{v:g}" if isinstance(v, float) else v for k, v in PlanOptions().model_dump().items()}
     if view:
         shown["note"] = view.plan.note
@@ -170,7 +170,7 @@ class HeldRow:
     """One row of the form.
 
     Attributes:
-        unit: of `UNITS`. amplitude, sessions: as they stand in the fields. why: what the sessions would tell; None of a free row.
+        unit: of `UNITS`. amplitude, sessions: the texts of the fields. why: what the sessions would show; None of a free row.
     """
 
     unit: str
@@ -180,7 +180,7 @@ class HeldRow:
 
 
 def held_of(values: FormData) -> list[HeldIn]:
-    """The sessions that the form asks for; a row without a number of sessions asks for none.
+    """Read the sessions that the form requests; a row without a number of sessions requests none.
 
     Raises:
         Invalid: what no row of the form sends, or values outside their range.
@@ -197,7 +197,7 @@ def held_of(values: FormData) -> list[HeldIn]:
 
 
 def held_rows(values: FormData | None, holds: Sequence[Held], bound: Bound, cdbs_ma: float | None) -> list[HeldRow]:
-    """What the form shows: what is suggested, no session asked for, and a free row; what was sent where it was refused."""
+    """Build the rows of the form: what is suggested, no session requested, and a free row; what was sent where it was refused."""
     unit = "amplitude_ma" if cdbs_ma is not None else "amplitude_fraction"
     rows = [HeldRow(unit, offered(h.hold.fraction, bound, cdbs_ma), "", h) for h in holds]
     rows = [*rows[: MOST_ROWS - 1], HeldRow(unit, "", "")]

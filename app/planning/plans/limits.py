@@ -31,10 +31,10 @@ class DeviceLimits:
 
 @dataclass(frozen=True)
 class StatedLimits:
-    """What a clinician states for the controllers of a plan; None takes the default.
+    """Limits that a clinician states for the controllers of a plan; None takes the default.
 
-    Defaults: from the stimulator's own lower limit (0 mA where no recording holds one) to the cDBS amplitude, with a ramp that covers the
-    cDBS amplitude within one period.
+    The default range is from the stimulator's own lower limit (0 mA where no recording has one) to the cDBS amplitude. The default ramp
+    covers the cDBS amplitude within one period.
     """
 
     min_ma: float | None = None
@@ -43,16 +43,16 @@ class StatedLimits:
 
     @property
     def any(self) -> bool:
-        """Whether anything was stated."""
+        """True where anything was stated."""
         return any(v is not None for v in (self.min_ma, self.max_ma, self.ramp_ma_per_s))
 
 
 @dataclass(frozen=True)
 class SlotLimits:
-    """Within what one planned session runs.
+    """Limits of one planned session.
 
     Attributes:
-        cdbs_ma: the clinical amplitude, to which every fault leads back. min_ma, max_ma: no amplitude leaves them; both are the cDBS
+        cdbs_ma: the clinical amplitude, to which every fault leads back. min_ma, max_ma: no amplitude leaves them. Both are the cDBS
             amplitude in a cDBS session, and 0 without stimulation. ramp_ma_per_s: fastest change.
     """
 
@@ -63,7 +63,7 @@ class SlotLimits:
 
 
 def device_limits(db: Session, participant: Participant, hemisphere: Hemisphere | None) -> DeviceLimits | None:
-    """Limits of the newest recording that holds any, of this side where one is named; None where no recording does."""
+    """Return limits of the newest recording that has any, of this side where one is named; None where no recording does."""
     for recording in repository.recordings_newest_first(db, participant.id, hemisphere):
         programs = [p for group in (recording.details.get("limits") or {}).values() for p in group.values()]
         if programs:
@@ -72,11 +72,11 @@ def device_limits(db: Session, participant: Participant, hemisphere: Hemisphere 
 
 
 def planned_cdbs_ma(visit: Visit, hemisphere: Hemisphere | None) -> float:
-    """The cDBS amplitude of a visit's plan, mA: what the visit states, else the participant's settings.
+    """Return the cDBS amplitude of a visit's plan, mA: what the visit states, else the participant's settings.
 
     Raises:
-        Invalid: nobody has stated it; the visit states both sides and none is named; or the settings say otherwise than the newest visit
-            that states one, so that nobody knows which of the two is right.
+        Invalid: it is not stated; the visit states both sides and none is named; or the settings differ from the newest visit that states
+            one. Which of the two is right is then unknown.
     """
     settings = visit.participant.current_settings
     found = cdbs_amplitude.in_force(visit, hemisphere, settings)
@@ -98,7 +98,7 @@ def planned_cdbs_ma(visit: Visit, hemisphere: Hemisphere | None) -> float:
 def slot_limits(
     cdbs_ma: float, controller: Controller, period_s: float, stated: StatedLimits, device: DeviceLimits | None, least_fraction: float = 0.0
 ) -> SlotLimits:
-    """The limits of one session.
+    """Compute the limits of one session.
 
     Args:
         cdbs_ma: as `planned_cdbs_ma`. period_s: between two decisions. stated: by the clinician. device: the stimulator's own.
@@ -133,10 +133,10 @@ def slot_limits(
 
 
 def lowest_draw(db: Session, visit: Visit, stated: StatedLimits, hemisphere: Hemisphere | None) -> float:
-    """B of a visit's random sessions, fraction of cDBS: the participant's, or the plan's lowest amplitude where that is higher.
+    """Return B of a visit's random sessions, fraction of cDBS: the participant's, or the plan's lowest amplitude where that is higher.
 
-    Draws below a limit would be cut by the tablet: the sheet would name amplitudes that nobody gives, and a density that is not theirs.
-    Where nobody knows the cDBS amplitude it is the participant's, because the plan has no limits then.
+    Draws below a limit would be cut by the tablet: the sheet would name amplitudes that are not given, and a density that is not theirs.
+    Where the cDBS amplitude is unknown it is the participant's, because the plan has no limits then.
 
     Raises:
         Invalid: as `slot_limits`.
@@ -152,10 +152,10 @@ def lowest_draw(db: Session, visit: Visit, stated: StatedLimits, hemisphere: Hem
 
 
 def set_limits(db: Session, visit: Visit, items: Sequence[PlanItem], stated: StatedLimits, hemisphere: Hemisphere | None) -> None:
-    """Set the limits of every session; where nobody knows the cDBS amplitude they stay open, and the plan cannot be signed.
+    """Set the limits of every session; where the cDBS amplitude is unknown they stay open, and the plan cannot be signed.
 
     Raises:
-        Invalid: limits were stated that cannot be used, or that no known cDBS amplitude stands behind.
+        Invalid: limits were stated that cannot be used, or without a known cDBS amplitude.
     """
     try:
         cdbs_ma = planned_cdbs_ma(visit, hemisphere)
@@ -173,20 +173,20 @@ def set_limits(db: Session, visit: Visit, items: Sequence[PlanItem], stated: Sta
 
 
 def require_limits(visit: Visit, items: Sequence[PlanItem]) -> None:
-    """Hold the limits of a plan against the cDBS amplitude of today.
+    """Check the limits of a plan against today's cDBS amplitude.
 
     Raises:
-        Conflict: they are open, or were set for another amplitude. Invalid: nobody knows the amplitude.
+        Conflict: they are open, or were set for another amplitude. Invalid: the amplitude is unknown.
     """
     for item in items:
         cdbs_ma = planned_cdbs_ma(visit, item.hemisphere)
         if item.cdbs_ma is None:
             raise Conflict(
                 f"Session {item.position} has no limits in mA: the cDBS amplitude was not known when the plan was drafted.",
-                "Draft the visit anew.",
+                "Draft the visit again.",
             )
         if abs(item.cdbs_ma - cdbs_ma) > _TOLERANCE_MA:
             raise Conflict(
                 f"The limits of session {item.position} were set for a cDBS amplitude of {item.cdbs_ma:g} mA; it is {cdbs_ma:g} mA now.",
-                "Draft the visit anew, so that its limits are set for the amplitude of today.",
+                "Draft the visit again, so that its limits are set for the amplitude of today.",
             )

@@ -36,7 +36,7 @@ router = APIRouter()
 
 
 class VisitChoice(Model):
-    """Which visit a draft is for; with neither id nor number the first open visit or a new one with the next number."""
+    """Visit that a draft is for; with neither id nor number the first open visit or a new one with the next number."""
 
     visit_id: Id | None = None
     visit_number: Int | None = Field(None, ge=1, le=10_000)
@@ -45,7 +45,7 @@ class VisitChoice(Model):
 
 @router.get("/visits/{visit_id}/plan", dependencies=[VisitViewed])
 def plan(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, replace: str = "") -> HTMLResponse:
-    """The visit day to scale, its sessions, approval, and the form for a new draft; of a signed plan where it shall be replaced."""
+    """Show the visit day to scale, its sessions, approval, and the form for a new draft; of a signed plan only to replace it."""
     return HTMLResponse(_page(request, db, visit, caller, replacing=replace == "yes"))
 
 
@@ -75,7 +75,7 @@ def approve(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller
 
 @router.get("/participants/{code}/plans")
 def plans(request: Request, participant: CurrentParticipant, db: Db, paging: PagingQuery) -> HTMLResponse:
-    """All plans of a participant, and the visits that may still be planned."""
+    """Show all plans of a participant, and the visits that may still be planned."""
     rows, total = repository.plans(db, participant.id, paging.limit, paging.offset)
     page = render(
         request,
@@ -187,7 +187,7 @@ def _page(
     view = shown(full) if full else None
     signed = view is not None and view.plan.status == "approved"
     may_approve = may(caller, can.SIGN_PLAN, participant)
-    # a signed plan is there to be run: policies are offered, and named beside one whose key is sealed, only to who would replace it
+    # a signed plan is there to be run: policies are offered, and named next to one whose key is sealed, only on request
     drafting = may(caller, can.DRAFT_PLAN, participant) and (not signed or (may_approve and (replacing or values is not None)))
     return render(
         request,
@@ -230,7 +230,7 @@ def _page(
 
 
 def _movable(view: PlanView | None) -> list[int]:
-    """Positions of the tested sessions of a draft, in order."""
+    """List positions of the tested sessions of a draft, in order."""
     if view is None or view.plan.status != "draft":
         return []
     return [i.item.position for i in view.lines if i.item.controller not in (Controller.CDBS, Controller.NO_DBS)]

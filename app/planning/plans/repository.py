@@ -21,12 +21,12 @@ from app.tables.visits import Dose, Visit, VisitLock
 
 
 def live_plan(db: Session, visit_id: int) -> Plan | None:
-    """The visit's plan that is not superseded, with its items."""
+    """Load the visit's plan that is not superseded, with its items."""
     return db.scalar(select(Plan).where(Plan.visit_id == visit_id, Plan.status != "superseded").options(selectinload(Plan.items)))
 
 
 def plans(db: Session, participant_id: int, limit: int, offset: int) -> tuple[Sequence[tuple[Plan, Visit]], int]:
-    """A page of a participant's plans with their visits, newest visit and newest plan first."""
+    """Load a page of a participant's plans with their visits, newest visit and newest plan first."""
     query = select(Plan, Visit).join(Visit, Visit.id == Plan.visit_id).where(Visit.participant_id == participant_id)
     rows = db.execute(
         query.order_by(Visit.number.desc(), Plan.id.desc()).limit(limit).offset(offset).options(selectinload(Plan.items))
@@ -40,7 +40,7 @@ def lock_visit(db: Session, visit_id: int) -> None:
 
 
 def earlier_designed_visits(db: Session, visit: Visit) -> int:
-    """Visits of the participant before this one whose live plan has random sessions of held draws."""
+    """Count visits of the participant before this one whose live plan has random sessions with sustained draws."""
     query = (
         select(func.count(distinct(Plan.visit_id)))
         .join(PlanItem, PlanItem.plan_id == Plan.id)
@@ -52,17 +52,17 @@ def earlier_designed_visits(db: Session, visit: Visit) -> int:
 
 
 def session_count(db: Session, visit_id: int) -> int:
-    """Confirmed sessions that a visit already has."""
+    """Count confirmed sessions that a visit already has."""
     return db.scalar(select(func.count()).select_from(StudySession).where(StudySession.visit_id == visit_id, CONFIRMED)) or 0
 
 
 def has_sessions(db: Session, visit_id: int) -> bool:
-    """Whether a visit has sessions, proposed ones too."""
+    """Check whether a visit has sessions, proposed ones too."""
     return db.scalar(select(exists().where(StudySession.visit_id == visit_id))) or False
 
 
 def open_visits(db: Session, participant_id: int, today: date) -> Sequence[Visit]:
-    """Visits that may still be planned: without a confirmed session, today or later or without a date; by number."""
+    """List visits that may still be planned: without a confirmed session, today or later or without a date; by number."""
     return db.scalars(
         select(Visit)
         .where(Visit.participant_id == participant_id, or_(Visit.date.is_(None), Visit.date >= today))
@@ -72,12 +72,12 @@ def open_visits(db: Session, participant_id: int, today: date) -> Sequence[Visit
 
 
 def next_visit_number(db: Session, participant_id: int) -> int:
-    """The number after the participant's last visit."""
+    """Return the number after the participant's last visit."""
     return (db.scalar(select(func.max(Visit.number)).where(Visit.participant_id == participant_id)) or 0) + 1
 
 
 def recordings_newest_first(db: Session, participant_id: int, hemisphere: Hemisphere | None) -> Sequence[Recording]:
-    """The participant's recordings; where a side is named, those of it and those that name none."""
+    """Load the participant's recordings; where a side is named, those of it and those that name none."""
     query = select(Recording).where(Recording.participant_id == participant_id)
     if hemisphere is not None:
         query = query.where((Recording.hemisphere == hemisphere) | Recording.hemisphere.is_(None))
@@ -85,7 +85,7 @@ def recordings_newest_first(db: Session, participant_id: int, hemisphere: Hemisp
 
 
 def earlier_planned_visits(db: Session, visit: Visit) -> int:
-    """Visits of the participant before this one whose live plan tests policies."""
+    """Count visits of the participant before this one whose live plan tests policies."""
     query = (
         select(func.count(distinct(Plan.visit_id)))
         .join(PlanItem, PlanItem.plan_id == Plan.id)
@@ -97,14 +97,14 @@ def earlier_planned_visits(db: Session, visit: Visit) -> int:
 
 
 def what_holds(db: Session, visit_id: int) -> list[str]:
-    """What of a visit keeps it from being removed, in words."""
+    """List what keeps a visit from being removed, in words."""
     sessions = db.scalar(select(func.count()).select_from(StudySession).where(StudySession.visit_id == visit_id)) or 0
     signed = db.scalar(select(func.count()).select_from(Plan).where(Plan.visit_id == visit_id, Plan.approved_at.is_not(None))) or 0
     events = db.scalar(select(func.count()).select_from(AdverseEvent).where(AdverseEvent.visit_id == visit_id)) or 0
     locks = db.scalar(select(func.count()).select_from(VisitLock).where(VisitLock.visit_id == visit_id)) or 0
     doses = db.scalar(select(func.count()).select_from(Dose).where(Dose.visit_id == visit_id)) or 0
     counted = {"sessions or proposals": sessions, "a plan that was signed": signed, "adverse events": events, "locks": locks}
-    counted["doses of medication"] = doses  # those that were taken back too: they stay, and tell that something was done
+    counted["doses of medication"] = doses  # those that were taken back too: they stay, and show that something was done
     counted["data queries"] = db.scalar(select(func.count()).select_from(DataQuery).where(DataQuery.visit_id == visit_id)) or 0
     return [what for what, count in counted.items() if count]
 
@@ -132,12 +132,12 @@ def delete_visit(db: Session, visit: Visit) -> None:
 
 
 def evaluation(db: Session, evaluation_id: int) -> Evaluation:
-    """An evaluation that a plan pins, with its estimates."""
+    """Load an evaluation that a plan pins, with its estimates."""
     return db.get_one(Evaluation, evaluation_id, options=[selectinload(Evaluation.estimates)])
 
 
 def pinned_evaluations(db: Session, participant_id: int) -> dict[int, int]:
-    """By visit: the evaluation whose predictions its signed plan rests on; plans without one are left out."""
+    """Return by visit the evaluation whose predictions its signed plan rests on; plans without one are ignored."""
     query = select(Plan.visit_id, Plan.evaluation_id).join(Visit, Visit.id == Plan.visit_id)
     query = query.where(Visit.participant_id == participant_id, Plan.status == "approved", Plan.evaluation_id.is_not(None))
     return {visit_id: evaluation_id for visit_id, evaluation_id in db.execute(query) if evaluation_id is not None}

@@ -1,4 +1,4 @@
-"""What stands between a verdict and a visit: unsafe policies need a clinician's reason, tests with care their lowest amplitude."""
+"""Safeguards between a verdict and a visit: unsafe policies need a clinician's reason, tests with care their lowest amplitude."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Safeguard:
-    """What a plan records of one policy.
+    """Record of a plan on one policy.
 
     Attributes:
-        verdict: the strictest of the ranking behind the plan and the newest one, *unsafe* after a serious adverse event; None where
-            nothing is known of the policy.
+        verdict: the strictest of the ranking behind the plan and the newest one. It is *unsafe* after a serious adverse event, and None
+            where nothing is known of the policy.
         min_fraction: lowest amplitude, fraction of cDBS; None where the plan states none. override_reason: a clinician's.
     """
 
@@ -32,16 +32,16 @@ class Safeguard:
 def safeguards(
     found: Grounds, policies: Sequence[Policy], overrides: Mapping[int, str], limits: Mapping[int, float], *, may_override: bool
 ) -> dict[int, Safeguard]:
-    """What the plan records of each policy.
+    """Build the plan's record of each policy.
 
     Args:
         found: what policies are planned by. policies: to test.
         overrides: reasons for unsafe policies, by id. limits: stated lowest amplitudes, by id.
-        may_override: whether whoever drafts may approve plans.
+        may_override: whether the author may approve plans.
 
     Raises:
-        Invalid: an unsafe policy without a reason, two tests with care, a limit below that of the verdict, or a reason or limit for a
-            policy that is not in the plan; `field` is what the form calls it. Forbidden: a reason of somebody who may not approve plans.
+        Invalid: an unsafe policy without a reason, two tests with care, or a limit below that of the verdict. Also a reason or limit for a
+            policy that is not in the plan; `field` is its name in the form. Forbidden: a reason of a person who may not approve plans.
     """
     _all_planned(policies, overrides, limits)
     made, careful = {}, []
@@ -63,11 +63,11 @@ def safeguards(
 
 
 def refuse_approval(found: Grounds, planned: Sequence[tuple[Policy, Safeguard]]) -> None:
-    """Hold a draft against the verdicts of now, which margins and later findings may have changed since it was drafted.
+    """Check a draft against the present verdicts: margins and later findings may have changed them since it was drafted.
 
     Raises:
-        Conflict: a policy that is unsafe now and has no clinician's reason, one to be tested with care without a lowest amplitude or with
-            one below the verdict's, or two of these.
+        Conflict: a policy that is unsafe now and has no clinician's reason; two tests with care; or a test with care without a lowest
+            amplitude or with one below the verdict's.
     """
     careful = []
     for policy, stated in planned:
@@ -77,7 +77,7 @@ def refuse_approval(found: Grounds, planned: Sequence[tuple[Policy, Safeguard]])
         if finding.held_back is not None and not stated.override_reason:
             raise Conflict(
                 f"Policy '{policy.name}' is not to be run without a clinician's word: {_why(finding.held_back)}.",
-                "Draft the visit anew without it, or with the reason why it is tested all the same.",
+                "Draft the visit again without it, or with the reason why it is tested all the same.",
             )
         if finding.with_care:
             careful.append(policy)
@@ -86,10 +86,10 @@ def refuse_approval(found: Grounds, planned: Sequence[tuple[Policy, Safeguard]])
                 least = f" of at least {limit:.2f} of the cDBS amplitude" if limit is not None else ""
                 raise Conflict(
                     f"Policy '{policy.name}' is to be tested with care, and the plan states no lowest amplitude{least} for it.",
-                    "Draft the visit anew with that limit.",
+                    "Draft the visit again with that limit.",
                 )
     if len(careful) > 1:
-        raise Conflict(f"{_names(careful)} are each to be tested with care; a visit takes one of them.", "Draft the visit anew with one.")
+        raise Conflict(f"{_names(careful)} are each to be tested with care; a visit takes one of them.", "Draft the visit again with one.")
 
 
 def _require_override(policy: Policy, decided: Decided, reason: str | None, may_override: bool) -> None:
@@ -104,7 +104,7 @@ def _require_override(policy: Policy, decided: Decided, reason: str | None, may_
 
 
 def _checked_limit(policy: Policy, least: float | None, stated: float | None) -> float | None:
-    """The lowest amplitude of a test with care: what was stated, else the verdict's; never below that."""
+    """Return the lowest amplitude of a test with care: the stated one, else the verdict's; never below that."""
     if stated is None or least is None:
         return least if stated is None else stated
     if stated < least - ROUNDING:

@@ -23,7 +23,7 @@ Milliamperes = Annotated[Number, Field(ge=0, le=25.5)]
 
 
 class PlanOptions(Model):
-    """How a visit day shall be laid out; what is left out takes the default."""
+    """Layout of a visit day; omitted options take the default."""
 
     minutes_per_session: Number = Field(10.0, ge=5, le=20, description="Length of every session but no-DBS, minutes.")
     total_minutes: Number = Field(120.0, gt=0, le=1440, description="From the first session's start to the last one's end, at most.")
@@ -53,8 +53,8 @@ class PlanOptions(Model):
     seed: Int | None = Field(None, ge=0, description="Draws the order; without one it is drawn too, and recorded.")
     evaluation_id: Id | None = Field(
         None,
-        description="Ranking that the choice rests on; the participant's newest where not given. Beside an older one the newest counts "
-        "too: what is unsafe by either needs a reason, and a test with care has the higher limit of both.",
+        description="Ranking that the choice rests on; the participant's newest where not given. Besides an older one the newest counts "
+        "too. Policies that are unsafe by either need a reason, and a test with care has the higher limit of both.",
     )
     note: Text = Field("", max_length=4000)
     reason: Text | None = Field(
@@ -63,7 +63,7 @@ class PlanOptions(Model):
 
 
 class OverrideIn(Model):
-    """Why an unsafe policy is planned all the same."""
+    """Reason why an unsafe policy is planned all the same."""
 
     policy_id: Id
     reason: Text = Field(max_length=1000)
@@ -77,7 +77,7 @@ class LimitIn(Model):
 
 
 class HeldIn(Model):
-    """Sessions that are held near an amplitude, as a verdict asks for."""
+    """Sessions near a stated amplitude, as a verdict requests."""
 
     amplitude_ma: Milliamperes | None = Field(None, description="Near which, mA; either this or `amplitude_fraction`.")
     amplitude_fraction: Number | None = Field(None, gt=0, lt=1, description="Near which, fraction of the cDBS amplitude.")
@@ -116,17 +116,17 @@ class PlanIn(PlanOptions):
 class Approval(Signing):
     """A signature under a draft."""
 
-    plan_id: Id | None = Field(None, description="Which draft was read; a guard against signing one that somebody replaced meanwhile.")
+    plan_id: Id | None = Field(None, description="Which draft was read; a guard against signing one that was replaced meanwhile.")
 
 
 class PlanEstimateOut(EstimateSummary):
-    """What the pinned ranking states of a policy."""
+    """Estimate of a policy in the pinned ranking."""
 
     method: str
 
 
 class PlannedHoldOut(Model):
-    """One amplitude that is held."""
+    """One sustained amplitude."""
 
     start: int = Field(description="First step.")
     steps: int
@@ -144,14 +144,14 @@ class BoundOut(Model):
 
 
 class PlannedDesignOut(Model):
-    """What a random session shall try."""
+    """Design of a random session."""
 
     design: SessionDesign
     level: float | None = Field(description="Of the session, fraction of the cDBS amplitude; null where it has none.")
     seed: int | None
     lower_bound: float
     period_s: float
-    holds: list[PlannedHoldOut] = Field(description="In order; empty in the paper's design, where the device draws anew every step.")
+    holds: list[PlannedHoldOut] = Field(description="In order; empty in the paper's design, where the device draws again at every step.")
     bounds: list[BoundOut] = Field(
         description="As they stood when the plan was approved, in a draft as of today; empty where the cDBS amplitude is not known."
     )
@@ -162,7 +162,7 @@ class PlannedSessionOut(Model):
 
     position: int
     start_minute: float = Field(description="From the first session's start.")
-    controller: Controller | None = Field(description="Null while the key of a blinded plan is sealed, with all that would tell it.")
+    controller: Controller | None = Field(description="Null while the key of a blinded plan is sealed, with all that would reveal it.")
     policy_id: int | None
     policy: str | None
     minutes: float
@@ -172,8 +172,8 @@ class PlannedSessionOut(Model):
     estimate: PlanEstimateOut | None
     predicted_energy: float | None = Field(description="Mean squared amplitude fraction; cDBS = 1.")
     verdict: str | None = Field(
-        description="What the ranking said of the policy when the plan was drafted, the strictest where the plan rests on an older one; "
-        "null for what is not ranked, but `unsafe` after a serious adverse event that no clinician has cleared."
+        description="Verdict of the ranking when the plan was drafted, the strictest where the plan rests on an older one. "
+        "Null for what is not ranked, but `unsafe` after a serious adverse event that no clinician has cleared."
     )
     min_fraction: float | None = Field(description="Lowest amplitude of the session, fraction of the cDBS amplitude.")
     override_reason: str | None = Field(description="Why a clinician plans an unsafe policy all the same.")
@@ -181,10 +181,12 @@ class PlannedSessionOut(Model):
     label: str | None = Field(description="What a blinded visit calls it.")
     hemisphere: Hemisphere | None = Field(description="Side whose amplitude the controller sets; null where none is stated.")
     cdbs_ma: float | None = Field(description="The clinical amplitude that the limits were set for; null where it was not known.")
-    min_ma: float | None = Field(description="No amplitude is below it, mA; null in plans of before, and where no limit could be set.")
+    min_ma: float | None = Field(
+        description="No amplitude is below it, mA; null in plans of older versions, and where no limit could be set."
+    )
     max_ma: float | None = Field(description="No amplitude is above it, mA.")
     ramp_ma_per_s: float | None = Field(description="Fastest change, mA/s.")
-    design: PlannedDesignOut | None = Field(description="Of a random session: what it shall try; null in plans of before.")
+    design: PlannedDesignOut | None = Field(description="Of a random session: what it shall try; null in plans of older versions.")
 
 
 class PlanEvaluationOut(Model):
@@ -199,7 +201,7 @@ class PlanEvaluationOut(Model):
 
 
 class PlanWarningOut(Model):
-    """What whoever signs or runs a plan must know. Programs read the code; the text may be worded anew."""
+    """Warning for the person who signs or runs a plan. Programs read the code; the text may be reworded."""
 
     code: Code
     policy_id: int | None = Field(description="Whom it is about; null for the whole plan.")
@@ -209,22 +211,22 @@ class PlanWarningOut(Model):
 class KeyOut(Model):
     """The key of a blinded plan: which letter is which controller."""
 
-    sealed: bool = Field(description="Until it is opened, sessions tell their letters and the limits that hold for all alike.")
+    sealed: bool = Field(description="Until it is opened, sessions show their letters and the limits that apply to all alike.")
     opened_at: datetime | None
     opened_by: str | None
-    reason: str | None = Field(description="Null after an emergency for which nobody has given it yet.")
+    reason: str | None = Field(description="Null after an emergency for which it is not given yet.")
     emergency: bool
 
 
 class KeyOpening(Model):
-    """Why the key of a blinded plan is opened."""
+    """Reason why the key of a blinded plan is opened."""
 
     reason: Text = Field("", max_length=1000, description="Needed but in an emergency, after which it is given by a second call.")
     emergency: Bool = False
 
 
 class Move(Model):
-    """A tested session changes places with the tested one before or after it, as often as said."""
+    """Move of a tested session: it changes places with the tested one before or after it, so many times."""
 
     position: Id
     earlier: Bool
@@ -232,7 +234,7 @@ class Move(Model):
 
 
 class Removal(Model):
-    """Why a visit in which nothing was done is removed."""
+    """Reason why a visit in which nothing was done is removed."""
 
     reason: Text = Field(max_length=1000)
 
@@ -254,7 +256,7 @@ class PlanOut(Model):
     approved_by: str | None
     signature: SignatureOut | None = Field(description="The newest under this plan, standing or not.")
     signature_state: Literal["none", "stands", "broken", "not_kept"] = Field(
-        description="Whether it stands; `broken` when anything that was signed has changed since, `not_kept` for plans of earlier versions."
+        description="Whether it is valid; `broken` when anything signed has changed since, `not_kept` for plans of earlier versions."
     )
     starts_at: dt.time | None
     order: Order

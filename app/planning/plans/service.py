@@ -40,12 +40,13 @@ MAX_SEED = 2**31 - 1
 
 
 def draft_plan(db: Session, visit: Visit, draft: PlanIn, caller: Caller) -> PlanView:
-    """Lay out a visit day from chosen policies. An earlier plan is superseded; an approved one only by who may approve, with a reason.
+    """Lay out a visit day from chosen policies. An earlier plan is superseded. Replacing an approved one takes the right to approve, and a
+    reason.
 
     Raises:
-        NotFound: a policy or ranking that the participant does not have. Forbidden: an approved plan, or an unsafe policy, and a caller
-            who may not approve. Invalid: a retired policy, a day that does not fit, no reason why an approved plan is replaced, a session
-            held near an amplitude that the participant's bound forbids, or what `safeguards` refuses.
+        NotFound: a policy or ranking that the participant does not have. Forbidden: an approved plan, or an unsafe policy, and a caller who
+            may not approve. Invalid: a retired policy, a day that does not fit, or no reason why an approved plan is replaced. Also a
+            session near an amplitude that the participant's bound forbids, or what `safeguards` refuses.
     """
     participant = visit.participant
     access.require(caller, can.DRAFT_PLAN, participant)
@@ -105,9 +106,9 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
         plan_id: the draft that was looked at; None for whatever is there. code: of the second factor, where the clinician has one.
 
     Raises:
-        NotFound: no plan. Conflict: approved already, replaced meanwhile, with a policy that was retired since it was drafted, limits that
-            were set for another cDBS amplitude, a serious adverse event since the reason was given why its policy is tested all the same,
-            or what `safeguards.refuse_approval` or `releases.refuse_unreleased` refuse.
+        NotFound: no plan. Conflict: approved already, replaced meanwhile, a policy retired since, or limits that were set for another cDBS
+            amplitude. Also a serious adverse event after the reason why its policy is tested all the same, and what
+            `safeguards.refuse_approval` or `releases.refuse_unreleased` refuse.
         Invalid: no cDBS amplitude by which limits are ones in milliamperes. Forbidden, TooMany: as `sign_off.sign_plan`.
     """
     access.require(caller, can.SIGN_PLAN, visit.participant)
@@ -117,7 +118,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
     if plan_id is not None and plan.id != plan_id:
         raise Conflict(f"Plan {plan_id} was replaced by plan {plan.id} of {plan.created_by}.", "Look at the new draft, then approve it.")
     if plan.status == "approved":
-        raise Conflict(f"Plan {plan.id} was approved by {plan.approved_by} already.", "Draft the visit anew to change it.")
+        raise Conflict(f"Plan {plan.id} was approved by {plan.approved_by} already.", "Draft the visit again to change it.")
     refuse_withdrawn(view)
     policies = {line.policy.id: line.policy for line in view.lines if line.policy}
     stated = [(v.policy, Safeguard(v.item.verdict, v.item.min_fraction, v.item.override_reason)) for v in view.lines if v.policy]
@@ -133,7 +134,7 @@ def approve_plan(db: Session, visit: Visit, caller: Caller, password: str, plan_
 
 
 def rules_of(options: PlanOptions) -> Rules:
-    """The rules of a visit day as the caller wants them."""
+    """Build the rules of a visit day as the caller wants them."""
     return Rules(
         session_minutes=options.minutes_per_session,
         washout_minutes=options.washout_minutes,
@@ -148,7 +149,7 @@ def rules_of(options: PlanOptions) -> Rules:
 
 
 def testable_policies(db: Session, participant: Participant, ids: Sequence[int]) -> list[Policy]:
-    """The named policies of this participant, in that order.
+    """Load the named policies of this participant, in that order.
 
     Raises:
         NotFound: one that the participant does not have. Invalid: one that is named twice, or retired.
@@ -165,12 +166,12 @@ def testable_policies(db: Session, participant: Participant, ids: Sequence[int])
 
 
 def controller_of(policy: Policy) -> Controller:
-    """What a session of this policy counts as: students are `distilled`, reference policies `other`, all others `rl`."""
+    """Return the controller of a session of this policy: students are `distilled`, reference policies `other`, all others `rl`."""
     return CONTROLLER_OF_KIND.get(policy.kind, Controller.RL)
 
 
 def count_repeats(items: Sequence[PlanItem]) -> None:
-    """Number the sessions of each policy, and of each controller without one, from 1 in their order; held ones by themselves."""
+    """Count the sessions of each policy, and of each controller without one, from 1; those near an amplitude by themselves."""
     seen: Counter[tuple[Controller, int | None, bool]] = Counter()
     for item in items:
         arm = (Controller(item.controller), item.policy_id, is_held(item))
@@ -181,17 +182,17 @@ def count_repeats(items: Sequence[PlanItem]) -> None:
 def reorder(db: Session, visit: Visit, move: Move, caller: Caller) -> PlanView:
     """Move a tested session of a draft past others; sessions of cDBS and without stimulation stay where the protocol has them.
 
-    Whoever moves a session has drafted the plan from then on, and signs it no more than any other drafter.
+    The user who moves a session counts as the plan's author from then on, and cannot sign it.
 
     Raises:
-        NotFound: no plan. Conflict: it is signed. Invalid: no tested session stands there, there are not so many before or after it, or
-            two policies would follow one another without a cDBS session between them.
+        NotFound: no plan. Conflict: it is signed. Invalid: no tested session is there, there are not so many before or after it, or two
+            policies would have no cDBS session between them.
     """
     access.require(caller, can.DRAFT_PLAN, visit.participant)
     repository.lock_visit(db, visit.id)
     plan = read_plan(db, visit, caller).plan
     if plan.status != "draft":
-        raise Conflict(f"Plan {plan.id} is signed.", "Draft the visit anew to change it.")
+        raise Conflict(f"Plan {plan.id} is signed.", "Draft the visit again to change it.")
     tested = [item for item in plan.items if item.controller not in (Controller.CDBS, Controller.NO_DBS)]
     place = next((i for i, item in enumerate(tested) if item.position == move.position), None)
     step = -1 if move.earlier else 1
@@ -218,7 +219,7 @@ def _set_medication(visit: Visit, plan: Plan) -> None:
 
 
 def _seed(participant: Participant, rules: Rules) -> int:
-    """Drawn; of a square by the participant's code, so that its rows go on from visit to visit."""
+    """Draw a seed; of a square by the participant's code, so that its rows go on from visit to visit."""
     if rules.order in (Order.LATIN_SQUARE, Order.WILLIAMS):
         return seed_of(participant.code, 0)
     return secrets.randbelow(MAX_SEED)
@@ -259,7 +260,7 @@ def _supersede(db: Session, visit: Visit, reason: str | None, caller: Caller) ->
 
 
 def _to_try(db: Session, visit: Visit, rules: Rules, draft: PlanIn, seed: int) -> list[Planned]:
-    """What the visit's random and held sessions shall try by the settings of today, in a drawn order where there are both."""
+    """Design the visit's random sessions and those near an amplitude by today's settings, in a drawn order where there are both."""
     participant, settings = visit.participant, visit.participant.current_settings
     bound = lowest_draw(db, visit, StatedLimits(draft.min_ma, draft.max_ma, draft.ramp_ma_per_s), draft.hemisphere)
     earlier = repository.earlier_designed_visits(db, visit)
@@ -272,10 +273,10 @@ def _to_try(db: Session, visit: Visit, rules: Rules, draft: PlanIn, seed: int) -
 
 
 def _levels(visit: Visit, held: Sequence[HeldIn], hemisphere: Hemisphere | None) -> tuple[list[float], float | None]:
-    """Fraction of cDBS of every held session, and the cDBS amplitude in mA; None where no wish is in mA and nobody has stated it.
+    """Return the fraction of cDBS of every session near an amplitude, and the cDBS amplitude in mA; None where unneeded and not stated.
 
     Raises:
-        Invalid: an amplitude in mA, and nobody knows which fraction of cDBS that is.
+        Invalid: an amplitude in mA whose fraction of cDBS is unknown.
     """
     try:
         cdbs_ma: float | None = planned_cdbs_ma(visit, hemisphere)
@@ -296,7 +297,7 @@ def _levels(visit: Visit, held: Sequence[HeldIn], hemisphere: Hemisphere | None)
 
 
 def _fix_designs(visit: Visit, plan: Plan) -> None:
-    """Fix the bounds of held draws in milliamperes."""
+    """Fix the bounds of sustained draws in milliamperes."""
     for item in plan.items:
         if item.design is not None and item.design["holds"]:
             design = Planned.from_json(item.design)

@@ -1,4 +1,4 @@
-"""What a clinician signs when a plan is approved, and whether the signature still stands. The caller commits."""
+"""Signature of a clinician under an approved plan, and its present state. The caller commits."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ MEANING: Final = "approved for use in this participant"
 def sign_plan(
     db: Session, visit: Visit, plan: Plan, policies: Mapping[int, Policy], caller: Caller, password: str, code: str = ""
 ) -> Signature:
-    """Sign a plan that stands as it shall run.
+    """Sign a plan in its final form.
 
     Raises:
-        Forbidden: whoever drafted it, or a wrong password. TooMany: too many wrong passwords. Conflict: a session without limits.
+        Forbidden: the caller drafted it, or a wrong password. TooMany: too many wrong passwords. Conflict: a session without limits.
     """
     if plan.created_by == caller.label:
         raise Forbidden(
@@ -41,14 +41,15 @@ def sign_plan(
     for item in plan.items:
         if item.min_ma is None or item.max_ma is None or item.ramp_ma_per_s is None or item.cdbs_ma is None:
             raise Conflict(
-                f"Session {item.position} of plan {plan.id} has no limits in mA.", "Draft the visit anew, so that its limits are set first."
+                f"Session {item.position} of plan {plan.id} has no limits in mA.",
+                "Draft the visit again, so that its limits are set first.",
             )
     content = signed_content(visit, plan, policies)
     return sign_on.sign(db, caller, password, kind=KIND, subject_id=plan.id, meaning=MEANING, content=content, code=code)
 
 
 def signature_of(db: Session, visit: Visit, plan: Plan, policies: Mapping[int, Policy]) -> tuple[SignatureState, Signature | None]:
-    """Whether a plan's signature stands, and the newest one under it, standing or broken."""
+    """Return the state of a plan's signature, and the newest one under it, valid or broken."""
     if plan.approved_at is None:
         return SignatureState.NONE, None
     newest = next(iter(signatures.signatures_of(db, KIND, plan.id)), None)
@@ -56,7 +57,8 @@ def signature_of(db: Session, visit: Visit, plan: Plan, policies: Mapping[int, P
 
 
 def signed_content(visit: Visit, plan: Plan, policies: Mapping[int, Policy]) -> dict[str, Any]:
-    """All that a signature under a plan covers: whose visit, the order, and of every session its policy's bytes and its limits in mA.
+    """Build the content that a signature under a plan covers: whose visit, the order, and of every session its policy's bytes and limits in
+    mA.
 
     The visit's date is not part of it: a visit that is put off is still the one that was approved.
     """
@@ -101,7 +103,7 @@ def _session(item: PlanItem, policy: Policy | None) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class CommonLimits:
-    """Limits that hold for every session of a plan alike, mA and mA/s: they tell no controller from another."""
+    """Limits that hold for every session of a plan alike, mA and mA/s: they reveal no controller."""
 
     min_ma: float
     max_ma: float
@@ -109,19 +111,19 @@ class CommonLimits:
 
 
 def label_sessions(items: Sequence[PlanItem], seed: int) -> None:
-    """Give every session a letter of its own, drawn: a letter that came twice would tell policies from cDBS."""
+    """Give every session a letter of its own, drawn: a repeated letter would distinguish policies from cDBS."""
     order = np.random.default_rng([seed, len(items)]).permutation(len(items))
     for item, place in zip(items, order, strict=True):
         item.label = _letters(int(place))
 
 
 def sealed(plan: Plan) -> bool:
-    """Whether nobody is shown which session is which: from the signature on, until the key is opened."""
+    """Check whether it is hidden which session is which: from the signature on, until the key is opened."""
     return plan.blinded and plan.approved_at is not None and plan.key_opened_at is None
 
 
 def common_limits(items: Sequence[PlanItem]) -> CommonLimits | None:
-    """The least and the greatest amplitude and the fastest change of any session; None where a limit is open."""
+    """Return the least and the greatest amplitude and the fastest change of any session; None where a limit is open."""
     lows, highs, ramps = ([getattr(i, name) for i in items] for name in ("min_ma", "max_ma", "ramp_ma_per_s"))
     if not items or any(v is None for v in (*lows, *highs, *ramps)):
         return None
@@ -155,7 +157,7 @@ def give_reason(db: Session, visit: Visit, plan: Plan, caller: Caller, reason: s
     """State afterwards why a key was opened in an emergency.
 
     Raises:
-        Forbidden: the caller may not open keys. Conflict: a reason stands, or nothing was opened. Invalid: no reason.
+        Forbidden: the caller may not open keys. Conflict: there is a reason already, or nothing was opened. Invalid: no reason.
     """
     access.require(caller, can.OPEN_KEY, visit.participant)
     if plan.key_opened_at is None or plan.key_opened_reason is not None:
@@ -169,7 +171,7 @@ def give_reason(db: Session, visit: Visit, plan: Plan, caller: Caller, reason: s
 
 
 def _letters(number: int) -> str:
-    """0 as A, 25 as Z, 26 as AA."""
+    """Write 0 as A, 25 as Z, 26 as AA."""
     text = ""
     number += 1
     while number:

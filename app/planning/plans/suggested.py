@@ -1,6 +1,7 @@
-"""What a visit's plan suggests: the portfolio of candidates that may be proposed, then sessions that would tell of others.
+"""Suggestions for a visit's plan: the portfolio of candidates that may be proposed, then sessions that would decide about others.
 
-The clinician decides."""
+The clinician decides.
+"""
 
 from __future__ import annotations
 
@@ -39,17 +40,17 @@ class Suggested:
 
 @dataclass(frozen=True)
 class Held:
-    """Sessions to hold near an amplitude, and the policies of which they would tell."""
+    """Sessions near an amplitude, and the policies that they would decide about."""
 
     hold: Hold
     policies: tuple[PolicyHead, ...]
 
 
 def held_in(found: Judged | None, slots: int, place: Place) -> tuple[Held, ...]:
-    """What to hold in slots that no policy takes; nothing before there is a ranking, or where it would tell nothing.
+    """Suggest sessions near an amplitude for slots that no policy takes; empty before there is a ranking, or where none would decide.
 
     Args:
-        found: the ranking. slots: of the visit that are free. place: within what the visit's sessions are held.
+        found: the ranking. slots: of the visit that are free. place: range of the visit's amplitudes.
     """
     if found is None:
         return ()
@@ -87,7 +88,7 @@ def _portfolio(found: Assessment, slots: int) -> tuple[Suggested, ...]:
     # of one session
     noise = float(found.cdbs.posterior.details.get("return_noise") or 0.0)
     for number in range(slots, 0, -1):
-        # a day of fewer policies has fewer cDBS sessions, and each policy is held against their mean
+        # a day of fewer policies has fewer cDBS sessions, and each policy is compared with their mean
         chosen = portfolio(differences, number, careful, tested, noise * math.sqrt(1 + 1 / cdbs_sessions(number)))
         if len(chosen) == number:
             return tuple(Suggested(policies[s.name], s) for s in chosen)

@@ -1,4 +1,4 @@
-"""A plan as it is read: its sessions with what is predicted of them, what speaks against it, whether its signature stands."""
+"""A plan with its sessions, their predictions, what speaks against it, and the state of its signature."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class PlanView:
 
     @property
     def sealed(self) -> bool:
-        """Whether nobody is shown which session is which (`app.planning.plans.sign_off`)."""
+        """True while it is hidden which session is which (`app.planning.plans.sign_off`)."""
         return sealed(self.plan)
 
     @property
@@ -89,7 +89,7 @@ class PlanView:
 
 
 def read_plan(db: Session, visit: Visit, caller: Caller) -> PlanView:
-    """The plan of a visit. Raises NotFound when there is none."""
+    """Read the plan of a visit. Raises NotFound when there is none."""
     access.require(caller, can.READ, visit.participant)
     plan = repository.live_plan(db, visit.id)
     if plan is None:
@@ -101,7 +101,7 @@ def read_plan(db: Session, visit: Visit, caller: Caller) -> PlanView:
 
 
 def medication_due(visit: Visit, plan: Plan) -> list[str]:
-    """What is due before each session by the participant's schedule of today, in words; empty where none is, or no time is planned."""
+    """Describe what is due before each session by the participant's present schedule; empty where none is, or no time is planned."""
     if plan.starts_at is None:
         return [""] * len(plan.items)
     lengths = [i.minutes + i.washout_minutes + i.break_minutes for i in plan.items]
@@ -109,12 +109,12 @@ def medication_due(visit: Visit, plan: Plan) -> list[str]:
 
 
 def refuse_withdrawn(view: PlanView) -> None:
-    """Raises Conflict for a plan with a policy that was retired after it was drafted."""
+    """Raise Conflict for a plan with a policy that was retired after it was drafted."""
     for line in view.lines:
         if line.policy and line.policy.retired_reason:
             raise Conflict(
                 f"Policy '{line.policy.name}' was retired after this plan was drafted: {line.policy.retired_reason}.",
-                "Draft the visit anew.",
+                "Draft the visit again.",
             )
 
 
@@ -122,19 +122,19 @@ def refuse_after_events(view: PlanView) -> None:
     """Refuse a plan with a policy with a serious event or a stop that was neither cleared nor answered. Raises Conflict."""
     names = {line.policy.id: line.policy.name for line in view.lines if line.policy}
     for policy_id, events in view.unanswered.items():
-        # of a sealed plan neither policy nor event is named, for the event may tell the policy
+        # of a sealed plan neither policy nor event is named, for the event may reveal the policy
         what = happened(None if view.sealed else names[policy_id], events)
         may_not = "be signed" if view.plan.status == "draft" else "run"
         raise Conflict(f"Plan {view.plan.id} of visit {view.visit.number} may not {may_not}: {what}.", ANSWER_EVENT)
 
 
 def refuse_running(view: PlanView) -> None:
-    """Hold a plan against what may run in a participant: signed, unchanged since, no policy withdrawn, the cDBS amplitude that was signed.
+    """Require that a plan may run in a participant: signed, unchanged since, no policy withdrawn, the cDBS amplitude that was signed.
 
-    Nor may one run with a policy that a serious event or a stop stands against, until a clinician has cleared it.
+    Nor may one run with a policy that has a serious event or a stop, until a clinician has cleared it.
 
     Raises:
-        Conflict: one of these fails; it says which. Invalid: nobody knows the cDBS amplitude any more.
+        Conflict: one of these fails; it says which. Invalid: the cDBS amplitude is no longer known.
     """
     if view.plan.status != "approved" or view.signature_state is not SignatureState.STANDS:
         why = {
@@ -143,14 +143,14 @@ def refuse_running(view: PlanView) -> None:
             SignatureState.NOT_KEPT: "was approved by an earlier version, which kept no signature",
             SignatureState.STANDS: "was replaced",
         }[view.signature_state]
-        raise Conflict(f"Plan {view.plan.id} of visit {view.visit.number} {why}.", "Draft the visit anew, and have a clinician sign it.")
+        raise Conflict(f"Plan {view.plan.id} of visit {view.visit.number} {why}.", "Draft the visit again, and have a clinician sign it.")
     refuse_withdrawn(view)
     refuse_after_events(view)
     require_limits(view.visit, view.plan.items)
 
 
 def shown(view: PlanView) -> PlanView:
-    """The plan as pages, routes and the sheet show it: of a sealed one letters and common limits, and nothing that tells a controller."""
+    """Convert the plan for pages, routes and the sheet: of a sealed one only letters and common limits, which reveal no controller."""
     if not view.sealed:
         return view
     limits = common_limits(view.plan.items)
@@ -168,7 +168,7 @@ def standings_of(db: Session, view: PlanView, caller: Caller) -> list[str]:
 
 
 def _masked(item: PlanItem, limits: CommonLimits | None) -> PlanItem:
-    """A session without its controller: an object of no database session."""
+    """Copy a session without its controller: an object of no database session."""
     masked = PlanItem(
         position=item.position,
         minutes=item.minutes,
@@ -186,7 +186,7 @@ def _masked(item: PlanItem, limits: CommonLimits | None) -> PlanItem:
 
 
 def view_of(db: Session, plan: Plan, visit: Visit) -> PlanView:
-    """A plan with all that is known about it."""
+    """Load a plan with all that is known about it."""
     evaluation = repository.evaluation(db, plan.evaluation_id) if plan.evaluation_id else None
     found = judged(db, visit.participant, evaluation) if evaluation else None
     estimates = {a.policy.id: a.estimate for a in found.assessment.assessed} if found else {}
@@ -268,7 +268,7 @@ def _warnings(
 
 
 def _of_policy(line: PlanLine, found: Judged | None) -> list[PlanWarning]:
-    """What speaks against one policy of a plan."""
+    """List what speaks against one policy of a plan."""
     policy, item, estimate = line.policy, line.item, line.estimate
     if policy is None:
         return []

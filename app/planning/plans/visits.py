@@ -1,4 +1,4 @@
-"""Which visit a plan is for, and how a visit that came to nothing is removed. The caller commits."""
+"""Visit of a plan, and removal of a visit that did not take place. The caller commits."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ _LAST_ZONE = timedelta(hours=-12)
 
 
 def today() -> date:
-    """The day by which a visit is past: one that has not ended everywhere is not. In the afternoon of a clinic in California it is tomorrow
-    in UTC; on which day a bundle runs the tablet decides by its own date."""
+    """Return the day by which a visit is past: one that has not ended everywhere is not. In the afternoon of a clinic in California it is
+    tomorrow in UTC. On which day a bundle runs is decided by the tablet's own date.
+    """
     return (now() + _LAST_ZONE).date()
 
 
 def visit_for_draft(
     db: Session, participant: Participant, visit_id: int | None, number: int | None, day: date | None, caller: Caller
 ) -> Visit:
-    """The visit that a draft is for: an open one by its id, or a new one, which has a number and a date.
+    """Return the visit that a draft is for: an open one by its id, or a new one, which has a number and a date.
 
     Raises:
         Invalid: neither is named, a new visit without a date, or a visit that is not open: another participant's, past, or with sessions.
@@ -41,7 +42,7 @@ def visit_for_draft(
             if visit.id == visit_id:
                 return visit
         raise Invalid(
-            f"Visit {visit_id} cannot be planned from here: it has sessions, lies in the past, or is another participant's.",
+            f"Visit {visit_id} cannot be planned from here: it has sessions, is in the past, or is another participant's.",
             "Choose another.",
         )
     if number is None:
@@ -60,7 +61,7 @@ def remove_visit(db: Session, visit: Visit, reason: str, caller: Caller) -> None
     """
     access.require(caller, can.WRITE_STUDY, visit.participant)
     if not reason.strip():
-        raise Invalid("A reason is missing.", "Say why the visit is removed; it stands in the audit trail.")
+        raise Invalid("A reason is missing.", "Say why the visit is removed; it is written to the audit trail.")
     repository.lock_visit(db, visit.id)
     require_unlocked(visit)
     held = repository.what_holds(db, visit.id)

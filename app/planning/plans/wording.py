@@ -57,17 +57,17 @@ _ABOUT: dict[Code, str] = {
 
 
 ANSWER_EVENT = (
-    "Clear the event with a reason on the page of adverse events; or draft the visit anew, without the policy or with the reason why it is "
-    "tested all the same, and have it signed."
+    "Clear the event with a reason on the page of adverse events; or draft the visit again, without the policy or with the reason why it "
+    "is tested all the same, and have it signed."
 )
-"""How a plan, or a policy's bundle, comes to run again after a serious adverse event."""
+"""Way of a plan, or a policy's bundle, to run again after a serious adverse event."""
 
 
 def happened(policy: str | None, events: Sequence[AdverseEvent]) -> str:
     """Return in one clause what no clinician has cleared of a policy.
 
     Args:
-        policy: its name; None where nobody may be shown which one it is. events: the adverse events; none where they would tell.
+        policy: its name; None where it is hidden which one it is. events: the adverse events; none where they would reveal it.
     """
     if policy is None:
         return "a serious adverse event or a stop, which no clinician has cleared, stands against a policy of it"
@@ -149,7 +149,7 @@ def holding(held: Held) -> str:
 
 
 TELLING = 0.2
-"""Share of what is open about the other candidates from which a policy's test is said to tell about them."""
+"""Share of what is open about the other candidates from which a policy's test counts as informative about them."""
 
 
 def scheduled_name(design: str, level: float | None) -> str:

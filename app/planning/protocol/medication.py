@@ -1,4 +1,4 @@
-"""When medication is due on a visit day: the participant's schedule laid beside the sessions of a plan, with which it is signed."""
+"""Medication due on a visit day: the participant's schedule next to the sessions of a plan, with which it is signed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from app.study.doses import DRUGS
 
 
 def due_before(lengths: Sequence[float], starts_at: time | None, schedule: Sequence[PlannedDose]) -> list[str]:
-    """What is due before each session and after the start of the one before it, in words; empty where no time of day is planned.
+    """Describe what is due before each session and after the start of the one before it; empty where no time of day is planned.
 
     Args:
         lengths: minutes from each session's start to the next one's. starts_at: of the first, by the clinic's clock.

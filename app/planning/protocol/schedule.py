@@ -1,7 +1,7 @@
 """The rules of a visit day, pure: which controller runs when. Source: Gao et al. 2023, section 6.1.
 
 From the paper: 2-4 policies a visit, a cDBS session between any two of them as control, sessions of 5-20 minutes, a short session without
-stimulation. Ours: the washout, the minutes of a visit, the order, repeats, the break, and where no-DBS and random sessions stand.
+stimulation. Ours: the washout, the minutes of a visit, the order, repeats, the break, and the places of no-DBS and random sessions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from app.tables.sessions import Controller
 
 
 class Order(StrEnum):
-    """How the order of a visit's policies is found."""
+    """Method by which the order of a visit's policies is found."""
 
     DRAWN = "drawn"  # from the seed
     LATIN_SQUARE = "latin_square"  # every policy at every place equally often
@@ -30,12 +30,12 @@ class Order(StrEnum):
 
 
 def latin_square(treatments: int) -> list[tuple[int, ...]]:
-    """The cyclic Latin square: `treatments` rows, each treatment once at each place. Rows hold numbers from 0."""
+    """Build the cyclic Latin square: `treatments` rows, each treatment once at each place. Rows hold numbers from 0."""
     return [tuple((row + place) % treatments for place in range(treatments)) for row in range(treatments)]
 
 
 def williams(treatments: int) -> list[tuple[int, ...]]:
-    """Williams' design: each treatment equally often at each place and right after each other one.
+    """Build Williams' design: each treatment equally often at each place and right after each other one.
 
     Returns:
         As many rows as treatments where they are even in number, twice as many where they are odd.
@@ -48,7 +48,7 @@ def williams(treatments: int) -> list[tuple[int, ...]]:
 
 
 def rounds(treatments: int, count: int, order: Order, seed: int, block: int) -> list[Sequence[int]]:
-    """The orders of `count` rounds, each of all treatments.
+    """Build the orders of `count` rounds, each of all treatments.
 
     Args:
         treatments: how many. count: rounds of this visit. seed: draws orders, and which treatment is which of a square.
@@ -67,7 +67,7 @@ def rounds(treatments: int, count: int, order: Order, seed: int, block: int) -> 
 SESSION_MINUTES = (5.0, 20.0)
 """Shortest and longest session of the paper, minutes."""
 POLICIES = (2, 4)
-"""Fewest and most policies of a visit in the paper; a single one, or random sessions alone, is possible and said."""
+"""Fewest and most policies of a visit in the paper; a single one, or random sessions alone, is possible and noted."""
 MOST_REPEATS = 4
 """Sessions of one policy within a visit, at most."""
 
@@ -85,7 +85,7 @@ class Rule(StrEnum):
 
 @dataclass(frozen=True)
 class Rules:
-    """What a visit day must keep to.
+    """Rules of a visit day.
 
     Attributes:
         session_minutes: length of every session but no-DBS.
@@ -93,8 +93,8 @@ class Rules:
         total_minutes: from the first session's start to the last one's end, at most.
         no_dbs: one session without stimulation, at the end of the day: what it does to the symptoms then reaches no other session.
         no_dbs_minutes: its length; no longer than another session, to spare the participant.
-        random_sessions: sessions of the random controller, which widen what the replay buffer covers. held_sessions: those held near a
-            stated amplitude; they stand where random ones stand, and count as such.
+        random_sessions: sessions of the random controller, which widen what the replay buffer covers. held_sessions: those near a stated
+            amplitude; they take the places of random ones, and count as such.
         repeats: sessions of each policy; each round has all of them.
         order: how the order of the policies is found. block: visits before this one that followed the same square.
         break_minutes: one rest in the middle of the visit; 0 for none.
@@ -137,7 +137,7 @@ class Rules:
 
     @property
     def exploring(self) -> int:
-        """Sessions of the random arm: those of the random controller, and those held near an amplitude."""
+        """Sessions of the random arm: those of the random controller, and those near a stated amplitude."""
         return self.random_sessions + self.held_sessions
 
 
@@ -162,15 +162,15 @@ class PlannedSession:
 
 
 def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[PlannedSession]:
-    """Lay out a visit day: the policies in the order that the rules ask for, a cDBS session between any two of their sessions.
+    """Lay out a visit day: the policies in the order of the rules, a cDBS session between any two of their sessions.
 
-    A single policy gets its cDBS session first, so that it too has a control, and so does a day of random or held sessions alone: an early
-    visit that only fills the replay buffer. Random and held sessions stand at drawn places, the no-DBS session at the end. The same
-    arguments give the same day.
+    A single policy gets its cDBS session first, so that it too has a control, and so does a day of random sessions alone, an early visit
+    that only fills the replay buffer. Random sessions, and those near an amplitude, have drawn places; the no-DBS session is at the end.
+    The same arguments give the same day.
 
     Raises:
-        Invalid: neither a policy nor a random or held session, a policy twice, more than four, or a day longer than
-            `rules.total_minutes`; the message says how many policies would fit. The member `rule` names the rule of the protocol.
+        Invalid: neither a policy nor a random session, a policy twice, more than four, or a day longer than `rules.total_minutes`. The
+            message says how many policies would fit. The member `rule` names the rule of the protocol.
     """
     _check_candidates(candidates, rules)
     needed = total_minutes(len(candidates), rules)
@@ -192,12 +192,12 @@ def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[P
 
 
 def cdbs_sessions(tested: int) -> int:
-    """cDBS sessions of a visit day with so many sessions of policies: one between any two, and one before a single one, or before none."""
+    """Count cDBS sessions of a day with so many sessions of policies: one between any two, one before a single one or before none."""
     return max(tested - 1, 1)
 
 
 def total_minutes(policies: int, rules: Rules) -> float:
-    """Minutes from the first session's start to the last one's end of a day with this many policies."""
+    """Compute the minutes from the first session's start to the last one's end of a day with this many policies."""
     tested = policies * rules.repeats
     controls = cdbs_sessions(tested) if tested or rules.exploring else 0
     full = tested + controls + rules.exploring
@@ -207,7 +207,7 @@ def total_minutes(policies: int, rules: Rules) -> float:
 
 
 def most_policies(rules: Rules) -> int:
-    """How many policies fit into the day."""
+    """Count how many policies fit into the day."""
     count = 0
     while count < POLICIES[1] and total_minutes(count + 1, rules) <= rules.total_minutes + 1e-9:
         count += 1

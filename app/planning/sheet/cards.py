@@ -1,4 +1,4 @@
-"""Cards of the printed sheet: one per session, with all that whoever runs it needs, and blanks for what is seen."""
+"""Cards of the printed sheet: one per session, with all that its operator needs, and blanks for observations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FIELDS = (
 
 
 def draw_cards(pdf: FPDF, view: PlanView, bundles: Mapping[int, str], ports: Mapping[int, str]) -> None:
-    """All cards, two beside each other in the order of the day; no card is cut by the end of a page."""
+    """Draw all cards, two side by side in the order of the day; no card is cut by the end of a page."""
     cards = [card_of(line, view, bundles.get(line.item.id), ports) for line in view.lines]
     for pair in (cards[i : i + 2] for i in range(0, len(cards), 2)):
         height = max(_height(pdf, card) for card in pair)
@@ -43,7 +43,7 @@ def _set(pdf: FPDF, style: str, size: float, ink: tuple[int, int, int] = INK) ->
 
 
 def _body(pdf: FPDF, card: Card) -> list[tuple[str, str, str]]:
-    """Lines of a card as they fit its width: style, label, text."""
+    """Break the lines of a card to fit its width: style, label, text."""
     found = []
     for label, text in card.lines:
         style = "B" if label in ("Policy", "Limits") else ""
@@ -83,7 +83,7 @@ def _draw(pdf: FPDF, card: Card, x: float, top: float, height: float) -> None:
 
 
 def _blanks(pdf: FPDF, x: float, top: float) -> None:
-    """Boxes to fill in by hand, each with its name in small letters."""
+    """Draw boxes to fill in by hand, each with its name in small letters."""
     _set(pdf, "", 6.5, MUTED)
     pdf.line(x, top, x + _CARD, top)
     left = x

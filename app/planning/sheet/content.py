@@ -1,4 +1,4 @@
-"""What the sheets say of a session, printed with its plan and packed into its bundle: made once, so that no two papers disagree."""
+"""Text of the sheets on a session, printed with its plan and packed into its bundle: made once, so that no two papers disagree."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from ml.outcomes import OUTCOMES
 
 BUNDLE = "Bundle"
 HASH = 12
-"""Characters of a hash that are printed: enough to tell two bundles of a study apart by eye."""
+"""Characters of a hash that are printed: enough to distinguish two bundles of a study by eye."""
 
 
 @dataclass(frozen=True)
 class Card:
-    """What stands on a card.
+    """Content of a card.
 
     Attributes:
         head, minutes: of its title line, left and right. lines: label and text. warnings: a sentence each. fill: colour of the title line.
@@ -33,7 +33,7 @@ class Card:
 
 
 def card_of(line: PlanLine, view: PlanView, bundle: str | None, ports: Mapping[int, str] = {}) -> Card:
-    """A session's card; of a sealed plan's session, which has lost its controller, letters and common limits alone.
+    """Build a session's card; of a sealed plan's session, which has lost its controller, only letters and common limits.
 
     Args:
         bundle: SHA-256 of the newest one taken for the session. ports: checks of converted copies, by the number of the policy.
@@ -69,7 +69,7 @@ def _bundle(line: PlanLine, sha256: str | None) -> str:
 
 
 def _verdict(line: PlanLine) -> str:
-    """The ranking's verdict with its reason and the chance of being no worse than cDBS; empty of what was not ranked."""
+    """Write the ranking's verdict with its reason and the chance of being no worse than cDBS; empty of what was not ranked."""
     if line.row is None:
         return ""
     why = plainly(line.row.decided.hazards or line.row.decided.reasons, line.row.limit, line.row.limit_ma)
@@ -78,7 +78,7 @@ def _verdict(line: PlanLine) -> str:
 
 
 def _expected(line: PlanLine) -> str:
-    """What is expected in a session; empty of one that was not ranked, as cDBS, whose energy is 100 % by definition."""
+    """Write what is expected in a session; empty of one that was not ranked, as cDBS, whose energy is 100 % by definition."""
     e = line.estimate
     if e is None:
         return ""

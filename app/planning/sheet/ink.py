@@ -32,7 +32,7 @@ _SPELLED = str.maketrans(
 
 
 def latin(text: str) -> str:
-    """Text in the characters that the built-in fonts have: Greek by name, accents dropped where need be, '?' for what has no spelling."""
+    """Spell text in the built-in fonts: Greek by name, accents dropped where need be, '?' for what has no spelling."""
     out = []
     for char in unicodedata.normalize("NFC", text).translate(_SPELLED):
         if char == "\n" or (32 <= ord(char) < 127) or (160 <= ord(char) < 256):
@@ -49,23 +49,23 @@ def latin(text: str) -> str:
 
 
 def shade(line: PlanLine) -> tuple[int, int, int]:
-    """Colour of a session's controller; of none while the key is sealed."""
+    """Return the colour of a session's controller; of none while the key is sealed."""
     return _SHADES[Controller(line.item.controller)] if line.item.controller else _PLANNED
 
 
 def printed_name(policy: Policy) -> str:
-    """A policy's name as the fonts can spell it, with its number where that is not the name itself: two policies never look alike."""
+    """Spell a policy's name for the fonts, with its number where that is not the name itself: two policies never look alike."""
     printed = latin(policy.name)
     return printed if printed == policy.name else f"{printed} (#{policy.id})"
 
 
 def printed_warning(text: str, policy: Policy | None) -> str:
-    """A warning with its policy's name as the fonts can spell it."""
+    """Spell a warning with its policy's name for the fonts."""
     return text.replace(f"'{policy.name}'", f"'{printed_name(policy)}'") if policy else text
 
 
 def clock(minutes: float, starts_at: time | None) -> str:
-    """When something is due, `minutes` after the first session's start: by the clinic's clock, else h:mm from that start."""
+    """Write when something is due, `minutes` after the first session's start: by the clinic's clock, else h:mm from that start."""
     if starts_at is None:
         return f"{round(minutes) // 60}:{round(minutes) % 60:02d}"
     return f"{datetime.combine(datetime.min, starts_at) + timedelta(minutes=round(minutes)):%H:%M}"

@@ -71,7 +71,7 @@ class _Sheet(FPDF):  # type: ignore[misc]
             self._watermark("DO NOT RUN")
 
     def _watermark(self, word: str) -> None:
-        """Over everything, so that no filled cell hides it, and faint, so that it hides nothing."""
+        """Print a word over everything, so that no filled cell hides it, and faint, so that it hides nothing."""
         self.set_font("Helvetica", "B", 120)
         self.set_text_color(*INK)
         width = self.get_string_width(word)
@@ -80,7 +80,7 @@ class _Sheet(FPDF):  # type: ignore[misc]
 
 
 def _approval(view: PlanView) -> str:
-    """Who signed, or why nothing here may be run."""
+    """Describe who signed, or why nothing here may be run."""
     plan = view.plan
     if plan.approved_at is None:
         return "NOT APPROVED: not for use with a participant"
@@ -98,12 +98,12 @@ def render(
     printed_at: datetime,
     standings: Sequence[str] = (),
 ) -> bytes:
-    """The sheet of a plan as PDF bytes.
+    """Render the sheet of a plan as PDF bytes.
 
     Args:
         view: the plan. bundles: SHA-256 of the newest bundle that was taken for a session, by the number of its plan item.
         ports: checks of converted copies, by the number of the policy.
-        printed_by: who printed it. printed_at: when; stands on the page and in the document's metadata.
+        printed_by: who printed it. printed_at: when; printed on the page and in the document's metadata.
         standings: sentences on the policies.
     """
     view = shown(view)
@@ -123,7 +123,7 @@ def render(
 
 
 def _timeline(pdf: _Sheet, view: PlanView) -> None:
-    """The day to scale, washouts left white."""
+    """Draw the day to scale, washouts left white."""
     scale, top, height = WIDTH / view.total_minutes, pdf.get_y(), 8.0
     pdf.set_text_color(*INK)
     pdf.set_font("Helvetica", "", 8)
@@ -146,7 +146,7 @@ def _timeline(pdf: _Sheet, view: PlanView) -> None:
 
 
 def _circumstances(pdf: _Sheet, view: PlanView) -> None:
-    """The stimulation that the day starts from, and blanks for what else bears on it."""
+    """Print the stimulation that the day starts from, and blanks for what else bears on it."""
     stated = [
         f"{a.hemisphere} {a.amplitude_ma:g} mA" + (f" (program {a.program})" if a.program else "") for a in view.visit.cdbs_amplitudes
     ]
@@ -166,7 +166,7 @@ def _circumstances(pdf: _Sheet, view: PlanView) -> None:
 
 
 def _designs(pdf: _Sheet, view: PlanView) -> None:
-    """What each random session tries and never does: it is signed with the plan."""
+    """Print what each random session tries and never does: it is signed with the plan."""
     for line in view.lines:
         if line.design is None:
             continue
@@ -188,7 +188,7 @@ def _designs(pdf: _Sheet, view: PlanView) -> None:
 
 
 def _reading(pdf: _Sheet, view: PlanView) -> None:
-    """What the numbers mean, and what speaks against them."""
+    """Print what the numbers mean, and what speaks against them."""
     evaluation = view.evaluation
     sentences = []
     if evaluation and any(line.row for line in view.lines):

@@ -1,8 +1,8 @@
-"""Which session filled which slot of a plan, pure.
+"""Matching of sessions to the slots of a plan, pure.
 
 A controller's log names its slot, and fills that one or none. Other sessions are aligned with slots in their order, as one aligns two
-sequences: the assignment that explains most, with no session and no slot used twice and none passing another. What is left over is matched
-out of order where controller and policy say clearly what it was.
+sequences. The assignment that explains most is taken; no session and no slot is used twice, and none passes another. What is left over is
+matched out of order where controller and policy say clearly what it was.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ FAR = timedelta(minutes=60)
 """A session that began further than this from what the clinic day entered for a slot is another one."""
 NEAR = timedelta(minutes=10)
 CLOCKS = (timedelta(0), timedelta(hours=1), timedelta(hours=-1))
-"""By how much the clock of a day's recordings may be off against the clinic day's: not at all, or by the hour of summer time."""
+"""Possible offsets of the recordings' clock against the clinic day's: none, or the hour of summer time."""
 _SHARE = 0.2
 """A session whose length differs from the plan by more than this share is named."""
 
 
 class Deviation(StrEnum):
-    """How what was done departs from the plan."""
+    """Deviation of a day from its plan."""
 
     MISSING = "missing"
     UNPLANNED = "unplanned"
@@ -72,7 +72,7 @@ class Done:
     duration_s: float
     began: datetime | None
     filled: int | None = None
-    """The slot that somebody confirmed it into."""
+    """The slot that a person confirmed it into."""
     logged: int | None = None
     """The slot of which its controller's log says it is; NO_SLOT where that is none of this participant's."""
     bench: bool = False
@@ -91,10 +91,10 @@ class Match:
 
 
 def match(slots: Sequence[Planned], sessions: Sequence[Done], day: date | None) -> list[Match]:
-    """The slots in their order, each with its session, then sessions that nobody planned.
+    """Match sessions to slots. Returns the slots in their order, each with its session, then unplanned sessions.
 
     Args:
-        slots: in the plan's order. sessions: in the order in which they were held. day: of the visit; None where it has no date.
+        slots: in the plan's order. sessions: in the order in which they ran. day: of the visit; None where it has no date.
     """
     known = {p.item_id for p in slots}
     pairs: dict[int, Done] = {s.filled: s for s in sessions if s.filled in known and s.filled is not None}
@@ -135,7 +135,7 @@ def _beside(session: Done, known: Collection[int]) -> Deviation:
 
 
 def _passed(slots: Sequence[Planned], sessions: Sequence[Done], pairs: Mapping[int, Done]) -> set[int]:
-    """Slots whose log says that a session ran before one of an earlier slot."""
+    """Find slots whose log says that a session ran before one of an earlier slot."""
     order = {s.session_id: i for i, s in enumerate(sessions)}
     found: set[int] = set()
     latest = -1
@@ -151,11 +151,11 @@ def _passed(slots: Sequence[Planned], sessions: Sequence[Done], pairs: Mapping[i
 
 _CLEAR = 3.0
 _MUCH_BETTER = 1.0
-"""By how much more than the clock as it is another one must explain to be supposed: as much as a session of which nothing is known."""
+"""Least gain in explanation for assuming another clock than the recorded one: as much as a session of which nothing is known."""
 
 
 def _score(slot: Planned, session: Done) -> float:
-    """How well a session explains a slot; 0 where it cannot be this one."""
+    """Score how well a session explains a slot; 0 where it cannot be this one."""
     if session.controller is not None and session.controller is not slot.controller:
         return 0.0
     if session.policy_id is not None and session.policy_id != slot.policy_id:
@@ -169,7 +169,7 @@ def _score(slot: Planned, session: Done) -> float:
 
 
 def _is_clear(slot: Planned, session: Done) -> bool:
-    """Whether a session fills a slot out of order: its controller and policy say so, or its time."""
+    """Check whether a session fills a slot out of order: its controller and policy say so, or its time."""
     if (score := _score(slot, replace(session, began=None))) >= _CLEAR:
         return _score(slot, session) > 0
     near = slot.began is not None and session.began is not None and abs(slot.began - session.began) <= NEAR
@@ -177,7 +177,7 @@ def _is_clear(slot: Planned, session: Done) -> bool:
 
 
 def _by_clock(slots: Sequence[Planned], sessions: Sequence[Done]) -> dict[int, Done]:
-    """The best assignment by the recordings' clock as it is, or an hour off where that explains as many of two or more much better."""
+    """Find the best assignment by the recorded clock, or an hour off where that explains as many of two or more much better."""
     own = {s.session_id: s for s in sessions}
     best, most, fewest = {}, -1.0, 2
     for off in CLOCKS:
@@ -191,7 +191,7 @@ def _by_clock(slots: Sequence[Planned], sessions: Sequence[Done]) -> dict[int, D
 
 
 def _aligned(slots: Sequence[Planned], sessions: Sequence[Done]) -> tuple[dict[int, Done], float]:
-    """The best assignment that keeps the order of both, and how much it explains."""
+    """Find the best assignment that keeps the order of both, and how much it explains."""
     best = np.zeros((len(slots) + 1, len(sessions) + 1))
     for i, slot in enumerate(slots):
         for j, session in enumerate(sessions):
@@ -246,7 +246,7 @@ DEVIATIONS: dict[Deviation, str] = {
 
 
 def slots_summary(planned: int, missing: Sequence[str], due: bool = True, earlier: int = 0) -> str:
-    """How many of the planned sessions were found, and which are missing; before anything can be there (`due` False) none is."""
+    """Describe how many of the planned sessions were found, and which are missing; none is before the day (`due` False)."""
     found = f"{planned - len(missing)} of {planned} planned sessions found"
     found += f"; {counted(earlier, 'session')} of the plan signed before {'is' if earlier == 1 else 'are'} kept" if earlier else ""
     return found if not missing or not due else f"{found}; {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"

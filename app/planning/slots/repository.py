@@ -15,14 +15,14 @@ from app.tables.visits import Visit, VisitLock
 
 
 def sessions_of_day(db: Session, visit_id: int) -> Sequence[StudySession]:
-    """Sessions of a visit, proposed ones too, in the order in which they were held; those without a start by their place in the visit."""
+    """Load sessions of a visit, proposed ones too, in the order in which they ran; those without a start by their place in the visit."""
     query = select(StudySession).where(StudySession.visit_id == visit_id)
     return db.scalars(query.order_by(StudySession.started_at.nulls_last(), StudySession.ordinal)).all()
 
 
 @dataclass(frozen=True)
 class Filled:
-    """How many slots of a visit's approved plan a confirmed session fills.
+    """Count of slots of a visit's approved plan that confirmed sessions fill.
 
     `tested`: of those that run a policy. `locked`: whether the visit is. `sealed`: whether the plan's key is.
     """

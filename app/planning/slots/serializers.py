@@ -14,9 +14,9 @@ from ml.outcomes import FIELDS
 
 
 class SlotRowOut(Model):
-    """One slot of the plan, or one session that nobody planned."""
+    """One slot of the plan, or one unplanned session."""
 
-    position: int | None = Field(description="Of the slot; null for a session beside the plan.")
+    position: int | None = Field(description="Of the slot; null for a session outside the plan.")
     name: str = Field(description="Of the slot; its letter while the key of a blinded plan is sealed.")
     controller: Controller | None
     policy_id: int | None
@@ -29,7 +29,7 @@ class SlotRowOut(Model):
 
 
 class VisitComparisonOut(Model):
-    """A visit as it was planned and as it was held."""
+    """A visit as planned and as done."""
 
     plan_id: int
     planned: int
@@ -39,13 +39,13 @@ class VisitComparisonOut(Model):
 
 
 class SlotConfirmation(Model):
-    """Put every found session into its slot."""
+    """Confirmation that puts every found session into its slot."""
 
-    other_day: Bool = Field(False, description="Sessions that were held on another day than the visit's are meant all the same.")
+    other_day: Bool = Field(False, description="Sessions of another day than the visit's are meant all the same.")
 
 
 class SlotsConfirmed(Model):
-    """What became of it."""
+    """Result of the confirmation."""
 
     comparison: VisitComparisonOut
     notes: list[str]
@@ -55,7 +55,7 @@ class SlotsConfirmed(Model):
 
 
 def comparison_out(found: Comparison) -> VisitComparisonOut:
-    """For the API and the page."""
+    """Convert a comparison for the API and the page."""
     lines = shown(found.view).lines
     names = {line.item.position: wording.session_name(line.item, line.policy.name if line.policy else None) for line in lines}
     return VisitComparisonOut(

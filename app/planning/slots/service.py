@@ -39,10 +39,10 @@ QUANTITIES = ("energy", *FIELDS)
 
 @dataclass(frozen=True)
 class Row:
-    """One slot, or one session that nobody planned.
+    """One slot, or one unplanned session.
 
     Attributes:
-        line: of the plan; None for a session beside it. session: that fills it; None where none was found.
+        line: of the plan; None for a session outside it. session: that fills it; None where none was found.
         confirmed: whether a person has put it there. proposed: whether the session itself waits for confirmation.
         predicted, done: `QUANTITIES` that are known, by name.
         differences: what the clinic day says otherwise than the confirmed session, in sentences.
@@ -60,7 +60,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A visit as it was planned and as it was held."""
+    """A visit as planned and as done."""
 
     view: PlanView
     rows: list[Row]
@@ -92,12 +92,12 @@ class Comparison:
 
     @property
     def asks_about_day(self) -> list[Row]:
-        """Those of them that were held on another day than the visit's."""
+        """Rows whose session ran on another day than the visit's."""
         return [r for r in self.waiting if Deviation.OTHER_DAY in r.deviations]
 
 
 def compare(db: Session, visit: Visit, caller: Caller) -> Comparison:
-    """The slots of a visit's signed plan with the sessions that fill them.
+    """Match the slots of a visit's signed plan with the sessions that fill them.
 
     While the key is sealed it is the machine that knows what ran: what people are shown of it goes through `serializers`.
 
@@ -108,7 +108,7 @@ def compare(db: Session, visit: Visit, caller: Caller) -> Comparison:
         require_known(visit, caller)
     view = plans.read_plan(db, visit, caller)
     if view.plan.status != "approved":
-        raise Conflict(f"Plan {view.plan.id} of visit {visit.number} is not signed.", "Sessions are held against signed plans alone.")
+        raise Conflict(f"Plan {view.plan.id} of visit {visit.number} is not signed.", "Sessions are compared only with signed plans.")
     sessions = {s.id: s for s in repository.sessions_of_day(db, visit.id)}
     entries = clinic_day.entries(db, view.plan.id)
     times = times_of(entries)
@@ -122,13 +122,13 @@ def confirm(db: Session, visit: Visit, caller: Caller, *, other_day: bool = Fals
     """Put every found session into its slot, and confirm those that wait for it, all or none.
 
     Args:
-        other_day: whether sessions that were held on another day than the visit's are meant all the same.
+        other_day: whether sessions of another day than the visit's are meant all the same.
 
     Returns:
         Sentences: what speaks against which sessions, and what the clinic day says otherwise.
 
     Raises:
-        Conflict: nothing is found to confirm, the visit is locked, or sessions of another day and nobody said that they are meant.
+        Conflict: nothing is found to confirm, the visit is locked, or sessions of another day are not stated as meant.
         Invalid, Conflict: as confirming a proposal does, with the session's number.
     """
     access.require(caller, can.WRITE_STUDY, visit.participant)
@@ -137,13 +137,13 @@ def confirm(db: Session, visit: Visit, caller: Caller, *, other_day: bool = Fals
     if not found.waiting:
         raise Conflict(
             f"Visit {visit.number} has nothing to confirm: no session waits for one of its {found.planned} slots.",
-            "Upload the recordings of the day, or look at the sessions that nobody planned.",
+            "Upload the recordings of the day, or look at the unplanned sessions.",
         )
     if found.asks_about_day and not other_day:
         held = [r.session for r in found.asks_about_day if r.session is not None]
         days = ", ".join(f"session {s.id} of {s.started_at:%Y-%m-%d}" for s in held)
         raise Conflict(
-            f"Held on another day than visit {visit.number} ({visit.date}): {days}. Are they meant?",
+            f"Recorded on another day than visit {visit.number} ({visit.date}): {days}. Are they meant?",
             "Say so and confirm again, or give these sessions to their own visit.",
             asks="other_day",
         )
@@ -186,7 +186,7 @@ def _done(db: Session, session: StudySession) -> Done:
     slot = controller_log.slot_of_recording(db, recording)
     # a number that this participant's plans do not have, or have for another session, may be that of any slot here
     of_log = None if slot is None else slot.slot_id if slot.planned is not None else NO_SLOT
-    # while the key is sealed a stated or guessed controller counts for nothing: where it were put to would tell what ran there
+    # while the key is sealed a stated or guessed controller counts for nothing: where it were put to would reveal what ran there
     arm = None if session.visit.sealed else stated_arm(session, SYSTEM)
     controller, policy = (arm.controller, arm.policy_id) if arm is not None else (None, None)
     return Done(
@@ -228,7 +228,7 @@ def _predicted(line: PlanLine | None) -> dict[str, float]:
 
 
 def _shown(db: Session, session: StudySession) -> dict[str, float]:
-    """What a session brought; its energy over the steps of known amplitude."""
+    """Return the results of a session; its energy over the steps of known amplitude."""
     table = session_data(db, session).table
     fraction = table.fraction[(table.t_s > 0) & ~np.isnan(table.fraction)]
     found = {"energy": float(np.mean(fraction**2)) if fraction.size else None}
@@ -237,5 +237,5 @@ def _shown(db: Session, session: StudySession) -> dict[str, float]:
 
 
 def of_sessions(numbers: Sequence[int], sentence: str) -> str:
-    """Of which sessions something is said."""
+    """Name the sessions that a sentence is about."""
     return f"{'Session' if len(numbers) == 1 else 'Sessions'} {', '.join(map(str, numbers))}: {sentence}"

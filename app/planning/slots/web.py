@@ -33,7 +33,7 @@ api = APIRouter(tags=["planning"], responses=problems(401, 403, 404, 409, 422))
 
 @api.get("/visits/{visit_id}/slots", dependencies=[VisitViewed])
 def read_slots(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> VisitComparisonOut:
-    """The slots of the visit's signed plan with the sessions that fill them, planned against done against predicted."""
+    """Return the slots of the visit's signed plan with the sessions that fill them, planned against done against predicted."""
     return comparison_out(service.compare(db, visit, caller))
 
 
@@ -49,7 +49,7 @@ pages = APIRouter()
 
 @pages.get("/visits/{visit_id}/slots", dependencies=[VisitViewed])
 def slots(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """Each slot of the plan with its session, and what is missing."""
+    """Show each slot of the plan with its session, and what is missing."""
     return HTMLResponse(_page(request, db, visit, caller))
 
 
@@ -83,7 +83,7 @@ def _page(
 
 
 def facts(db: Session, visit: Visit, caller: Caller) -> dict[str, Any] | None:
-    """What the page of a visit shows of planned against done, as `planning/_slots.html` takes it; None where no plan is signed."""
+    """Build planned against done for the page of a visit, as `planning/_slots.html` takes it; None where no plan is signed."""
     plan = plans.live_plan(db, visit.id)
     if plan is None or plan.status != "approved":
         return None

@@ -1,1 +1,1 @@
-"""The clinic day: what a tablet takes down beside the participant, session by session of the approved plan."""
+"""The clinic day: entries on a tablet next to the participant, session by session of the approved plan."""

@@ -17,13 +17,13 @@ router = APIRouter(tags=["clinic day"], responses=problems(401, 403, 404, 422))
 
 @router.get("/visits/{visit_id}/day", responses=problems(409))
 def read_day(visit: CurrentVisit, db: Db, caller: CurrentCaller) -> DayOut:
-    """The clinic day of a visit: the sessions of its approved plan, and what has been entered. Blinded readers see labels."""
+    """Return the clinic day of a visit: the sessions of its approved plan, and what has been entered. Blinded readers see labels."""
     return day_out(service.read_day(db, visit, caller), caller)
 
 
 @router.get("/visits/{visit_id}/day/entries", dependencies=[VisitViewed])
 def list_entries(visit: CurrentVisit, db: Db, caller: CurrentCaller, paging: PagingQuery) -> Page[EntryOut]:
-    """Everything that was entered on the clinic day of a visit, also under a plan that was replaced since, as it arrived."""
+    """List everything that was entered on the clinic day of a visit, also under a plan that was replaced since, as it arrived."""
     rows, total = repository.entries_of_visit(db, visit.id, paging.limit, paging.offset)
     return Page(items=[EntryOut.model_validate(row) for row in rows], total=total, limit=paging.limit, offset=paging.offset)
 

@@ -61,7 +61,7 @@ _ENTRY: TypeAdapter[Any] = TypeAdapter(EntryIn)
 
 
 class _When(Model):
-    """When a dose was taken, where the form says it."""
+    """Time when a dose was taken, where the form states it."""
 
     taken_at: DeviceTime | None = None
 
@@ -91,19 +91,19 @@ _LABELS = {
 
 @router.get("/visit-day/shell")
 def shell(request: Request) -> HTMLResponse:
-    """The page without any data, which the service worker shows where the network is gone; what it shows is read on the tablet."""
+    """Show the page without any data, which the service worker shows without a network; what it shows is read on the tablet."""
     return HTMLResponse(render(request, "planning/visit_day/shell.html", **_frame()))
 
 
 @router.get("/visit-day/worker.js")
 def worker() -> Response:
-    """The service worker; from here it rules over `/visit-day/` alone."""
+    """Serve the service worker; from here it controls only `/visit-day/`."""
     return FileResponse(FILES / "worker.js", media_type="text/javascript", headers={"Cache-Control": "no-cache"})
 
 
 @router.get("/visit-day/files/{path:path}")
 def file(path: Annotated[str, Path(pattern=r"^[0-9a-f]{10}/[a-z-]+\.(js|css)$")]) -> Response:
-    """A script or style of the page. Scripts import one another by name, so that the version stands in their folder."""
+    """Serve a script or style of the page. Scripts import one another by name, so that the version is in their folder's name."""
     version, name = path.split("/")
     if version != _version() or name not in _names():
         raise NotFound("There is no such file of this version.", "Load the page again.")
@@ -112,20 +112,20 @@ def file(path: Annotated[str, Path(pattern=r"^[0-9a-f]{10}/[a-z-]+\.(js|css)$")]
 
 @router.get("/visit-day/key")
 def key(caller: CurrentCaller) -> JSONResponse:
-    """With what the tablet encrypts the caller's entries until they are sent."""
+    """Return the key with which the tablet encrypts the caller's entries until they are sent."""
     found = service.device_key(caller)
     return JSONResponse({"owner": found.owner, "name": caller.label, "key": found.key, "until": found.until.isoformat()})
 
 
 @router.get("/visit-day/{visit_id}", dependencies=[VisitViewed])
 def visit_day(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller) -> HTMLResponse:
-    """The clinic day of a visit."""
+    """Show the clinic day of a visit."""
     return HTMLResponse(_page(request, db, visit, caller))
 
 
 @router.post("/visit-day/{visit_id}")
 def enter(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, values: FormValues) -> Response:
-    """One entry from the plain form."""
+    """Add one entry from the plain form."""
     try:
         entry, plan_id = _entry(values)
         result = service.add_entries(db, visit, plan_id, [entry], caller)[0]
@@ -140,7 +140,7 @@ def enter(request: Request, visit: CurrentVisit, db: Db, caller: CurrentCaller, 
 
 
 def _entry(values: FormData) -> tuple[Any, int]:
-    """The form as the API's type, and the plan that it was about."""
+    """Parse the form to the API's type, and the plan that it was about."""
     kind = str(values.get("kind", ""))
     if kind not in _PAYLOADS:
         raise Invalid(f"'{kind}' is nothing that can be entered.", "Load the page again.")
@@ -162,7 +162,7 @@ def _entry(values: FormData) -> tuple[Any, int]:
 
 
 def _event(texts: dict[str, str]) -> dict[str, str]:
-    """An adverse event as its payload names it: the form has one choice for severe and serious."""
+    """Convert an adverse event to the names of its payload: the form has one choice for severe and serious."""
     serious = texts.get("severity") == "serious"
     return {
         "kind": texts.get("kind_of_event", ""),
@@ -214,7 +214,7 @@ def _page(
 
 
 def _frame() -> dict[str, Any]:
-    """What the page and the shell need of their files."""
+    """Return what the page and the shell need of their files."""
     folder = f"/visit-day/files/{_version()}"
     return {
         "folder": folder,

@@ -1,7 +1,7 @@
-"""What the entries of a clinic day amount to. `static/visit-day/record.js` does the same on the tablet.
+"""Meaning of the entries of a clinic day. `static/visit-day/record.js` does the same on the tablet.
 
-Entries are only added. Those that a later entry names in `replaces` no longer stand; where two stand that say different things of the same
-matter (two tablets, or two people), nothing is taken until somebody decides between them.
+Entries are only added. Those that a later entry names in `replaces` are no longer valid. Where two valid ones of the same matter differ
+(two tablets, or two people), nothing is taken until a person decides between them.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ DeviceTime = Annotated[datetime, AfterValidator(_utc)]
 
 
 class EntryBase(Model):
-    """What every entry has."""
+    """Members that every entry has."""
 
     uuid: UUID = Field(description="Drawn by the tablet; the same one again is the same entry.")
     plan_item_id: Annotated[Int, Field(ge=1)] | None = Field(None, description="Session of the plan; null for the day as a whole.")
@@ -53,7 +53,7 @@ class EntryBase(Model):
 
 
 class SessionEntry(EntryBase):
-    """What belongs to one session of the plan."""
+    """Members that belong to one session of the plan."""
 
     plan_item_id: Annotated[Int, Field(ge=1)]
     attempt: Annotated[Int, Field(ge=1, le=20)] = 1
@@ -177,7 +177,7 @@ class Timed(Protocol):
 
 
 class Entry(Timed, Protocol):
-    """What is read of an entry."""
+    """Members of an entry that are read here."""
 
     uuid: Any
     plan_item_id: Any
@@ -205,11 +205,11 @@ class Attempt:
 
 @dataclass(frozen=True)
 class SlotTimes:
-    """When a session of the plan ran.
+    """Times of one session of the plan.
 
     Attributes:
         attempts: in order, the last one counts. skipped_because: None where it was not skipped.
-        stop_cause: `participant`, `technical`, `other`; None where it was not stopped early, or nobody said why. stop_text: in words.
+        stop_cause: `participant`, `technical`, `other`; None where it was not stopped early, or no cause is stated. stop_text: in words.
     """
 
     attempts: tuple[Attempt, ...]
@@ -230,12 +230,12 @@ class SlotTimes:
 
 @dataclass(frozen=True)
 class SlotOutcome:
-    """What was entered about the attempt of a session that counts; None where nothing was, or where two entries contradict.
+    """Entries about the attempt of a session that counts; None where nothing was entered, or where two entries contradict.
 
     Attributes:
         qocs: of the outcomes that are asked for, by `Outcome.field`; those that were entered.
         dyskinesia, speech, gait: `none`, `mild` or `severe`. notes: in order.
-        contradictions: kinds of which two different entries stand. entered_by: of the outcomes, by kind of entry.
+        contradictions: kinds with two different valid entries. entered_by: of the outcomes, by kind of entry.
     """
 
     qocs: Mapping[str, float] = field(default_factory=dict)
@@ -258,19 +258,19 @@ class Contradiction:
 
 
 def moment(entry: Timed) -> datetime:
-    """When an entry was made, by the service's clock."""
+    """Return when an entry was made, by the service's clock."""
     return entry.device_time + timedelta(milliseconds=entry.clock_offset_ms or 0)  # type: ignore[no-any-return]
 
 
 def standing(entries: Iterable[Entry]) -> list[Entry]:
-    """The entries that no other replaces, in the order of their moments."""
+    """Select the entries that no other replaces, in the order of their moments."""
     entries = list(entries)
     replaced = {str(u) for e in entries for u in e.replaces}
     return sorted((e for e in entries if str(e.uuid) not in replaced), key=moment)
 
 
 def last_attempt(entries: Iterable[Entry], plan_item_id: int) -> int:
-    """Number of the attempt that counts."""
+    """Return the number of the attempt that counts."""
     return 1 + max((e.attempt for e in entries if e.plan_item_id == plan_item_id and e.kind == "repeat"), default=0)
 
 
@@ -284,7 +284,7 @@ def attempt_at(entries: Sequence[Entry], plan_item_id: int, began: datetime | No
 
 
 def said_of(entries: Iterable[Entry], item: int, attempt: int) -> dict[str, Entry]:
-    """By kind, the entry that stands of one attempt; the earliest of several that agree, none where they do not."""
+    """Return by kind the valid entry of one attempt; the earliest of several that agree, none where they do not."""
     rows: dict[str, list[Entry]] = {}
     for entry in standing(entries):
         if (entry.plan_item_id, entry.attempt) == (item, attempt):
@@ -293,7 +293,7 @@ def said_of(entries: Iterable[Entry], item: int, attempt: int) -> dict[str, Entr
 
 
 def agree(one: Entry, other: Entry) -> bool:
-    """Whether two entries of one matter say the same."""
+    """Check whether two entries of one matter state the same."""
     if one.kind in ("start", "stop"):
         return abs((moment(one) - moment(other)).total_seconds()) <= SAME_MOMENT_S
     if (asked := ASKED_BY_KIND.get(one.kind)) is not None:
@@ -302,7 +302,7 @@ def agree(one: Entry, other: Entry) -> bool:
 
 
 def contradictions(entries: Iterable[Entry]) -> list[Contradiction]:
-    """Every matter of which two entries stand that say different things."""
+    """List every matter with two valid entries that differ."""
     matters: dict[tuple[int, int, str], list[Entry]] = {}
     for entry in standing(entries):
         if entry.plan_item_id is not None and entry.kind not in MANY:
@@ -311,7 +311,7 @@ def contradictions(entries: Iterable[Entry]) -> list[Contradiction]:
 
 
 def open_severe(entries: Iterable[Entry]) -> Entry | None:
-    """The severe side effect after which nobody has confirmed the clinical settings yet."""
+    """Find the severe side effect after which the clinical settings are not confirmed yet."""
     rows = standing(entries)
     severe = [e for e in rows if _grade(e) == SEVERE]
     confirmed = max((moment(e) for e in rows if e.kind == "clinical_settings"), default=None)
@@ -325,7 +325,7 @@ def _grade(entry: Entry) -> str | None:
 
 
 def state_of(entries: Sequence[Entry], plan_item_id: int) -> State:
-    """How far a session of the plan is: `asked` after its stop, until somebody says that all is entered."""
+    """Determine how far a session of the plan is: `asked` after its stop, until a person states that all is entered."""
     rows = [e for e in standing(entries) if e.plan_item_id == plan_item_id and e.attempt == last_attempt(entries, plan_item_id)]
     kinds = {e.kind for e in rows}
     for kind, state in _STATES:
@@ -335,7 +335,7 @@ def state_of(entries: Sequence[Entry], plan_item_id: int) -> State:
 
 
 def times_of(entries: Sequence[Entry]) -> dict[int, SlotTimes]:
-    """When each session ran, by its id in the plan."""
+    """Return when each session ran, by its id in the plan."""
     found = {}
     for item in _items(entries):
         count = last_attempt(entries, item)
@@ -357,7 +357,7 @@ def times_of(entries: Sequence[Entry]) -> dict[int, SlotTimes]:
 
 
 def outcomes_of(entries: Sequence[Entry]) -> dict[int, SlotOutcome]:
-    """What was entered about each session, by its id in the plan."""
+    """Return what was entered about each session, by its id in the plan."""
     return {item: outcome_of(entries, item, last_attempt(entries, item)) for item in _items(entries)}
 
 

@@ -15,29 +15,29 @@ from app.tables.sessions import StudySession
 
 
 def entries(db: Session, plan_id: int) -> Sequence[DayEntry]:
-    """All entries of a plan's day, in the order in which they arrived."""
+    """Load all entries of a plan's day, in the order in which they arrived."""
     return db.scalars(select(DayEntry).where(DayEntry.plan_id == plan_id).order_by(DayEntry.id)).all()
 
 
 def entries_of_visit(db: Session, visit_id: int, limit: int, offset: int) -> tuple[Sequence[DayEntry], int]:
-    """A page of all entries about a visit, under whichever of its plans, in the order in which they arrived."""
+    """Load a page of all entries about a visit, under whichever of its plans, in the order in which they arrived."""
     of_visit = select(DayEntry).join(Plan, Plan.id == DayEntry.plan_id).where(Plan.visit_id == visit_id)
     return db.scalars(of_visit.order_by(DayEntry.id).limit(limit).offset(offset)).all(), count(db, of_visit)
 
 
 def entries_beside(db: Session, plan_item_id: int) -> Sequence[DayEntry]:
-    """All entries of the day that a session of a plan belongs to, in the order in which they arrived."""
+    """Load all entries of the day that a session of a plan belongs to, in the order in which they arrived."""
     of_item = select(PlanItem.plan_id).where(PlanItem.id == plan_item_id).scalar_subquery()
     return db.scalars(select(DayEntry).where(DayEntry.plan_id == of_item).order_by(DayEntry.id)).all()
 
 
 def entries_named(db: Session, uuids: Collection[uuid.UUID]) -> dict[uuid.UUID, DayEntry]:
-    """Those of the named entries that are stored, of whatever plan."""
+    """Load those of the named entries that are stored, of whatever plan."""
     return {row.uuid: row for row in db.scalars(select(DayEntry).where(DayEntry.uuid.in_(list(uuids))))}
 
 
 def plan_of_visit(db: Session, visit_id: int, plan_id: int) -> Plan | None:
-    """A plan of a visit that was approved once; it may have been replaced since."""
+    """Find a plan of a visit that was approved once; it may have been replaced since."""
     return db.scalar(select(Plan).where(Plan.id == plan_id, Plan.visit_id == visit_id, Plan.approved_at.is_not(None)))
 
 
@@ -54,5 +54,5 @@ def sessions_in_place(db: Session, plan_id: int) -> Sequence[StudySession]:
 
 
 def slot_times(db: Session, plan_id: int) -> dict[int, SlotTimes]:
-    """When each session of a plan ran, by its id in the plan; sessions of which nothing was entered are left out."""
+    """Return when each session of a plan ran, by its id in the plan; without sessions of which nothing was entered."""
     return times_of(entries(db, plan_id))

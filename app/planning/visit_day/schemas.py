@@ -27,14 +27,14 @@ class Nothing(Model):
 
 
 class StopCausePayload(Model):
-    """Why a session was stopped before its planned end."""
+    """Cause of a session's stop before its planned end."""
 
     cause: StopCause = Field(description="`participant`: for the participant's sake.")
     text: Annotated[Text, Field(max_length=500)] = ""
 
 
 class GradePayload(Model):
-    """How much of a side effect there was."""
+    """Grade of a side effect."""
 
     grade: Grade = Field(description="`severe` is a stop rule.")
 
@@ -63,14 +63,14 @@ class AdverseEventPayload(Model):
 
 
 class DosePayload(Model):
-    """A dose of medication; the entry's time is when it was taken, and it stands among the visit's doses as soon as it arrives."""
+    """A dose of medication; the entry's time is when it was taken, and it is among the visit's doses as soon as it arrives."""
 
     drug: Drug
     mg: Number = Field(gt=0, le=5000, description="Of the active drug; of levodopa combinations the levodopa.")
 
 
 class ReasonPayload(Model):
-    """Why a session was skipped or is repeated."""
+    """Reason why a session was skipped or is repeated."""
 
     reason: Reason
 
@@ -83,7 +83,7 @@ class Mark(SessionEntry):
 
 
 class StopCauseEntry(SessionEntry):
-    """Why a session was stopped early."""
+    """Cause of an early stop of a session."""
 
     kind: Literal["stop_cause"]
     payload: StopCausePayload
@@ -118,7 +118,7 @@ class AdverseEventEntry(EntryBase):
 
 
 class ClinicalSettingsEntry(EntryBase):
-    """Somebody has looked: the stimulator is back on the clinical settings."""
+    """Confirmation that the stimulator is back on the clinical settings."""
 
     kind: Literal["clinical_settings"]
     payload: Nothing = Nothing()
@@ -167,7 +167,7 @@ class EntriesIn(Model):
 
 
 class EntryResult(Model):
-    """What became of one entry."""
+    """Result of one entry."""
 
     uuid: UUID | None = Field(description="Null where a refused entry has none that can be read.")
     outcome: Literal["stored", "known", "refused"] = Field(description="`refused`: not stored; keep it and show why.")
@@ -177,7 +177,7 @@ class EntryResult(Model):
 
 
 class EntriesOut(Model):
-    """What became of every entry of a batch, in its order."""
+    """Results of every entry of a batch, in its order."""
 
     server_time: datetime
     results: list[EntryResult]
@@ -212,7 +212,7 @@ class SlotOut(Model):
 
     plan_item_id: int
     position: int
-    label: str = Field(description="What stands in large letters: the controller, or a label where it is not to be known.")
+    label: str = Field(description="Text in large letters: the controller, or a label where it is not to be known.")
     controller: str | None = Field(description="Null where it is not to be known.")
     detail: str = Field(description="Policy or design; empty where it is not to be known.")
     minutes: float
@@ -237,7 +237,7 @@ class DayOut(Model):
     date: dt.date | None
     participant: str
     plan_id: int
-    blinded: bool = Field(description="Labels stand in the place of controllers.")
+    blinded: bool = Field(description="Labels replace controllers.")
     locked: bool = Field(description="The visit takes no entries any more.")
     not_runnable: str = Field(description="Why nothing of the plan may be started, such as a broken signature; empty where it may.")
     note: str

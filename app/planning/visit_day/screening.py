@@ -1,7 +1,7 @@
-"""Notes hold no identity: dates, long numbers and addresses are refused, words that look like names are asked about.
+"""Screening of notes for identity: dates, long numbers and addresses are refused, words that look like names are questioned.
 
-The tablet screens by the same rules before it keeps a note (`static/visit-day/screening.js`); the words and patterns come from here, and
-both are written so that Python and JavaScript read them alike. A name in small letters, or one that is also a common word, is not seen.
+The tablet screens by the same rules before it keeps a note (`static/visit-day/screening.js`). The words and patterns come from here,
+written so that Python and JavaScript read them alike. A name in small letters, or one that is also a common word, is not seen.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ symptoms tablet talking that the their then there these they this tingling tired
 unchanged unsteady until very vision voice walking was watch water we weak went were when while with without worse yes
 """
 PLAIN_WORDS = frozenset(_PLAIN.split())
-"""Words that may stand with a capital at the beginning of a sentence without being asked about."""
+"""Words that may begin a sentence with a capital without being questioned."""
 
 _WORD = re.compile(r"[^\W\d_]+(?:['’-][^\W\d_]+)*")
 
@@ -55,7 +55,7 @@ class Found:
 
 
 def screen(text: str, no_names: Collection[str] = ()) -> list[Found]:
-    """What a note may not hold, in the order date, number, address, name; each piece once.
+    """Find what a note may not contain, in the order date, number, address, name; each piece once.
 
     Args:
         text: the note.
@@ -78,5 +78,5 @@ def screen(text: str, no_names: Collection[str] = ()) -> list[Found]:
 
 
 def rules() -> dict[str, Any]:
-    """The rules as the tablet takes them."""
+    """Return the rules as the tablet takes them."""
     return {"patterns": {kind: list(patterns) for kind, patterns in PATTERNS.items()}, "plain_words": sorted(PLAIN_WORDS)}

@@ -20,7 +20,7 @@ from app.tables.sessions import Controller
 
 
 def day_out(day: Day, caller: Caller) -> DayOut:
-    """A clinic day for its page."""
+    """Convert a clinic day for its page."""
     visit, plan = day.visit, day.plan
     blinded = not may_know(visit, caller) or sealed(plan)
     shared = common_limits(plan.items)
@@ -48,7 +48,7 @@ def day_out(day: Day, caller: Caller) -> DayOut:
 
 
 def limits_of(item: PlanItem) -> LimitsOut | None:
-    """Within which amplitudes a session of the plan stays; None where the plan does not say."""
+    """Return the limits within which a session of the plan stays; None where the plan does not state any."""
     if item.min_ma is None or item.max_ma is None:
         return None
     return LimitsOut(min_ma=item.min_ma, max_ma=item.max_ma, ramp_ma_per_s=item.ramp_ma_per_s)

@@ -65,7 +65,7 @@ class DeviceKey:
 
 
 def read_day(db: Session, visit: Visit, caller: Caller) -> Day:
-    """The clinic day of a visit. Raises NotFound without a plan, Conflict where it is not approved."""
+    """Read the clinic day of a visit. Raises NotFound without a plan, Conflict where it is not approved."""
     access.require(caller, can.READ, visit.participant)
     plan = plans.live_plan(db, visit.id)
     if plan is None:
@@ -125,12 +125,12 @@ def add_entries(db: Session, visit: Visit, plan_id: int, entries: Sequence[Entry
 
 
 def words_like_names(note: str) -> list[str]:
-    """The words of a note that somebody must say are no names."""
+    """List the words of a note that the author must confirm to be no names."""
     return [found.text for found in screen(note) if found.kind == "name"]
 
 
 def device_key(caller: Caller) -> DeviceKey:
-    """The key of the caller's own entries: the same at every sign-in, so that what waits on a tablet is read again after an expired one.
+    """Return the key of the caller's own entries: the same at every sign-in, so that entries waiting on a tablet stay readable.
 
     Raises:
         Forbidden: asked for with an API token.
@@ -144,7 +144,7 @@ def device_key(caller: Caller) -> DeviceKey:
 
 
 def _not_runnable(db: Session, visit: Visit, caller: Caller) -> str:
-    """Why the approved plan may not run; what was done is entered all the same."""
+    """Explain why the approved plan may not run; what was done is entered all the same."""
     try:
         refuse_running(read_plan(db, visit, caller))
     except (Conflict, Invalid) as error:
@@ -157,7 +157,7 @@ def _tells_harm(entry: EntryIn) -> bool:
 
 
 def _require_same(stored: DayEntry, entry: EntryIn, plan: Plan) -> None:
-    """Raises Conflict where an identifier that is known comes with something else."""
+    """Raise Conflict where a known identifier comes with other content."""
     same = (stored.plan_id, stored.plan_item_id, stored.kind, stored.payload) == (
         plan.id, entry.plan_item_id, entry.kind, _payload(entry),
     )  # fmt: skip
@@ -178,22 +178,22 @@ def _check(entry: EntryIn, items: dict[int, PlanItem]) -> None:
 
 
 def dose_of(entry: EntryIn) -> DoseIn:
-    """The dose that an entry says was taken, to the minute: the same one twice within a minute is one that was entered twice.
+    """Build the dose of an entry, to the minute: the same one twice within a minute counts as entered twice.
 
     Raises:
-        Invalid: the tablet had lost its clock, and nobody knows when the dose was taken.
+        Invalid: the tablet had lost its clock, and the time of the dose is unknown.
     """
     assert isinstance(entry.payload, DosePayload)
     taken_at = moment(entry).replace(second=0, microsecond=0)
     if taken_at.year < FIRST_YEAR:
         raise Invalid(
-            f"The tablet's clock said {taken_at:%Y-%m-%d %H:%M} UTC.", "Write the dose down on the page of the visit, with its time."
+            f"The tablet's clock showed {taken_at:%Y-%m-%d %H:%M} UTC.", "Write the dose down on the page of the visit, with its time."
         )
     return DoseIn(drug=entry.payload.drug, mg=entry.payload.mg, taken_at=taken_at)
 
 
 def _free_text(entry: EntryIn) -> tuple[str, str, Sequence[str]]:
-    """The field of the payload that somebody wrote, its text, and which of its words they say are no names."""
+    """Return the free-text field of the payload, its text, and the words that its author says are no names."""
     payload = entry.payload
     if isinstance(payload, NotePayload):
         return "text", payload.text, payload.no_names
@@ -222,7 +222,7 @@ def _store(db: Session, plan: Plan, entry: EntryIn, caller: Caller) -> DayEntry:
 
 
 def _record_event(db: Session, visit: Visit, item: PlanItem | None, row: DayEntry, caller: Caller) -> None:
-    """Adverse events and severe side effects stand among the adverse events at once, with or without a recording of the session."""
+    """Record adverse events and severe side effects among the adverse events at once, with or without a recording of the session."""
     payload = row.payload
     if row.kind == "adverse_event":
         about = {name: payload[name] for name in ("kind", "severity", "serious", "note")}

@@ -1,4 +1,4 @@
-"""What was entered on the clinic day becomes the outcome of the session that takes its place in the plan. The caller commits.
+"""Entries of the clinic day as the outcome of the session that takes its place in the plan. The caller commits.
 
 It joins the session whenever the later of both arrives: log, confirmation and entries may come in any order.
 """
@@ -123,7 +123,7 @@ def stop_words(entry: Entry) -> str:
 
 
 def _mild(db: Session, session: StudySession, entries: Sequence[DayEntry], number: int, caller: Caller) -> None:
-    """Mild side effects become adverse events of the session; severe ones are events since they arrived.
+    """Record mild side effects as adverse events of the session; severe ones are events since they arrived.
 
     One whose entry was corrected since becomes none.
     """

@@ -12,7 +12,7 @@ from ml.outcomes import BY_FIELD
 
 
 def screened(found: Sequence[Found]) -> str:
-    """Why a note is not kept, in one sentence."""
+    """Explain why a note is not kept, in one sentence."""
     what = {"date": "a date", "number": "a number of four or more digits", "address": "an address", "name": "a word that looks like a name"}
     return "The note holds " + "; ".join(f"{what[f.kind]} ('{f.text}')" for f in found) + "."
 
@@ -27,7 +27,7 @@ _MATTERS = {
 
 
 def contradiction(found: Contradiction, slots: Sequence[SlotOut]) -> str:
-    """What two entries say differently, in one sentence."""
+    """Describe what two entries state differently, in one sentence."""
     position = next((slot.position for slot in slots if slot.plan_item_id == found.plan_item_id), 0)
     said = ", ".join(f"{_entered(entry)} by {entry.entered_by} at {moment(entry):%H:%M:%S} UTC" for entry in found.entries)
     what = _MATTERS.get(found.kind, "entries")
@@ -40,7 +40,7 @@ STOPPED_FOR_PARTICIPANT = "stopped for the participant's sake on the clinic day"
 
 
 def from_the_day(who: Sequence[str]) -> str:
-    """Why a session has outcomes that nobody typed beside it."""
+    """Explain where a session's outcomes come from, if they were not typed on its page."""
     return "entered on the clinic day" + (f" by {', '.join(who)}" if who else "")
 
 
@@ -58,7 +58,7 @@ def day_ended(elapsed_s: float, recorded_s: float) -> str:
 
 
 def open_contradiction(kind: str) -> str:
-    """A matter of which the clinic day has two entries that say different things."""
+    """Describe a matter of which the clinic day has two different entries."""
     return f"The clinic day has different {_MATTERS.get(kind, 'entries')}; none was taken. Choose one on the page of the day."
 
 

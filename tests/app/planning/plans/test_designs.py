@@ -153,7 +153,7 @@ def test_a_plan_without_a_bound_in_milliamperes_cannot_be_signed(
     assert "State the cDBS amplitude" in refused.json()["hint"]
     settle(client, cdbs_amplitude_ma=2.5)
     unset = sign_plan(number)
-    assert (unset.status_code, unset.json()["hint"]) == (409, "Draft the visit anew.")
+    assert (unset.status_code, unset.json()["hint"]) == (409, "Draft the visit again.")
     assert designed(client, number)[0]["bounds"] != []
     signed = sign_plan(number).json()
     settle(client, cdbs_amplitude_ma=5.0)

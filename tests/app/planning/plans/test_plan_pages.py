@@ -128,7 +128,7 @@ def test_a_draft_that_fails_makes_no_visit(client: TestClient, study_world: Any,
 def test_a_visit_with_sessions_is_not_open_for_planning(client: TestClient, study_world: Any) -> None:
     answer = _post(client, "/participants/P1/plan/draft", policy_ids=[str(study_world.policies[0])], visit_id=str(study_world.held_visit))
     assert answer.status_code == 422
-    assert "it has sessions, lies in the past" in answer.text
+    assert "it has sessions, is in the past" in answer.text
 
 
 def test_the_list_shows_every_plan_and_the_open_visits(client: TestClient, study_world: Any) -> None:

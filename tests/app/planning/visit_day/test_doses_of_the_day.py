@@ -54,7 +54,7 @@ def test_a_dose_by_a_tablet_that_lost_its_clock_or_of_another_week_is_refused_wi
     lost = dose(today, device_time="1970-01-01T00:05:00Z", clock_offset_ms=None)
     results = today.send(lost, dose(today, 60 * 24 * 8), today.entry("start")).json()["results"]
     assert [r["outcome"] for r in results] == ["refused", "refused", "stored"]
-    assert "The tablet's clock said 1970-01-01 00:05 UTC." in results[0]["detail"]
+    assert "The tablet's clock showed 1970-01-01 00:05 UTC." in results[0]["detail"]
     assert "is not near visit 2" in results[1]["detail"]
     offset = round((NOW - timedelta(hours=1) - datetime(1970, 1, 1, 0, 5, tzinfo=UTC)).total_seconds() * 1000)
     assert today.outcomes(lost | {"clock_offset_ms": offset}) == ["stored"], "measured since: the time is known"
