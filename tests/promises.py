@@ -1,4 +1,4 @@
-"""What docs/trust.md promises, each with a change of the code that breaks it and the test that shows it (`tests/broken_promises.py`)."""
+"""Promises of docs/trust.md, each with a change of the code that breaks it and the test that shows it (`tests/broken_promises.py`)."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ PROMISES = [
          f"{SIGNED}::test_nobody_else_confirms_and_an_old_sign_on_does_not"),
         ("a closed account stays closed to the sign-on", "    if not user.active:\n", "    if False:\n",
          f"{SIGN_ON}::test_a_closed_account_stays_closed"),
-        ("an account belongs to one person there", "if link_of_user(db, user.id, identity.issuer):", "if False:",
+        ("an account belongs to one person there", "if link is None and link_of_user(db, user.id, identity.issuer):", "if False:",
          f"{SIGN_ON}::test_an_address_that_was_given_to_somebody_else_opens_no_account"),
         ("look-alikes of an address open no account", "and user.email == address.strip().lower() else None", "else None",
          f"{SIGN_ON}::test_look_alikes_of_an_address_open_no_account"),
