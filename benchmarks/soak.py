@@ -43,7 +43,7 @@ HEALTHY_S = 10.0
 OWN_LOAD = 2.5
 """Load that a run makes by itself (docs/reliability.md)."""
 PATIENCE_S = 120.0
-"""Whoever is not healthy by then ends the run."""
+"""Time after which an unhealthy installation ends the run."""
 ORPHANS_S = 5.0
 JOBS_S = 90.0
 """For so long the last jobs may show no progress; a busy machine makes them slow, and does not stop them."""

@@ -1,6 +1,6 @@
 """Break promises of docs/trust.md on purpose, one after another, and see that the test which shows each one fails.
 
-    nice .venv/bin/python -m tests.broken_promises [WORD ...]     those whose sentence or test has one of the words; all when left out
+    nice .venv/bin/python -m tests.broken_promises [WORD ...]     those whose sentence or test has one of the words; all by default
 
 Ends with exit code 1 where a test did not notice. `tests/test_trust.py` looks that every line which is broken here is still there.
 """
@@ -58,12 +58,12 @@ def say(line: str) -> None:
 
 
 def wanted(words: list[str]) -> list[Promise]:
-    """The promises that have one of the words; all without words."""
+    """Select the promises that have one of the words; all without words."""
     return [p for p in PROMISES if not words or any(w in p.said or w in p.test or w in p.file for w in words)]
 
 
 def functions(code: CodeType) -> dict[str, list[CodeType]]:
-    """The code of every function of a module, by its qualified name."""
+    """Return the code of every function of a module, by its qualified name."""
     found: dict[str, list[CodeType]] = {}
     for part in code.co_consts:
         if isinstance(part, CodeType):
@@ -75,7 +75,7 @@ def functions(code: CodeType) -> dict[str, list[CodeType]]:
 
 
 def broken_code(promise: Promise) -> dict[str, CodeType]:
-    """The functions of the broken file that differ, by name; none where what differs is no function's."""
+    """Compile the functions of the broken file that differ, by name; none where what differs is no function's."""
     path = ROOT / promise.file
     source = path.read_text()
     whole, broken = (functions(compile(text, str(path), "exec")) for text in (source, source.replace(promise.old, promise.new)))
@@ -83,13 +83,13 @@ def broken_code(promise: Promise) -> dict[str, CodeType]:
 
 
 def told(code: CodeType) -> tuple[object, ...]:
-    """What a function does, wherever it stands in its file."""
+    """Describe what a function does, wherever it is in its file."""
     return code.co_code, code.co_names, tuple(told(c) if isinstance(c, CodeType) else (type(c), c) for c in code.co_consts)
 
 
 @contextmanager
 def broken(promise: Promise) -> Iterator[None]:
-    """The promise broken in the functions of this process."""
+    """Break the promise in the functions of this process."""
     path, new = str(ROOT / promise.file), broken_code(promise)
     importlib.import_module(promise.file.removesuffix(".py").replace("/", "."))
     gc.unfreeze()  # else what was set aside before a process was forked is not listed
@@ -107,13 +107,13 @@ def broken(promise: Promise) -> Iterator[None]:
 
 
 class Rest:
-    """What is left after a test: the session, with the server and the databases that tests copy."""
+    """Rest after a test: the session, with the server and the databases that tests copy."""
 
     def __init__(self, session: pytest.Session) -> None:
         self.session = session
 
     def listchain(self) -> list[object]:
-        """What stays set up."""
+        """List what stays set up."""
         return [self.session]
 
 
@@ -154,13 +154,13 @@ class Breaker:
 
 
 def noticed_apart(promise: Promise) -> bool | None:
-    """Whether the test fails on a copy of the code, for what is read when a module is loaded; None where it fails with the promise kept."""
+    """Check whether the test fails on a broken copy of the code, for what is read at import; None where it fails unbroken."""
     return None if not passes_apart(promise.test) else not passes_apart(promise.test, promise)
 
 
 @cache
 def passes_apart(test: str, promise: Promise | None = None) -> bool:
-    """Whether a test passes, and is not skipped, in a process of its own on a copy of the code, in which a promise is broken."""
+    """Check whether a test passes, and is not skipped, in its own process on a copy of the code with a broken promise."""
     with tempfile.TemporaryDirectory(prefix="betaloop-promises-") as place:
         folder = Path(place)
         folder.chmod(0o711)  # PostgreSQL's own user passes through

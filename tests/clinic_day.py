@@ -15,7 +15,7 @@ NOW = "2026-11-22T10:00:00Z"
 
 @dataclass
 class ClinicDay:
-    """A visit whose plan is approved, and a client that acts for somebody.
+    """A visit whose plan is approved, and a client that acts for a user.
 
     Attributes:
         slots: numbers of the plan's sessions, in order.
@@ -27,19 +27,19 @@ class ClinicDay:
     slots: list[int] = field(default_factory=list)
 
     def entry(self, kind: str, payload: dict[str, Any] | None = None, slot: int | None = 0, **more: Any) -> dict[str, Any]:
-        """An entry as a tablet sends it; `slot` counts from 0, None is the day."""
+        """Build an entry as a tablet sends it; `slot` counts from 0, None is the day."""
         of = {} if slot is None else {"plan_item_id": self.slots[slot], "attempt": 1}
         return {
             "uuid": str(uuid.uuid4()), "kind": kind, "payload": payload or {}, "device_time": NOW, "clock_offset_ms": 0, **of, **more,
         }  # fmt: skip
 
     def send(self, *entries: dict[str, Any], client: TestClient | None = None) -> Any:
-        """The answer to a batch."""
+        """Send a batch and return the answer."""
         body = {"plan_id": self.plan, "entries": list(entries)}
         return (client or self.client).post(f"/api/v1/visits/{self.visit}/day/entries", json=body)
 
     def outcomes(self, *entries: dict[str, Any]) -> list[str]:
-        """What became of each entry."""
+        """Send entries and return the result of each."""
         answer = self.send(*entries)
         assert answer.status_code == 200, answer.text
         return [r["outcome"] for r in answer.json()["results"]]

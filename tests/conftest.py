@@ -74,7 +74,7 @@ def recordings() -> Path:
 
 
 def database_folder(tmp_path_factory: pytest.TempPathFactory, memory: Path = MEMORY) -> Path:
-    """A new folder for the databases of this process: in memory where there is room for them, else on the disk.
+    """Make a new folder for the databases of this process: in memory where there is room for them, else on the disk.
 
     Every test gets a copy of 730 files, which took a disk a quarter of the processor time of the whole suite.
     """
@@ -133,12 +133,12 @@ def _administer(server: EmbeddedPostgres, statement: str) -> None:
 
 
 def copy_database(server: EmbeddedPostgres, name: str, template: str) -> None:
-    """A new database with what another one has, to which nobody is connected."""
+    """Create a database with the content of another one without connections."""
     _administer(server, f"create database {name} template {template} owner betaloop strategy file_copy")
 
 
 def drop_database(server: EmbeddedPostgres, name: str) -> None:
-    """Remove a database where it is there, whoever is connected to it."""
+    """Remove a database where it is there, even with connections."""
     _administer(server, f"drop database if exists {name} with (force)")
 
 
@@ -156,7 +156,7 @@ def close_connections() -> None:
 
 @contextmanager
 def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.MonkeyPatch, template: str, keep: str = "") -> Iterator[str]:
-    """A database and data folder of one test, named in the environment too, so that child processes find them.
+    """Make a database and data folder of one test, named in the environment too, so that child processes find them.
 
     Args:
         keep: the name of a copy that is left at the end, a template for other tests; `data` is left with it.
@@ -173,7 +173,7 @@ def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.Monke
         yield url
         close_connections()
         if keep:
-            drop_database(server, keep)  # of a making that was cut short, which pytest begins anew
+            drop_database(server, keep)  # of a making that was cut short, which pytest begins again
             copy_database(server, keep, name)
     finally:
         close_connections()
@@ -185,12 +185,12 @@ def own_database(server: EmbeddedPostgres, data: Path, monkeypatch: pytest.Monke
 
 
 Template = tuple[str, Path]
-"""A database that nobody is connected to, and its data folder; tests work on copies."""
+"""A database without connections, and its data folder; tests work on copies."""
 
 
 @dataclass(frozen=True)
 class Begun:
-    """What a test that asks for `participant_code` begins with: an administrator and a participant, made once.
+    """Start of a test that uses `participant_code`: an administrator and a participant, made once.
 
     Attributes:
         token: of the administrator.
@@ -213,7 +213,7 @@ def begun_once(server: EmbeddedPostgres, application, tmp_path_factory: pytest.T
 
 @pytest.fixture
 def begun(request: pytest.FixtureRequest) -> Begun | None:
-    """What the test begins with; None where it asks for no participant, only in its course, or for a synthetic one."""
+    """Start of the test; None where it uses no participant, only in its course, or a synthetic one."""
     ready = "participant_code" in request.fixturenames and request.node.get_closest_marker("synthetic") is None
     return request.getfixturevalue("begun_once") if ready else None
 
@@ -228,7 +228,7 @@ def fresh_database(begun: Begun | None, server: EmbeddedPostgres, tmp_path: Path
 
 @contextmanager
 def copy_of(template: Template, server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A copy of a template, for one test."""
+    """Copy a template for one test."""
     shutil.copytree(template[1], tmp_path / "data")
     with own_database(server, tmp_path / "data", monkeypatch, template[0]) as url:
         yield url
@@ -251,7 +251,7 @@ def one_event_loop() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def new_sources() -> None:
-    """What a test has used up of the limits by source is not held against the next one."""
+    """Limits by source, reset so that no test's use counts against the next one."""
     failed_sign_ins.forget()
     sent.forget()
 
@@ -291,7 +291,7 @@ def _token_of(role: str) -> str:
 
 @pytest.fixture
 def make_token(fresh_database: str) -> Callable[[str], str]:
-    """Make a user of a role and return an API token."""
+    """Function that makes a user of a role and returns an API token."""
     return _token_of
 
 
@@ -329,7 +329,7 @@ def client_as(service_app, make_token: Callable[[str], str]) -> Callable[[str], 
 
 @pytest.fixture
 def sign_plan(service_app, fresh_database: str) -> Callable[..., Response]:  # type: ignore[no-untyped-def]
-    """Sign a visit's plan over REST as a clinician who drafts nothing."""
+    """Function that signs a visit's plan over REST as a clinician who drafts nothing."""
     with database.transaction("test") as db:
         accounts.add_user(db, "signer@clinic.example", Role.CLINICIAN, PASSWORD)
         token = accounts.create_token(db, "signer@clinic.example", "tests")

@@ -9,7 +9,7 @@ _ran: dict[str, bool] = {}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Have each report carry the hazards of its test, from the processes of pytest-xdist too."""
+    """Add the hazards of its test to each report, from the processes of pytest-xdist too."""
     for item in items:
         for mark in item.iter_markers("hazard"):
             item.user_properties.extend((_PROPERTY, number) for number in mark.args)
@@ -37,5 +37,5 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def unshown() -> list[str]:
-    """Hazards of which tests ran, and none passed."""
+    """List hazards of which tests ran, and none passed."""
     return sorted(number for number, passed in _ran.items() if not passed)

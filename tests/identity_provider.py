@@ -1,7 +1,7 @@
 """A small OpenID Connect provider on a socket, as a hospital has one: it asks people, keeps them signed in, checks its clients.
 
-It is written after the standard and not after betaloop: it refuses what the standard has it refuse (a foreign return address, a missing
-PKCE challenge, a wrong verifier, a code that is used twice), so that a test which comes back signed on has done all of it right.
+It is written after the standard and not after betaloop. It refuses what the standard does: a foreign return address, a missing PKCE
+challenge, a wrong verifier, a code that is used twice. So a test that comes back signed on has done all of it right.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CLIENT_ID, CLIENT_SECRET = "betaloop-at-the-clinic", "a secret: of both"
 
 @dataclass
 class Person:
-    """Somebody who knows their password there."""
+    """A user who knows their password there."""
 
     subject: str
     email: str
@@ -40,7 +40,8 @@ class Provider:
     """The provider's state; tests change it between requests.
 
     Attributes:
-        person: who sits at the browser when a password is asked for; None: nobody gives one. present: who is signed in there, since when.
+        person: who sits at the browser when a password is asked for; None: no password is given. present: who is signed in there, since
+            when.
         asked: how often a password was asked for. change: claims of the next ID tokens that differ; None takes one out.
         key, kid, algorithm: what ID tokens are signed with. published: what the provider says its keys are.
     """
@@ -65,7 +66,7 @@ class Provider:
         self.published = [self.key]
 
     def sign_with_the_public_key(self) -> None:
-        """The old trick: the public key, which everyone has, as the secret of a symmetric signature."""
+        """Sign by the old trick: the public key, which everyone has, as the secret of a symmetric signature."""
         self.algorithm = "HS256"
 
     def _signed(self, claims: dict[str, Any]) -> str:
@@ -79,7 +80,7 @@ class Provider:
         return f"{parts}.{_base64(hmac.digest(self.key.as_pem(private=False), parts.encode(), hashlib.sha256))}"
 
     def authorize(self, query: dict[str, str]) -> str:
-        """The address that the browser is sent to; raises ValueError where the standard forbids to send it anywhere."""
+        """Return the address that the browser is sent to; raises ValueError where the standard forbids to send it anywhere."""
         if query.get("client_id") != CLIENT_ID or query.get("redirect_uri") != self.return_address:
             raise ValueError("unknown client or return address")
         challenge = query.get("code_challenge_method") == "S256" and query.get("code_challenge")
@@ -173,7 +174,7 @@ def _handler(provider: Provider) -> type[BaseHTTPRequestHandler]:
 
 @contextmanager
 def running(return_address: str) -> Iterator[Provider]:
-    """A provider that answers as long as the context lasts."""
+    """Run a provider that answers as long as the context lasts."""
     provider = Provider(return_address)
     provider.renew_key()
     server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(provider))

@@ -10,7 +10,7 @@ BELOW_OUTGOING = range(20_000, 32_000)
 
 
 def free_port() -> int:
-    """A port of this machine that nothing listens on; two workers do not choose the same one."""
+    """Find a port of this machine that nothing listens on; two workers do not choose the same one."""
     for port in random.SystemRandom().sample(BELOW_OUTGOING, 100):
         with socket.socket() as probe:
             try:

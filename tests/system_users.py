@@ -24,7 +24,7 @@ def require_root(reason: str) -> None:
 
 @contextmanager
 def unknown_user() -> Iterator[str]:
-    """A name that no user has; the user of that name, if one was made meanwhile, is removed at the end."""
+    """Yield a name that no user has; the user of that name, if one was made meanwhile, is removed at the end."""
     name = f"bltest-{secrets.token_hex(6)}"
     assert not exists(name)
     try:
@@ -35,7 +35,7 @@ def unknown_user() -> Iterator[str]:
 
 
 def exists(name: str) -> bool:
-    """Whether there is a user of this name."""
+    """Check whether there is a user of this name."""
     try:
         pwd.getpwnam(name)
     except KeyError:

@@ -80,7 +80,7 @@ def test_the_image_holds_what_runs_and_is_nobody_s_root() -> None:
 
 @pytest.fixture
 def empty(server: EmbeddedPostgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
-    """What the compose file puts into the environment of its services, on a database of the tests that holds nothing yet."""
+    """Environment of the compose file's services, on a database of the tests that holds nothing yet."""
     with own_database(server, tmp_path / "data", monkeypatch, "template0"):
         held = {k: v for k, v in os.environ.items() if not k.startswith("BETALOOP_") or k == "BETALOOP_SERVER_USER"}
         yield held | {"BETALOOP_DATA_DIR": str(tmp_path / "data"), "PYTHONPATH": str(ROOT)}
@@ -97,7 +97,7 @@ def started(name: str, env: dict[str, str], log: Path) -> subprocess.Popen[bytes
 
 
 def healthy(port: int) -> bool:
-    """What the file asks the web service for, asked as it asks."""
+    """Check the web service's health as the compose file does."""
     kind, program, *rest = SERVICES["web"]["healthcheck"]["test"]
     assert (kind, program) == ("CMD", "python")
     asked = [word.replace(":8000/", f":{port}/") for word in rest]

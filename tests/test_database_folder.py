@@ -1,4 +1,4 @@
-"""Where the databases of the tests lie: in memory where there is room, and nothing of a killed run stays there."""
+"""Place of the tests' databases: in memory where there is room, and nothing of a killed run stays there."""
 
 from __future__ import annotations
 

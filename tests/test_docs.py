@@ -1,4 +1,4 @@
-"""What README and the documentation name exists: commands and options, make targets, routes, settings, files, names in files."""
+"""Names in README and the documentation exist: commands and options, make targets, routes, settings, files, names in files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Code(NamedTuple):
 
 
 def pieces(markdown: str) -> Iterator[Code]:
-    """Every piece of code; in a block a line that ends with a backslash goes on."""
+    """Yield every piece of code; in a block a line that ends with a backslash goes on."""
     block = False
     for number, line in enumerate(markdown.replace("\\\n", " ").splitlines(), 1):
         if line.lstrip().startswith("```"):
@@ -56,12 +56,12 @@ def pieces(markdown: str) -> Iterator[Code]:
 
 @cache
 def command_tree() -> Any:
-    """The command line as click has it."""
+    """Return the command line as click has it."""
     return typer.main.get_command(commands)
 
 
 def wrong_command(words: list[str], options: list[str]) -> str | None:
-    """What is wrong with `betaloop words... options...`."""
+    """Explain what is wrong with `betaloop words... options...`."""
     node, path = command_tree(), "betaloop"
     for word in words:
         known = getattr(node, "commands", None)
@@ -77,7 +77,7 @@ def wrong_command(words: list[str], options: list[str]) -> str | None:
 
 @cache
 def every_option() -> set[str]:
-    """Options of all commands together."""
+    """Collect options of all commands together."""
     nodes = [command_tree()]
     for node in nodes:
         nodes += getattr(node, "commands", {}).values()
@@ -85,7 +85,7 @@ def every_option() -> set[str]:
 
 
 def commands_of(code: Code) -> Iterator[tuple[list[str], list[str]]]:
-    """(words, options) of every call of betaloop in a piece of code."""
+    """Yield (words, options) of every call of betaloop in a piece of code."""
     for call in re.findall(r"(?:^|[\s/])betaloop((?:\s+[^\s|;#&)]+)*)", code.text):
         words: list[str] = []
         for word in call.split():
@@ -96,12 +96,12 @@ def commands_of(code: Code) -> Iterator[tuple[list[str], list[str]]]:
 
 
 def wrong_commands(markdown: str) -> list[str]:
-    """Calls of betaloop that the command line does not offer."""
+    """List calls of betaloop that the command line does not offer."""
     found = []
     for code in pieces(markdown):
         calls = list(commands_of(code))
         if code.text.startswith("betaloop ") and calls:
-            # `betaloop ingest redecode` · `resume`: the others stand in the same group
+            # `betaloop ingest redecode` · `resume`: the others are in the same group
             group = calls[0][0][:-1]
             following = code.line.split(f"`{code.text}`", 1)[-1]
             siblings = re.match(r"(?: · `[^`]+`)*", following)
@@ -115,7 +115,7 @@ def wrong_commands(markdown: str) -> list[str]:
 
 
 def wrong_targets(markdown: str) -> list[str]:
-    """Targets that the Makefile lacks."""
+    """List targets that the Makefile lacks."""
     targets = set(re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     named = [(code, t) for code in pieces(markdown) for t in re.findall(r"(?:^|[;&] *)make ([a-z][a-z-]*)", code.text)]
     return [f"line {code.number}: no target {target}" for code, target in named if target not in targets]
@@ -126,13 +126,13 @@ def wrong_targets(markdown: str) -> list[str]:
 
 @cache
 def routes() -> set[tuple[str, str]]:
-    """(method, path) of every route, pages too."""
+    """Collect (method, path) of every route, pages too."""
     contexts = iter_route_contexts(create_app().routes)
     return {(method, c.path) for c in contexts if c.path for method in (getattr(c, "methods", None) or ())}
 
 
 def is_route(path: str, method: str | None, ending: bool = False) -> bool:
-    """Whether a path, with numbers, codes or other names in place of its parameters, is a route; `ending`: or the end of one."""
+    """Check whether a path, with numbers, codes or other names in place of its parameters, is a route; `ending`: or the end of one."""
     wanted = re.sub(r"{[^}]*}", "x", path.split("?")[0].rstrip("/.")) or "/"
     for known_method, known in routes():
         if method is not None and known_method != method:
@@ -145,7 +145,7 @@ def is_route(path: str, method: str | None, ending: bool = False) -> bool:
 
 
 def wrong_routes(markdown: str) -> list[str]:
-    """Routes, with their methods where these are stated, that the service lacks."""
+    """List routes, with their methods where these are stated, that the service lacks."""
     found = []
     for code in pieces(markdown):
         named: list[tuple[str | None, str]] = []
@@ -169,7 +169,7 @@ def wrong_routes(markdown: str) -> list[str]:
 
 
 def wrong_settings(markdown: str) -> list[str]:
-    """Environment variables that nothing reads."""
+    """List environment variables that nothing reads."""
     known = {f"BETALOOP_{name.upper()}" for name in Settings.model_fields}
     read = "".join(p.read_text() for folder in ("tests", "benchmarks") for p in (ROOT / folder).rglob("*.py") if p != Path(__file__))
     known |= set(re.findall(r"environ(?:\.get\(|\[)\"(BETALOOP_[A-Z_]+)\"", read))
@@ -181,14 +181,14 @@ def wrong_settings(markdown: str) -> list[str]:
 
 @cache
 def tree() -> tuple[str, ...]:
-    """Every file and folder of the repository that a document may name."""
+    """List every file and folder of the repository that a document may name."""
     top = [p for p in ROOT.iterdir() if p.is_file()]
     inner = [p for folder in CODE_FOLDERS if (ROOT / folder).exists() for p in (ROOT / folder).rglob("*") if "__pycache__" not in p.parts]
     return tuple(str(p.relative_to(ROOT)) for p in [*top, *inner, *(ROOT / f for f in CODE_FOLDERS)])
 
 
 def named_paths(text: str) -> Iterator[tuple[str, str | None]]:
-    """(path, name in it) that a piece of code names: `ml/qoc.py`, `app/study`, `traces.py: step_table`, `rl*.py`."""
+    """Yield (path, name in it) that a piece of code names: `ml/qoc.py`, `app/study`, `traces.py: step_table`, `rl*.py`."""
     folders = "|".join(map(re.escape, CODE_FOLDERS))
     for match in re.finditer(
         rf"(?<![\w/.$-])((?:{folders})/[\w./*-]+|[\w*-]+\.(?:{'|'.join(SUFFIXES)}))(?!\w|\.\w)(?::{{1,2}} ?([A-Za-z_]\w*))?", text
@@ -197,13 +197,13 @@ def named_paths(text: str) -> Iterator[tuple[str, str | None]]:
 
 
 def files_of(path: str) -> list[str]:
-    """Files and folders that a path, from the root or from anywhere, stands for."""
+    """List files and folders that a path means, from the root or from anywhere."""
     pattern = re.compile(r"(?:.*/)?" + re.escape(path).replace(r"\*", "[^/]*"))
     return [known for known in tree() if pattern.fullmatch(known)]
 
 
 def wrong_files(markdown: str) -> list[str]:
-    """Paths that lead nowhere, and names that their file does not hold."""
+    """List paths that lead nowhere, and names that their file does not hold."""
     found = []
     for code in pieces(markdown):
         for path, name in named_paths(code.text):
@@ -219,12 +219,12 @@ def wrong_files(markdown: str) -> list[str]:
 
 
 def defines(source: str, name: str) -> bool:
-    """Whether a file gives a name a meaning: a function, a class, a value, a field."""
+    """Check whether a file gives a name a meaning: a function, a class, a value, a field."""
     return re.search(rf"^\s*(?:async )?(?:def|class) {name}\b|^\s*{name}\s*[:=]", source, re.MULTILINE) is not None
 
 
 def is_module(dotted: str) -> bool:
-    """Whether a dotted name is a module, or a name in one."""
+    """Check whether a dotted name is a module, or a name in one."""
     parts = dotted.split(".")
     for k in range(len(parts), 0, -1):
         try:
@@ -237,7 +237,7 @@ def is_module(dotted: str) -> bool:
 
 
 def wrong_options(markdown: str) -> list[str]:
-    """Options of benchmarks that the script does not know, and options named alone that nothing has."""
+    """List options of benchmarks that the script does not know, and options named alone that nothing has."""
     found = []
     scripts = "".join(p.read_text() for p in (ROOT / "benchmarks").rglob("*.py"))
     for code in pieces(markdown):
@@ -253,13 +253,13 @@ def wrong_options(markdown: str) -> list[str]:
 
 
 def anchors(markdown: str) -> set[str]:
-    """Places that a link can lead to."""
+    """Collect places that a link can lead to."""
     heads = re.findall(r"^#+ (.+)$", markdown, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
 
 
 def wrong_links(markdown: str, document: Path) -> list[str]:
-    """Links to files and headings that do not exist."""
+    """List links to files and headings that do not exist."""
     found = []
     for target in re.findall(r"(?<!`)\]\(([^)\s]+)\)", markdown):
         if re.match(r"[a-z]+:", target):
@@ -274,7 +274,7 @@ def wrong_links(markdown: str, document: Path) -> list[str]:
 
 
 def wrong(markdown: str, document: Path) -> list[str]:
-    """Everything that a document names and that does not exist."""
+    """List everything that a document names and that does not exist."""
     checks = (wrong_commands, wrong_targets, wrong_routes, wrong_settings, wrong_files, wrong_options)
     return [*(found for check in checks for found in check(markdown)), *wrong_links(markdown, document)]
 

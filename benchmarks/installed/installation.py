@@ -155,7 +155,7 @@ class Installation:
         done = subprocess.run(arguments, cwd=ROOT, env=self._env(), capture_output=True, text=True, timeout=4 * STARTED_S, check=False)
         if done.returncode:
             raise RuntimeError(f"the installation could not be made:\n{done.stderr[-3000:]}")
-        self.database = self.own or self._embedded()  # where the embedded one lies is known now
+        self.database = self.own or self._embedded()  # where the embedded one is, is known now
         tokens: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
         return tokens
 

@@ -107,7 +107,7 @@ class Writers:
     """Four threads: uploads, QoCs, entries of a clinic day, jobs. Each sends the same again until it is acknowledged.
 
     Args:
-        token: of somebody who may write all of it.
+        token: of a user who may write all of it.
         pause_s: between two writes of a thread.
     """
 
@@ -150,7 +150,7 @@ class Writers:
         try:
             with client(self._installed, self._token) as caller:
                 while not self._no_more.is_set():
-                    # to one web after the other, as whatever stands before several of them does
+                    # to one web after the other, as a proxy before several of them does
                     caller.base_url = f"{random.choice(self._installed.bases)}/api/v1"
                     work(caller)
                     self._no_more.wait(self._pause_s)

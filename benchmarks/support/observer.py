@@ -26,13 +26,13 @@ from ml.population.virtual.world import DataDesign, DataSession, visit_plan
 Floats = NDArray[np.float64]
 
 KEYS = 1 << 30
-"""First key of the random streams of patients that stand beside a world's own."""
+"""First key of the random streams of patients besides a world's own."""
 DATA_SESSIONS, CALIBRATION = 1 << 40, 1 << 42
 """Session numbers of the data, as the world's own; of the sessions that a threshold is taken from."""
 CALIBRATION_DAYS = 10
 
 BINS = 12
-"""Random sessions are told apart by mean amplitude into so many bins at most."""
+"""Random sessions are distinguished by mean amplitude into so many bins at most."""
 LAGS = (0, 1, 3, 10, 30)
 """Steps after a change of amplitude at which beta is looked at."""
 LARGEST = 4.0
@@ -175,7 +175,7 @@ class Observed:
     """Predictions of an observer with so many visits, of a world and of others of its kind.
 
     Attributes:
-        said: of the world itself, [C]. others: of patients that it did not learn from, [T, C].
+        `said`: of the world itself, [C]. others: of patients that it did not learn from, [T, C].
         error: standard deviation of what is left open about a return, by candidate, less the scatter of simulated returns, [C].
     """
 
@@ -191,7 +191,7 @@ def observe(
 
     Args:
         w: the world. design, visits: of its data, 0 for none. learnt: patients of its kind, N. targets: their simulated returns, [N, C].
-        scatter: error variance of these, on average, [C]. others: patients to be judged beside w.
+        scatter: error variance of these, on average, [C]. others: patients to be judged besides w.
     """
     if visits == 0:
         mean = targets.mean(0)

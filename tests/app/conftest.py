@@ -34,7 +34,7 @@ Upload = Callable[..., int]
 
 
 def table(amplitude: NDArray[np.float64], rng: np.random.Generator, lead: int = 10) -> str:
-    """A CSV of one session: `lead` rows before its start, then one row per amplitude."""
+    """Write a CSV of one session: `lead` rows before its start, then one row per amplitude."""
     driven = np.concatenate([np.full(lead, amplitude[0]), amplitude])
     beta, level = np.empty(driven.size), 1.2
     for i, a in enumerate(driven):
@@ -94,12 +94,12 @@ def beginnings() -> dict[str, Beginning]:
 
 @pytest.fixture
 def rng() -> np.random.Generator:
-    """What uploads draw from."""
+    """Generator that uploads draw from."""
     return np.random.default_rng(20)
 
 
 def _written() -> list[tuple[str, str]]:
-    """Every change of the database in use so far."""
+    """List every change of the database in use so far."""
     with new_session() as db:
         return [(entity, action) for entity, action in db.execute(text("select entity, action from audit_event order by id"))]
 
@@ -112,9 +112,9 @@ def begin_with(
     beginnings: dict[str, Beginning],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Callable[[str, Callable[[], Any]], Any]:
-    """Make a study, or copy the one that an earlier test of this process made under the same name: a tenth of the time.
+    """Function that makes a study, or copies the one that an earlier test of this process made under the same name in a tenth of the time.
 
-    What a test writes before it would be lost by the copy, or kept for every later test, so it is refused.
+    What a test writes before it would be lost by the copy, or kept for every later test, so that it is refused.
     """
 
     def begin(name: str, make: Callable[[], Any]) -> Any:
@@ -146,7 +146,7 @@ def begin_with(
 
 @pytest.fixture
 def upload(client: TestClient, participant_code: str, rng: np.random.Generator) -> Upload:
-    """Upload a session of P1 and enter its QoCs; returns its id."""
+    """Function that uploads a session of P1, enters its QoCs and returns its id."""
 
     def send(
         controller: str = "random",
@@ -213,7 +213,7 @@ def ended(client: TestClient) -> Callable[[str, float], dict[str, Any]]:
 
 @pytest.fixture
 def statements() -> Iterator[list[str]]:
-    """What the service asks the database."""
+    """Queries of the service to the database."""
     asked: list[str] = []
 
     def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:

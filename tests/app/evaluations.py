@@ -44,7 +44,9 @@ def estimate(method: str, value: float, *, supported: bool = True, spread: float
 
 
 def judged(value: float, **changed: Any) -> dict[str, Any]:
-    """A posterior estimate whose verdict is known: worth a test, but for what `changed` (`tests/ml/ope/posterior/draws.py`) says."""
+    """Build a posterior estimate whose verdict is known: worth a test, but for what `changed` (`tests/ml/ope/posterior/draws.py`)
+    states.
+    """
     return replace(constructed(value=value, **changed), step_return=value - 80, end_reward=80.0).to_json()
 
 
@@ -64,7 +66,7 @@ def policies(client: TestClient, upload: Upload, begin_with: Callable[[str, Call
 
 @pytest.fixture
 def judge(db: Session, policies: list[int], monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """Store an evaluation with the posterior of policies by id and that of cDBS; chances are the shares of their constructed draws."""
+    """Function that stores an evaluation with the posterior of policies by id and that of cDBS; chances are the shares of their draws."""
     monkeypatch.setattr(verdict, "CALIBRATION", ((0.0, 0.0), (1.0, 1.0)))
 
     def store(
@@ -100,7 +102,7 @@ def judge(db: Session, policies: list[int], monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.fixture
 def evaluate(db: Session, policies: list[int]) -> Callable[..., int]:
-    """Store an evaluation; `dlsm` values by policy, further methods by name."""
+    """Function that stores an evaluation; `dlsm` values by policy, further methods by name."""
 
     def store(dlsm: dict[int, dict[str, Any]], baselines: dict[float, float] | None = None, **others: dict[str, Any]) -> int:
         db.rollback()
@@ -133,14 +135,14 @@ SPREAD = {"energy": 0.02, "grasp_hz": 0.05, "rating": 0.3, "tremor_percent": 2.0
 
 
 def made_elsewhere(client: TestClient, doses: Mapping[str, float]) -> list[int]:
-    """Ids of policies of P1 that hold a dose, fraction of cDBS, by name."""
+    """Upload policies of P1 with constant doses, fractions of cDBS, by name; return their ids."""
     files = [(name, {"file": (f"{name}.onnx", constant_onnx(dose, 10))}) for name, dose in doses.items()]
     answers = [client.post("/api/v1/participants/P1/policies", data={"name": name}, files=file) for name, file in files]
     return [int(answer.json()["id"]) for answer in answers]
 
 
 def predicted(dose: float, rng: np.random.Generator, nearly_off: float | None = None, **middles: float) -> dict[str, Any]:
-    """What is predicted of a policy of some mean dose, and what it does; `middles` replaces outcomes."""
+    """Build what is predicted of a policy of some mean dose, and what it does; `middles` replaces outcomes."""
     middle = {"energy": dose**2, "grasp_hz": 2.4 - 0.9 * (1 - dose) ** 2, "rating": 7.2 - 2 * (1 - dose) ** 2}
     middle |= {"tremor_percent": 8 + 60 * (1 - dose) ** 2} | middles
     off = float(dose < 0.2) if nearly_off is None else nearly_off
@@ -151,7 +153,7 @@ def predicted(dose: float, rng: np.random.Generator, nearly_off: float | None = 
 
 
 def behaviour(doses: Mapping[int, float]) -> dict[str, Any]:
-    """What an evaluation stores of policies that go up with beta around their dose, over a cloud of recorded sessions."""
+    """Build what an evaluation stores of policies that go up with beta around their dose, over a cloud of recorded sessions."""
     centre = [1.0 + 0.1 * k for k in range(COLUMNS)]
     tried = tuple(tuple(int(30 * (row % 4 == 0 and row > 6) / (1 + k)) for row in range(DOSES)) for k in range(COLUMNS))
     curves = {str(i): [float(np.clip(d + 0.1 * (b - 2.0), 0, 1)) for b in centre] for i, d in doses.items()}

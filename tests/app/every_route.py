@@ -50,13 +50,13 @@ METHODS = ("get", "post", "put", "patch", "delete")
 
 
 def routes(app: Any) -> list[tuple[str, str]]:
-    """(method, path) of every route of the REST interface, as the service has them, but its own description."""
+    """List (method, path) of every route of the REST interface, as the service has them, but its own description."""
     found = [(m.lower(), c.path) for c in iter_route_contexts(app.routes) if c.path for m in sorted(getattr(c, "methods", None) or ())]
     return [(m, p) for m, p in found if m in METHODS and p.startswith(("/api/", "/healthz", "/readyz")) and p != DESCRIPTION]
 
 
 def token_of(role: str, study: str | None = None, name: str | None = None) -> str:
-    """A new person with a role, and their token."""
+    """Create a person with a role, and return their token."""
     address = f"{name or role}@{study or 'clinic'}.example"
     with transaction("test") as db:
         accounts.add_user(db, address, Role(role), PASSWORD, study_code=study)
@@ -87,7 +87,7 @@ class World:
         ranking = self.read("/participants/P2/ranking")
         open_visit = next(v["id"] for v in self.read("/participants/P2/visits")["items"] if v["number"] == 4)
         first = {"policy_ids": [ranking["policies"][0]["policy_id"]], "seed": 1}
-        # by somebody who signs no plan of these tests
+        # by a user who signs no plan of these tests
         assert self.calling(token_of("engineer", name="drafter")).post(f"/api/v1/visits/{open_visit}/plan", json=first).status_code == 201
         held = self.send("/participants/P2/visits", json={"number": 88, "date": f"{datetime.now(UTC):%Y-%m-%d}"})["id"]
         drafter = self.calling(token_of("engineer", name="second-drafter"))
@@ -238,17 +238,17 @@ class World:
         }
 
     def calling(self, token: str | None) -> TestClient:
-        """A client with a token."""
+        """Return a client with a token."""
         return TestClient(self.app, headers={"Authorization": f"Bearer {token}"} if token else {})
 
     def read(self, path: str) -> Any:
-        """What a GET gives."""
+        """Return the answer to a GET."""
         answer = self.admin.get(f"/api/v1{path}")
         assert answer.status_code == 200, answer.text
         return answer.json()
 
     def send(self, path: str, method: str = "post", **form: Any) -> Any:
-        """What a call that must succeed gives."""
+        """Return the answer to a call that must succeed."""
         answer = self.admin.request(method, f"/api/v1{path}", **form)
         assert answer.is_success, answer.text
         return answer.json() if "json" in answer.headers["content-type"] else answer.content
@@ -265,22 +265,22 @@ class World:
         return {"data": {"target": "TFLite"}, "files": {"file": ("answers.csv", port_answers(answer.content, 0.25))}}
 
     def replayed(self, policy: int) -> Json:
-        """A session of P1 and a policy to run over it."""
+        """Return a session of P1 and a policy to run over it."""
         visit = self.read("/participants/P1/visits")["items"][0]["id"]
         return {"session": self.read(f"/visits/{visit}/sessions")["items"][0]["id"], "policy": policy}
 
     def question(self) -> Json:
-        """A data query about a session of P1."""
+        """Build a data query about a session of P1."""
         visit = self.read("/participants/P1/visits")["items"][0]["id"]
         session = self.read(f"/visits/{visit}/sessions")["items"][0]["id"]
         return {"session_id": session, "field": "rating", "text": "7 in the file, 8 on the form?"}
 
     def event(self) -> int:
-        """A serious adverse event of its own for one route."""
+        """Add a serious adverse event of its own for one route."""
         return int(self.send("/participants/P1/adverse-events", json=SPEECH)["id"])
 
     def proposal(self, **change: Any) -> Json:
-        """A proposal of its own for one route."""
+        """Add a proposal of its own for one route."""
         self.made += 1
         body = self.upload(f"p{self.made}.csv", TABLE.replace(b"2,1,1", b"2,1.%d,1" % self.made, 1), visit="3")
         (proposal,) = body["proposals"]
@@ -295,13 +295,13 @@ class World:
         return {"session_id": proposal["session"]["id"], "json": choice}
 
     def proposal_of_another_day(self) -> Json:
-        """A proposal on whose day there is no visit, for the route that adds one."""
+        """Add a proposal on whose day there is no visit, for the route that adds one."""
         body = self.upload("day.csv", TABLE.replace(b"2,1,1", b"2,1.99,1", 1), visit="", started_at="2025-07-01T09:00:00Z")
         (proposal,) = body["proposals"]
         return {"session_id": proposal["session"]["id"], "json": {"version": proposal["version"]}}
 
     def unreadable(self, content: bytes, reviewed: bool = False) -> int:
-        """A file in quarantine of its own for one route."""
+        """Add a file in quarantine of its own for one route."""
         body = self.upload(
             "t.csv", TABLE.replace(b"4,1,1", b"4,%d,1" % len(content), 1), more=[("noise.bin", b"\x00\x01" + content)], visit="3"
         )
@@ -311,18 +311,18 @@ class World:
         return number
 
     def unknown_columns(self, name: str) -> int:
-        """A table that waits for a column mapping, of its own for one route."""
+        """Add a table that waits for a column mapping, of its own for one route."""
         table = f"{name};signal;current\n" + "".join(f"{2 * k};{k / 7:.2f};1.5\n" for k in range(1, 12))
         body = self.upload("t.csv", TABLE.replace(b"4,1,1", b"4,7.%d,1" % ord(name), 1), more=[("u.csv", table.encode())], visit="3")
         return next(int(f["id"]) for f in body["files"] if f["waits_for_mapping"])
 
     def ids_of(self, method: str, path: str) -> Json:
-        """What stands in the path of a route, by name: rows that the route can work on."""
+        """Return the path members of a route by name: rows that the route can work on."""
         form = self.forms.get((method, path.removeprefix("/api/v1")), {})
         return self.ids | {name: value for name, value in form.items() if name in self.ids or name in OWN}
 
     def call(self, client: TestClient, method: str, path: str) -> int:
-        """Status of a call that is right in everything but, perhaps, who makes it."""
+        """Return the status of a call that is right in everything but, perhaps, who makes it."""
         form = dict(self.forms.get((method, path.removeprefix("/api/v1")), {}))
         ids = self.ids_of(method, path)
         form = {name: value for name, value in form.items() if name not in ids}

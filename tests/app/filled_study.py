@@ -1,4 +1,4 @@
-"""A study in use, made by the present version: four participants with sessions, two rankings, a tested policy, a cancelled job.
+"""A study in use, made by the present version: four participants, sessions, two rankings, a tested policy, a cancelled job.
 
 Jobs run their real steps in the process of the tests, with few updates: starting a child for each step would take most of the time.
 """
@@ -99,7 +99,7 @@ class FilledStudy:
                 self._upload(code, number, ordinal, controller, next(designed) if controller == "random" else None)
 
     def _begins(self, visit: int, ordinal: int = 0) -> datetime:
-        """Start of a session: visits are four weeks apart, the fourth in two weeks; sessions twenty minutes."""
+        """Return the start of a session: visits are four weeks apart, the fourth in two weeks; sessions twenty minutes."""
         today = datetime.now(UTC).replace(hour=9, minute=5, second=0, microsecond=0)
         return today + timedelta(days=14 - 28 * (4 - visit), minutes=20 * ordinal)
 

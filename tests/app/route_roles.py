@@ -1,4 +1,4 @@
-"""Who may call each route of the REST interface: the permission that it needs, and what is open to a blinded assessor."""
+"""Permission that each route of the REST interface needs, and what is open to a blinded assessor."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ BLINDED = {
 
 
 def may_call(role: Role, method: str, path: str, scope: Scope | None = Scope.FULL) -> bool:
-    """Whether a route answers to a role: to a token of it with a scope, or (None) to a browser that has signed in."""
+    """Check whether a route answers to a role: to a token of it with a scope, or (None) to a browser that has signed in."""
     if scope is None:
         scope = Scope.FULL
     elif (method, path) in BROWSER:

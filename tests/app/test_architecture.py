@@ -16,12 +16,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def sources(*folders: str) -> dict[str, str]:
-    """Source files by path relative to the root."""
+    """Read source files by path relative to the root."""
     return {str(p.relative_to(ROOT)): p.read_text() for folder in folders for p in sorted((ROOT / folder).rglob("*.py"))}
 
 
 def repository_files() -> Iterator[Path]:
-    """Every file of the repository, relative to its root, without what git ignores."""
+    """Yield every file of the repository, relative to its root, without what git ignores."""
     ignored = {".git", *(ROOT / ".gitignore").read_text().replace("/\n", "\n").split()}
     for folder, below, names in os.walk(ROOT):
         below[:] = [name for name in below if not any(fnmatch(name, pattern) for pattern in ignored)]
@@ -33,7 +33,7 @@ ARM_IN_SQL = re.compile(r"\b(controller|policy_id)\b|\bselect\s+(\w+\.)?\*", re.
 
 
 def texts(tree: ast.AST) -> Iterator[str]:
-    """Every string of a file; one that is put together of pieces, over however many lines, is one text."""
+    """Yield every string of a file; one that is put together of pieces, over however many lines, is one text."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.value
@@ -44,7 +44,7 @@ def texts(tree: ast.AST) -> Iterator[str]:
 
 
 def reads_the_arm(source: str) -> bool:
-    """Whether code reads which controller or policy a session had: by attribute, by name, by column, or by SQL."""
+    """Check whether code reads which controller or policy a session had: by attribute, by name, by column, or by SQL."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and node.attr in ("_controller", "_policy_id"):
@@ -132,7 +132,7 @@ QUERY_METHODS = {"execute", "scalar", "scalars", "query"}
 
 
 def calls(text: str) -> set[tuple[bool, str]]:
-    """Every call in a source text: whether it is a method's, and its name."""
+    """List every call in a source text: whether it is a method's, and its name."""
     functions = [node.func for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)]
     named = {(False, f.id) for f in functions if isinstance(f, ast.Name)}
     return named | {(True, f.attr) for f in functions if isinstance(f, ast.Attribute)}
@@ -205,7 +205,7 @@ def test_the_session_commits_and_nothing_else_but_what_must_in_the_middle() -> N
         "app/ingest/uploads/service.py",
         "app/ingest/uploads/in_progress.py",  # a count is taken back after its transaction was
         "app/ingest/quarantine/service.py",  # bytes are erased only after the decision is safe
-        "app/accounts/sign_on.py",  # a refusal stands in the trail whatever becomes of the request
+        "app/accounts/sign_on.py",  # a refusal is in the trail whatever becomes of the request
         # a failed sign-in counts whatever becomes of the request; so does when a session or token was last used
         "app/accounts/service.py",
         "app/overview/commands.py",  # an export is in the trail before its first row is written, whatever becomes of the rest
@@ -256,7 +256,7 @@ def test_every_local_link_in_a_template_leads_to_a_page() -> None:
 
 
 def page_paths() -> set[str]:
-    """Paths of every page and of every route of the interface."""
+    """List paths of every page and of every route of the interface."""
     from fastapi.routing import iter_route_contexts
 
     from app.main import API_ROUTERS, PAGE_ROUTERS, router_of

@@ -41,7 +41,7 @@ Betaloop = Callable[..., "Ended"]
 
 
 class Ended(NamedTuple):
-    """How a command ended, and what it said."""
+    """End of a command: its exit code and output."""
 
     returncode: int
     stdout: str
@@ -50,7 +50,9 @@ class Ended(NamedTuple):
 
 @pytest.fixture
 def betaloop(monkeypatch: pytest.MonkeyPatch) -> Iterator[Betaloop]:
-    """Run the command in this process, from its arguments to its exit code: to start an interpreter for each takes seconds."""
+    """Function that runs the command in this process, from its arguments to its exit code: to start an interpreter for each takes
+    seconds.
+    """
     logs, signals = structlog.get_config(), {n: signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGHUP)}
     monkeypatch.setenv("COLUMNS", "200")
 

@@ -20,7 +20,7 @@ EXAMPLES = 10
 
 
 def operations(world: World) -> list[Any]:
-    """Those that read before those that change: what these leave behind is then the same in every run."""
+    """Sort operations: those that read before those that change; what these leave behind is then the same in every run."""
     # the event stream of a job has no end of its own
     schema = schemathesis.openapi.from_asgi("/api/v1/openapi.json", world.app, headers=dict(world.admin.headers)).exclude(
         path_regex="events$"
@@ -29,7 +29,7 @@ def operations(world: World) -> list[Any]:
 
 
 def order(operation: Any) -> tuple[bool, bool]:
-    """Changes after what reads, and after them the end of studies and sites, and their opening again."""
+    """Place changes after what reads, and after them the end of studies and sites, and their opening again."""
     return operation.method.lower() != "get", operation.path.endswith(("/end", "/reopen"))
 
 
@@ -54,7 +54,7 @@ def conforms(world: World, operation: Any, examples: int, number: int) -> list[i
 
 
 def round_of(world: World, examples: int, number: int) -> list[int]:
-    """Every operation once; the statuses of all answers. Raises AssertionError with every fault, not the first one alone."""
+    """Run every operation once; return the statuses of all answers. Raises AssertionError with every fault, not only the first."""
     faults, answered = [], []
     for operation in operations(world):
         try:

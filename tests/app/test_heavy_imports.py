@@ -1,4 +1,4 @@
-"""What starts without the learners: compute modules are named by strings, and `scipy` loads its parts where they are first used."""
+"""Start without the learners: compute modules are named by strings, and `scipy` loads its parts where they are first used."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def loaded(code: str) -> set[str]:
-    """Names of the modules that a fresh interpreter has loaded after some code."""
+    """List the modules that a fresh interpreter has loaded after some code."""
     script = f"{code}\nimport sys\nprint(' '.join(sorted(sys.modules)))"
     return set(subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split())
 

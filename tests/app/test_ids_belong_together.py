@@ -49,7 +49,7 @@ Ids = dict[str, Any]
 
 
 def routes_with_two_ids(app: Any) -> set[tuple[str, str]]:
-    """(method, path) of every page and route whose path names two objects; `key` is a word, `position` a place in a plan."""
+    """List (method, path) of every page and route whose path names two objects; `key` is a word, `position` a place in a plan."""
     found = set()
     for context in iter_route_contexts(app.routes):
         if context.path and context.path.replace("{key}", "").replace("{position}", "").count("{") >= 2:
@@ -58,7 +58,7 @@ def routes_with_two_ids(app: Any) -> set[tuple[str, str]]:
 
 
 def study_world(client: TestClient, code: str, seed: int, sign_plan: Callable[..., Any]) -> Ids:
-    """A participant with one object of every sort; their ids."""
+    """Build a participant with one object of every sort; return their ids."""
     api, home = "/api/v1", f"/api/v1/participants/{code}"
     settings = {"xi_beta": 1.0, "cdbs_amplitude_ma": 3.0, "beta_unit": "uV", "beta_source": "table"}
     assert client.post(f"{api}/participants", json={"code": code, "site": "main", "settings": settings}).status_code == 201
@@ -114,7 +114,7 @@ def _grasps(seed: int) -> str:
 
 @pytest.fixture
 def clinician(client_as: Callable[[str], TestClient]) -> TestClient:
-    """Somebody who brought no policy from elsewhere."""
+    """A user who brought no policy from elsewhere."""
     return client_as("clinician")
 
 
@@ -126,7 +126,7 @@ def both(client: TestClient, clinician: TestClient, sign_plan: Callable[..., Any
 def test_every_route_with_two_ids_refuses_another_participants(
     service_app: Any, client: TestClient, clinician: TestClient, both: tuple[Ids, Ids], db: Session
 ) -> None:
-    others = {RELEASE: clinician}  # nobody releases what they brought from elsewhere themselves
+    others = {RELEASE: clinician}  # no user releases what they brought from elsewhere themselves
     signed_in = TestClient(service_app, base_url="http://testserver")
     assert signed_in.post("/sign-in", data={"email": "admin@clinic.example", "password": PASSWORD}).status_code == 200
     others |= {path: signed_in for _, path in PAIRS if path.startswith("/studies/")}  # forms that no token sends
@@ -153,7 +153,7 @@ def _written(db: Session) -> Any:
 
 
 def test_the_services_refuse_what_does_not_belong_together(both: tuple[Ids, Ids], db: Session) -> None:
-    """The check is the service's: whoever calls it, from wherever, is refused."""
+    """The check is the service's: every caller is refused."""
     participant, policy = participant_by_code(db, "P2", SYSTEM), db.get_one(Policy, both[0]["policy_id"])
     job = db.get_one(Job, both[0]["job_id"])
     for call in (
@@ -174,7 +174,7 @@ def test_a_bundle_holds_the_approvals_of_its_own_participant_alone(both: tuple[I
 
 
 def _bodies(own: Ids, other: Ids) -> list[tuple[str, str, dict[str, Any]]]:
-    """Calls on objects of `own` whose bodies name an object of `other`."""
+    """List calls on objects of `own` whose bodies name an object of `other`."""
     api, page, policy = "/api/v1", f"/participants/{own['code']}", other["policy_id"]
     plan, session, proposal = f"/visits/{own['open_visit']}/plan", f"/sessions/{own['session_id']}", f"/proposals/{own['proposal']}"
     grasps, theirs = f"/uploaded-files/{own['file_id']}/session", other["proposal"]
@@ -216,7 +216,7 @@ def test_ids_in_bodies_of_another_participants_objects_are_refused(client: TestC
 
 
 def test_the_same_bodies_with_own_objects_are_taken(client: TestClient, both: tuple[Ids, Ids]) -> None:
-    """So that the test above cannot pass by calls that nobody could make."""
+    """So that the test above cannot pass by impossible calls."""
     own = both[0]
     policy = own["policy_id"]
     api = "/api/v1"

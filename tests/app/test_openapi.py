@@ -14,7 +14,7 @@ RECORDED = Path(__file__).resolve().parents[1] / "data" / "openapi.json"
 
 
 def differences(recorded: Any, served: Any, place: tuple[str, ...] = ()) -> Iterator[str]:
-    """Places at which two JSON documents differ, and how."""
+    """Yield the places at which two JSON documents differ, and how."""
     if isinstance(recorded, dict) and isinstance(served, dict):
         for key in sorted(recorded.keys() | served.keys()):
             if key not in served:
@@ -59,7 +59,7 @@ def test_a_difference_of_each_kind_is_seen_at_its_place() -> None:
 
 
 def schemas(part: Any, place: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every schema of an OpenAPI document, and every schema inside one, with its place."""
+    """Yield every schema of an OpenAPI document, and every schema inside one, with its place."""
     if isinstance(part, list):
         for i, one in enumerate(part):
             yield from schemas(one, f"{place} > {i}")

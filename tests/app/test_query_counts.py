@@ -34,7 +34,7 @@ PAGES = (
 
 @pytest.fixture
 def queries(client: TestClient) -> Iterator[Callable[[str], int]]:
-    """How many queries a page asks once it has been seen."""
+    """Function that counts the queries of a page once it has been seen."""
     asked: list[str] = []
 
     def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:

@@ -18,7 +18,7 @@ from tests.app.route_roles import BROWSER, may_call
 
 
 def success(app: Any, method: str, path: str) -> int:
-    """The status that a route's description promises where all is right."""
+    """Return the status that a route's description promises where all is right."""
     return min(int(status) for status in app.openapi()["paths"][path][method]["responses"])
 
 
@@ -30,7 +30,7 @@ def test_without_a_token_no_route_answers(world: World) -> None:
 
 @pytest.mark.parametrize("role", list(Role))
 def test_every_route_against_every_role(world: World, role: Role) -> None:
-    """Who may call a route gets what it promises; who may not is refused, with rows that exist in both cases."""
+    """Roles with access to a route get what it promises; all others are refused, with rows that exist in both cases."""
     caller = world.admin if role is Role.ADMIN else world.calling(token_of(role))
     assert wrong_answers(world, caller, role, Scope.FULL) == {}
 
@@ -59,7 +59,7 @@ def test_what_no_token_may_is_open_to_who_has_signed_in(world: World, role: Role
 def wrong_answers(
     world: World, caller: TestClient, role: Role, scope: Scope | None, only: list[tuple[str, str]] | None = None
 ) -> dict[tuple[str, str], str]:
-    """Routes that answer otherwise than the table says, each with its answer and the right one."""
+    """List routes that answer otherwise than the table says, each with its answer and the right one."""
     found = {}
     for method, path in only or routes(world.app):
         right = success(world.app, method, path) if may_call(role, method, path, scope) else 403
@@ -92,7 +92,7 @@ def test_a_caller_of_another_study_sees_nothing(world: World) -> None:
 
 
 ANSWER_S = 120.0
-"""For so long a call may take: a machine with much else to do is slow and not at fault, and ten seconds were not enough for one."""
+"""Longest time of a call: a machine with much else to do is slow and not at fault, and ten seconds were too few."""
 
 CHECKS = (
     schemathesis.checks.not_a_server_error,

@@ -1,4 +1,4 @@
-"""What a page says before anything is unfolded, its figures and scripts included, and the words of methods that it does without there."""
+"""Words of a page before anything is unfolded, figures and scripts included, and the words of methods that must not be there."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LITERAL = re.compile(
     r"""("(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|`(?:\\.|[^`\\])*`)""",
     re.S,
 )
-"""Comments and patterns of a script, which nobody reads, or (the group) a literal."""
+"""Comments and patterns of a script, which no user reads, or (the group) a literal."""
 
 
 def flat(page: str) -> str:
@@ -56,14 +56,14 @@ class _Reader(HTMLParser):
 
 
 def above_fold(page: str) -> str:
-    """The words of a page's HTML that no fold hides."""
+    """Return the words of a page's HTML that no fold hides."""
     reader = _Reader()
     reader.feed(page)
     return " ".join(" ".join(reader.words).split())
 
 
 def drawn_above_fold(page: str, fetch: Callable[[str], str]) -> str:
-    """The words of the figures that no fold hides; `fetch` gives the figure of an address, for those that do not travel with the page."""
+    """Return the words of the figures that no fold hides; `fetch` gives the figure of an address, for those not in the page."""
     reader = _Reader()
     reader.feed(page)
     figures = [json.loads(fetch(held) if held.startswith("/") else held) for held in reader.figures if held.strip()]
@@ -71,7 +71,7 @@ def drawn_above_fold(page: str, fetch: Callable[[str], str]) -> str:
 
 
 def drawn(figure: Any, shown: bool = False) -> Iterator[str]:
-    """The strings of a figure that somebody reads."""
+    """Yield the strings of a figure that users read."""
     if isinstance(figure, str):
         if shown:
             yield re.sub(r"%\{[^}]*\}", "", figure)
@@ -84,14 +84,14 @@ def drawn(figure: Any, shown: bool = False) -> Iterator[str]:
 
 
 def said_by_script(script: str) -> list[str]:
-    """The literals of a script that may reach a reader: those with a space or a capital, less what code alone is made of."""
+    """List the literals of a script that may reach a reader: those with a space or a capital, less what code alone is made of."""
     literals = [m[1][1:-1] for m in _LITERAL.finditer(script) if m[1]]
     texts = [re.sub(r"\$\{[^}]*\}", " ", text) for text in literals]
     return [text for text in texts if re.search(r"[A-Z ]", text)]
 
 
 def miscounted(words: str) -> list[str]:
-    """Where some words speak of one minutes, or of one of any other thing of which there are counts."""
+    """List where some words have the plural after 1, of minutes or of any other thing of which there are counts."""
     return re.findall(rf"(?<![\d.,:/@\u202f-])\b1 (?:more |planned |further )?(?:{'|'.join(_COUNTED)})\b", words)
 
 
@@ -102,5 +102,5 @@ _COUNTED = (
 
 
 def methods_named(words: str) -> list[str]:
-    """The banned words among some words, whatever their capitals."""
+    """List the banned words among some words, whatever their capitals."""
     return [word for word in BANNED if word.lower() in words.lower()]

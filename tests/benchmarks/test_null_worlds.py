@@ -1,4 +1,4 @@
-"""How null studies are drawn: which null is one in every metric, and what a saturating metric shows where it is none."""
+"""Null studies: which null is one in every metric, and what a saturating metric shows where it is none."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ def worlds(monkeypatch):
 
 
 def tremor_at(spread):
-    """Expected tremor (%) of sessions whose latent value is normal with that standard deviation, by Gauss-Hermite quadrature."""
+    """Compute the expected tremor (%) of sessions whose latent value is normal with that standard deviation, by Gauss-Hermite
+    quadrature.
+    """
     nodes, weights = np.polynomial.hermite_e.hermegauss(40)
     return 100 * float(weights @ expit(0.8 * spread * nodes - 1.5)) / float(weights.sum())
 

@@ -15,7 +15,7 @@ SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "pages.py"
 
 
 def measured() -> dict[str, str]:
-    """Addresses that the script asks for, by what it calls them."""
+    """Return the addresses that the script requests, by their names there."""
     tree = ast.parse(SCRIPT.read_text())
     (pages,) = [n.value for n in tree.body if isinstance(n, ast.Assign) and getattr(n.targets[0], "id", "") == "PAGES"]
     found: dict[str, str] = ast.literal_eval(pages)

@@ -1,5 +1,6 @@
-"""What `make bench` runs: every file in `benchmarks/` and `benchmarks/evaluation/` is a script that knows `--quick`; what scripts share
-lies in `benchmarks/support` and `benchmarks/installed`."""
+"""Scripts of `make bench`: every file in `benchmarks/` and `benchmarks/evaluation/` knows `--quick`; shared code is in `benchmarks/support`
+and `benchmarks/installed`.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ SCRIPTS = sorted([*(ROOT / "benchmarks").glob("*.py"), *(ROOT / "benchmarks" / "
 
 
 def options(source: str) -> set[str]:
-    """Options that a script's parser is given."""
+    """List the options of a script's parser."""
     calls = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Call) and isinstance(n.func, ast.Attribute)]
     return {str(a.value) for c in calls if c.func.attr == "add_argument" for a in c.args if isinstance(a, ast.Constant)}
 
@@ -38,7 +39,7 @@ def test_what_scripts_share_is_no_script() -> None:
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.name)
 def test_a_script_imports_only_what_is_there_when_it_is_called(script: Path) -> None:
-    """A script finds `support` and `installed` beside it; one of `benchmarks.evaluation`, called from the root, finds `benchmarks`."""
+    """A script finds `support` and `installed` next to it; one of `benchmarks.evaluation`, called from the root, finds `benchmarks`."""
     tree = ast.parse(script.read_text())
     modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
     shared = {m for m in modules if m.split(".")[0] in ("support", "installed", "benchmarks")}
@@ -48,7 +49,7 @@ def test_a_script_imports_only_what_is_there_when_it_is_called(script: Path) -> 
 
 
 def is_there(module: str, name: str) -> bool:
-    """Whether `from module import name` finds something."""
+    """Check whether `from module import name` finds something."""
     found = importlib.import_module(module)
     return hasattr(found, name) or (hasattr(found, "__path__") and find_spec(f"{module}.{name}") is not None)
 

@@ -68,7 +68,7 @@ def test_a_server_error_but_503_and_507_fails_a_run(
 
 
 def test_a_request_for_a_job_that_is_on_its_way_is_answered_before_no_more_are_begun(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What begins after the last jobs were counted would be running when the installation is stopped, and look lost."""
+    """Requests that begin after the last jobs were counted would run when the installation is stopped, and look lost."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     writers = importlib.import_module("installed.writers")
     callers = writers.Writers(Installed(), "a token", writers.Study(1, 1, 1, 1))
@@ -127,7 +127,7 @@ KEPT = ("BETALOOP_SERVER_USER", "BETALOOP_JOB_NICENESS")
 
 
 def ran(script: str, *arguments: str) -> dict[str, Any]:
-    """The figures of a run that found nothing wrong."""
+    """Run a script that must find nothing wrong; return its figures."""
     env = {k: v for k, v in os.environ.items() if not k.startswith("BETALOOP_") or k in KEPT} | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, *script.split(), *arguments], cwd=ROOT, env=env, capture_output=True, text=True, timeout=500, check=False

@@ -20,7 +20,7 @@ from fastapi.testclient import TestClient
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 PASSWORD = "correct horse battery"
 PATIENCE_MS = 120_000
-"""How long a page may take to come, or a part of it: on a machine that is busy with other work, half a minute was too short."""
+"""Longest wait for a page, or a part of it: on a machine that is busy with other work, half a minute was too short."""
 DRAWN_FOR_PAPER = """() => [...document.querySelectorAll("figure[data-chart]")].every((figure) => figure.dataset.drawn === "failed"
   || (figure.dataset.drawn === "yes" && figure.querySelector(".plot").layout?.autosize === false))"""
 CLIPPED = """() => {
@@ -57,7 +57,7 @@ class Watched:
     foreign: list[str] = field(default_factory=list)
 
     def open(self, path: str) -> None:
-        """Go to a path of the service."""
+        """Open a path of the service."""
         answer = self.page.goto(self.address + path)
         assert answer.status == 200, f"{path}: {answer.status}"
 
@@ -91,7 +91,7 @@ class Watched:
         self.page.wait_for_function("() => ![...document.querySelectorAll('[data-late]')].some((e) => e.dataset.late === '')")
 
     def on_paper(self) -> list[str]:
-        """Have every chart drawn for paper, as before printing, which this browser must be told; what is wider than what it stands in."""
+        """Draw every chart for paper, as before printing, which this browser must be asked for; return what is wider than its container."""
         self.page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
         self.page.wait_for_function(DRAWN_FOR_PAPER)
         found: list[str] = self.page.evaluate(CLIPPED)
@@ -99,7 +99,7 @@ class Watched:
 
 
 def program() -> str:
-    """Path of Chromium. Skips where there is none."""
+    """Return the path of Chromium. Skips where there is none."""
     path = os.environ.get("BETALOOP_CHROMIUM") or next(filter(None, map(shutil.which, PROGRAMS)), None)
     if path is None:
         pytest.skip("no Chromium here: install it, or name its program in BETALOOP_CHROMIUM")
@@ -135,7 +135,7 @@ def chromium() -> Iterator[Any]:
 
 @contextmanager
 def serving(app: Any) -> Iterator[str]:
-    """Where a service answers that runs in a thread, on the database in use."""
+    """Serve an app in a thread, on the database in use; yield its address."""
     server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning"))
     thread = threading.Thread(target=server.run)
     thread.start()
@@ -172,7 +172,7 @@ def windows(chromium: Any, address: str) -> Iterator[Callable[..., Watched]]:
 
 @pytest.fixture
 def address(service_app) -> Iterator[str]:  # type: ignore[no-untyped-def]
-    """Where the service answers; it runs in a thread on the test's database."""
+    """Address of the service; it runs in a thread on the test's database."""
     with serving(service_app) as found:
         yield found
 

@@ -51,7 +51,7 @@ TOO_WIDE = """() => [document.documentElement].map((e) => e.scrollWidth - e.clie
 
 
 def once_drawn(watched: Watched) -> list[str]:
-    """What is too small, too faint or too wide, once the page has had time to be drawn: it may be in the middle of that after a tap."""
+    """List what is too small, too faint or too wide, once the page is drawn: it may still be drawing after a tap."""
     look = f"() => [{SMALL}, {FAINT}, {TOO_WIDE}].flatMap((found) => found())"
     if found := watched.page.evaluate(look):
         with suppress(NotInTime):
@@ -87,7 +87,7 @@ def wait_until_stored(watched: Watched, day: ClinicDay, entries: int) -> None:
 
 
 def worker_ready(watched: Watched) -> None:
-    """The page can be opened without network from now on."""
+    """Wait until the page can be opened without network."""
     watched.page.evaluate("() => navigator.serviceWorker.ready.then(() => true)")
     watched.page.wait_for_function("() => caches.match('/visit-day/shell').then(Boolean)")
 

@@ -61,9 +61,10 @@ SHIFTS = """() => new Promise((done) => {
   setTimeout(() => done(sum), 100);
 })"""
 MOST_SHIFT = 0.04
-"""Cumulative layout shift, until charts and late parts have come, up to which a page counts as steady: less than half of what is called
-good. On a busy machine a page comes in parts, and fields of a line find their widths when the last has come: up to 0.02, with a processor
-that is slowed down twelve times."""
+"""Cumulative layout shift, until charts and late parts have come, up to which a page counts as steady: less than half of the limit for
+good. On a busy machine a page comes in parts. Fields of a line find their widths when the last has come: up to 0.02, with a processor
+slowed down twelve times.
+"""
 INKS = """() => [...document.querySelectorAll("svg.drawing :is(text, path, line, circle, rect)")]
   .map((e) => `${e.tagName} ${getComputedStyle(e).fill} ${getComputedStyle(e).stroke}`)"""
 
@@ -166,7 +167,7 @@ def test_drawings_come_to_paper_in_the_light_colours(ranked: dict[str, int], win
 
 
 def looked_at(watched: Any, addresses: dict[str, str], for_the_tour: bool = False) -> list[str]:
-    """What axe-core and the eye for shifts find on pages; pictures of them where they are asked for."""
+    """List what axe-core and the eye for shifts find on pages; take pictures of them on request."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     pictures = os.environ.get("BETALOOP_TOUR") if for_the_tour else None
     watched.signed_in()

@@ -1,4 +1,4 @@
-"""What charts and late parts of pages do in a real Chromium: they come, move together, and lead where their words say."""
+"""Charts and late parts of pages in a real Chromium: they come, move together, and lead where their words say."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_raw_samples_are_drawn_and_every_chart_of_the_session_follows_a_zoom(win
     watched.charts_drawn()
     expect(watched.page.locator("#signal [data-signal-subtitle]")).to_contain_text("lowest and highest sample of every 32 ms")
     whole = watched.page.evaluate(RANGE, "control")
-    # from the beta above to the samples below, which are read anew, and back
+    # from the beta above to the samples below, which are read again, and back
     watched.page.evaluate(ZOOM, ["control", [0.1, 0.15]])
     watched.page.wait_for_function(f"({RANGE})('signal').join() === '0.1,0.15'")
     expect(watched.page.locator("#signal [data-signal-subtitle]")).to_contain_text("every sample")

@@ -1,4 +1,4 @@
-"""What was typed and not saved: back after a reload and an expired sign-in, gone once saved, never shown to another person."""
+"""Typed and unsaved text: back after a reload and an expired sign-in, gone once saved, never shown to another person."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def tab(window: Callable[..., Watched], study_world: list[int]) -> Watched:
 
 
 def session_of(client: TestClient) -> str:
-    """The page of a session that has no QoCs yet."""
+    """Return the page of a session that has no QoCs yet."""
     rows = "\n".join(["t_s,beta,amplitude_fraction", *(f"{2 * i},{1 + i % 4},0.5" for i in range(-9, 41))])
     data = {"participant": "P1", "visit": "1", "controller": "cdbs"}
     answer = client.post("/api/v1/uploads", data=data, files={"file": ("new.csv", rows.encode())})
@@ -87,7 +87,7 @@ def test_what_one_person_entered_is_never_saved_under_anothers_name(tab: Watched
     cookies = page.context.cookies()
     page.context.clear_cookies()
     second = page.context.new_page()
-    Watched(second, tab.address).sign_in(OTHER)  # somebody else, in another tab of the same browser
+    Watched(second, tab.address).sign_in(OTHER)  # another person, in another tab of the same browser
     page.click(SAVE)
     page.wait_for_selector("h1:text('Entered by somebody else')")
     assert "2.4" not in client.get(f"/api/v1{path}/qoc").text
@@ -197,5 +197,5 @@ def test_what_stood_beside_something_too_large_stands_in_the_form_again(tab: Wat
     page.go_back()
     page.wait_for_selector("[name=number]")
     assert (page.input_value("[name=number]"), page.input_value("[name=cdbs_left]")) == ("7", "2.5")
-    tab.open("/participants/P1/visits/new")  # also where the form is opened anew
+    tab.open("/participants/P1/visits/new")  # also where the form is opened again
     assert (page.input_value("[name=number]"), page.input_value("[name=cdbs_left]")) == ("7", "2.5")

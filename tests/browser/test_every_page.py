@@ -28,7 +28,7 @@ SEND = """([action, name, value]) => { const form = document.createElement('form
   const field = document.createElement('input'); field.name = name; field.value = value; form.append(field); document.body.append(form);
   form.submit(); }"""
 DRAWN = ("/visit-day/shell",)
-"""What nobody opens by its address: a tablet without network draws the clinic day into it."""
+"""Page that is not opened by its address: a tablet without network draws the clinic day into it."""
 SUBMIT = "main form[method=post] button.primary"
 
 
@@ -49,7 +49,7 @@ def axe() -> Any:
 
 
 def broken(axe: Any, watched: Watched, name: str) -> list[str]:
-    """What axe-core finds on the page that is shown, with its folds open, and whether it is wider than the window."""
+    """List what axe-core finds on the page that is shown, with its folds open, and whether it is wider than the window."""
     watched.page.evaluate(OPEN_FOLDS)
     watched.charts_drawn()
     watched.page.evaluate("() => scrollTo(0, 0)")
@@ -118,7 +118,7 @@ def test_on_paper_no_page_has_anything_cut_off(window: Callable[..., Watched], w
     watched = window(SHEET, 900, "light")
     watched.page.emulate_media(media="print")
     found, charts, there = [], 0, addresses(world)
-    # first what only somebody who is not signed in is shown
+    # first what is shown only without a sign-in
     for name in sorted(tour.PAGES, key=lambda route: route != "/sign-in"):
         watched.open(there[name])
         assert watched.page.url == watched.address + there[name]

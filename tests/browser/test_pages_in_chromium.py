@@ -135,7 +135,7 @@ def test_the_theme_is_chosen_kept_and_redraws_the_charts(window: Callable, study
 
 
 def test_paper_takes_every_chart_in_the_light_colours(window: Callable, study_world: list[int]) -> None:  # type: ignore[type-arg]
-    """Also charts that nobody scrolled to, and from a page in the dark theme."""
+    """Also charts outside the scrolled part, and from a page in the dark theme."""
     watched = window(1280, 400, "dark")
     watched.signed_in()
     watched.open(f"/sessions/{study_world[0]}")

@@ -1,4 +1,4 @@
-"""What a printed page must not lose: every file of a report, every row that a count includes, and where samples are."""
+"""Contents that a printed page must not lose: every file of a report, every row that a count includes, and where samples are."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.browser.test_accessibility import SHEET
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 SEEN = "() => document.querySelector('main').innerText"
-"""What stands on the page: nothing of a closed fold, nothing that a style hides."""
+"""Text of the page: nothing of a closed fold, nothing that a style hides."""
 UNCUT = "() => [...document.querySelectorAll('.file > summary > .line')].every((line) => line.scrollWidth <= line.clientWidth + 1)"
 
 

@@ -42,7 +42,7 @@ def promising(policies: list[int], judge: Judge) -> None:
 
 @pytest.fixture
 def undecided(policies: list[int], judge: Judge) -> None:
-    """None is worth a test: of four it cannot be told, the others act like cDBS, and nothing is dangerous."""
+    """None is worth a test: of four it is open, the others act like cDBS, and nothing is dangerous."""
     rng = np.random.default_rng(6)
     doses = dict(zip(policies, [d if k < 4 else 0.96 + 0.005 * k for k, d in enumerate(DOSES.values())], strict=True))
     posterior = {i: judged(50.0 * d, **predicted(d, rng, 0.0, **({} if d > 0.95 else {"tremor_percent": 17.2}))) for i, d in doses.items()}
@@ -50,7 +50,7 @@ def undecided(policies: list[int], judge: Judge) -> None:
 
 
 def answered(watched: Any) -> str:
-    """The answer's words, all of which are on the first screen."""
+    """Return the answer's words, all of which are on the first screen."""
     watched.signed_in()
     watched.open("/participants/P1/ranking")
     answer = watched.page.locator("#answer")

@@ -95,7 +95,7 @@ def test_a_killed_browser_sends_what_it_held_when_it_comes_back(chromium: Any, a
     wait_for(watched, 2, "offline")
     kill_browser(profile)
     context = chromium.browser_type.launch_persistent_context(profile, executable_path=program(), args=FLAGS)
-    context.clear_cookies()  # a browser writes them down half a minute late: whoever was signed in may have to do it again
+    context.clear_cookies()  # a browser writes them down half a minute late: the signed-in user may have to do it again
     watched = Watched(context.new_page(), address)
     watched.open(f"/visit-day/{clinic_day.visit}")
     fill(watched, "admin@clinic.example")
@@ -206,9 +206,9 @@ def test_a_tap_is_not_lost_when_something_arrives_under_the_finger(window: Calla
     tap(watched, "start")
     wait_until_stored(watched, clinic_day, 1)
     wait_for(watched, 0)
-    watched.page.locator("[data-act=stop]").hover()  # waits until the page is drawn, also when it is drawn anew meanwhile
+    watched.page.locator("[data-act=stop]").hover()  # waits until the page is drawn, also when it is drawn again meanwhile
     watched.page.mouse.down()
-    watched.page.evaluate("() => { dispatchEvent(new Event('online')); }")  # draws the page anew
+    watched.page.evaluate("() => { dispatchEvent(new Event('online')); }")  # draws the page again
     watched.page.wait_for_timeout(1500)
     assert stored(clinic_day) == ["start"], "the tap is not over yet"
     watched.page.mouse.up()

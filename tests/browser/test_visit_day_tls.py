@@ -34,7 +34,7 @@ PATIENCE_S = 180.0
 
 @contextmanager
 def served(certificate: Path, key: Path, log: Path) -> Iterator[str]:
-    """`betaloop serve` with a certificate, in a process of its own, on the test's database."""
+    """Run `betaloop serve` with a certificate, in a process of its own, on the test's database."""
     port = free_port()
     command = ["serve", "--port", str(port), "--tls-certificate", str(certificate), "--tls-key", str(key)]
     with log.open("wb") as out:
@@ -99,7 +99,7 @@ def test_without_tls_nothing_is_kept_and_the_plain_form_remains(chromium: Any, a
 
 
 def _certificate(folder: Path) -> tuple[Path, Path, str]:
-    """A certificate of its own maker for the host, its key, and the hash by which the browser is told to trust it."""
+    """Make a certificate of its own maker for the host, its key, and the hash by which the browser trusts it."""
     key, name = ec.generate_private_key(ec.SECP256R1()), x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, HOST)])
     now = datetime.now(UTC)
     builder = x509.CertificateBuilder(

@@ -1,4 +1,4 @@
-"""What the tablet and the service compute of the same day, each in its own language: what a note may hold, and what entries say."""
+"""Agreement of tablet and service on the same day, each in its own language: what a note may hold, and what entries say."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_the_tablet_reads_entries_as_the_service_does(window: Callable[..., Watc
 
 
 def _drawn_day(seed: int) -> list[dict[str, Any]]:
-    """Entries as two careless tablets might make them."""
+    """Draw entries as two careless tablets might make them."""
     rng = random.Random(seed)
     entries: list[dict[str, Any]] = []
     payloads: dict[str, list[dict[str, Any]]] = {

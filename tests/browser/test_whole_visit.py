@@ -60,7 +60,7 @@ def sign_in_as(watched: Watched, who: str, path: str) -> None:
 
 
 def press(watched: Watched, button: str, done: str) -> None:
-    """Press a button of a form, and wait for what the page says then; a refusal is told in its own words."""
+    """Press a button of a form, and wait for what the page says then; a refusal is reported in its own words."""
     watched.page.click(button)
     watched.page.locator(f".note.good:has-text('{done}'), .note.warn:has-text('{done}'), .note.bad[role=alert]").first.wait_for(
         timeout=90_000
@@ -81,7 +81,7 @@ def kept(watched: Watched, n: int) -> None:
 
 
 def rate(watched: Watched, rating: int, grasp: str) -> None:
-    """All that is asked about a session, as the participant answers it."""
+    """Enter all outcomes of a session, as the participant answers."""
     tap(watched, f"rating-{rating}")
     tap(watched, "type")
     watched.page.fill(".day-dialog input", grasp)
@@ -94,7 +94,7 @@ def rate(watched: Watched, rating: int, grasp: str) -> None:
 
 @pytest.fixture
 def people(client: TestClient) -> None:
-    """Who is there that day, beside the administrator."""
+    """People of that day, besides the administrator."""
     with transaction("test") as db:
         for role in (Role.ENGINEER, Role.CLINICIAN, Role.COORDINATOR):
             accounts.add_user(db, f"{role.value}@clinic.example", role, PASSWORD)
@@ -127,7 +127,7 @@ def ranked(client: TestClient, participant_code: str, worker: None, ended: Calla
 
 
 def run_on_the_tablet(bundle: Path, key: str, log: Path, begins: datetime, ledger: Path) -> str:
-    """`betaloop control` with the bundle of a session: a simulated device answers every amplitude with beta. What it says of it."""
+    """Run `betaloop control` with the bundle of a session, and return its output: a simulated device answers every amplitude with beta."""
     options = ["--bundle", str(bundle), "--key", key, "--participant", "P1", "--ledger", str(ledger), "--source", "simulated:P1:4"]
     moment = begins.astimezone().strftime("%Y-%m-%dT%H:%M:%S")
     command = ["control", *options, "--begins", moment, "--time", "200", "--log", str(log)]
@@ -160,7 +160,7 @@ def test_a_clinic_day_from_the_signed_plan_to_the_next_generation(
     sign_in_as(engineer, "engineer", f"/visits/{visit}/plan")
     for policy in ranked:
         fold = engineer.page.locator(f"details:not([open]):has([name=policy_ids][value='{policy}']) > summary")
-        if fold.count():  # a student that does what its teacher does stands in the teacher's fold
+        if fold.count():  # a student that does what its teacher does is in the teacher's fold
             fold.click()
         engineer.page.check(f"[name=policy_ids][value='{policy}']")
     for name, value in (("minutes_per_session", MINUTES), ("washout_minutes", 5), ("random_sessions", 1), ("seed", 5)):
@@ -261,14 +261,14 @@ def test_a_clinic_day_from_the_signed_plan_to_the_next_generation(
     assert (filled["found"], filled["missing"]) == (len(slots), [])
     for row, slot, session in zip(filled["rows"], slots, planned, strict=True):
         assert (row["position"], row["confirmed"]) == (slot["position"], True)
-        # the simulated device's minutes pass in seconds, so that a log may stand minutes from where the day's page says its session began
+        # the simulated device's minutes pass in seconds, so that a log may be minutes from where the day's page says its session began
         assert set(row["deviations"]) <= {"other_time"}
         assert (row["done"]["rating"], row["done"]["grasp_hz"]) == (5 + slot["position"], 2 + slot["position"] / 10)
         assert 0 < row["done"]["energy"] <= 1.0 + 1e-6
         assert ("energy" in row["predicted"]) is (session["controller"] != "random"), "against what was predicted"
         assert client.get(f"/api/v1/sessions/{row['session_id']}").json()["hours_since_dose"] is not None
 
-    # what the tablets took for a decision stands on the visit; the engineer starts the next generation from there
+    # the tablets' times of decisions are on the visit; the engineer starts the next generation from there
     engineer.open(f"/visits/{visit}")
     assert "Controller on the tablet" in engineer.page.content()
     engineer.page.click("text=Train the next generation")
@@ -308,7 +308,7 @@ def test_a_clinic_day_from_the_signed_plan_to_the_next_generation(
 
 
 def chosen(client: TestClient, number: str) -> dict[str, Any]:
-    """A generation's job once it has chosen, among the policies of that day, those it goes on from, and trains."""
+    """Return a generation's job once it has chosen among the policies of that day those it goes on from, and trains."""
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
         job: dict[str, Any] = client.get(f"/api/v1/jobs/{number}").json()

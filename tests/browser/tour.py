@@ -1,4 +1,4 @@
-"""Which page of the service stands under which name in docs/tour.md, and how its picture is made: small enough to be kept in git."""
+"""Pages of the service by their names in docs/tour.md, and how their pictures are made: small enough to be kept in git."""
 
 from __future__ import annotations
 
@@ -77,13 +77,15 @@ PAGES = {
 }
 """Name of the picture of each page, by its route."""
 PARTS = {"participant/session-samples": "#signal-card"}
-"""Further pictures, of what stands lower on the page of a session with `samples`: the card that is shown."""
+"""Further pictures, of what is lower on the page of a session with `samples`: the card that is shown."""
 OF_THE_RANKED = ("evaluate/ranking", "evaluate/policy", "evaluate/compare", "plan/plan", "plan/visit")
 """Made of a study with a judged ranking and a draft, in which there is more to see."""
 
 
 def samples() -> bytes:
-    """Three minutes of samples at 250 Hz as a table: noise that falls with the frequency, and bursts of beta that stimulation shortens."""
+    """Build three minutes of samples at 250 Hz as a table: noise that falls with the frequency, and bursts of beta that stimulation
+    shortens.
+    """
     rng = np.random.default_rng(8)
     t = (np.arange(-20 * 250, 180 * 250) + 1) / 250
     white = np.fft.rfft(rng.standard_normal(t.size))
@@ -96,7 +98,7 @@ def samples() -> bytes:
 
 
 def take(page: Any, folder: str | Path, name: str) -> None:
-    """The upper part of the page that is shown, in a picture of few colours."""
+    """Take a picture of the upper part of the page, in few colours."""
     page.set_viewport_size({"width": WIDTH, "height": HEIGHT})
     page.wait_for_timeout(400)  # charts fit themselves to the window
     whole = Image.open(io.BytesIO(page.screenshot(scale="css"))).convert("RGB")

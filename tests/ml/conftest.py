@@ -8,7 +8,7 @@ from ml.trajectories import ReplayBuffer, SessionTrajectory
 
 
 def random_sessions(settings: MdpSettings, count: int = 4, steps: int = 60, seed: int = 0, noise: float = 0.3) -> ReplayBuffer:
-    """Sessions of a random controller on a participant whose beta falls with the amplitude in force."""
+    """Simulate sessions of a random controller on a participant whose beta falls with the amplitude in force."""
     rng = np.random.default_rng(seed)
     sessions = []
     for i in range(count):

@@ -56,7 +56,7 @@ def test_two_processes_that_compile_at_once_do_not_mix_their_code(tmp_path: Path
 
 def test_without_a_folder_to_write_everything_is_compiled_anew(tmp_path: Path) -> None:
     (tmp_path / "kernel.py").write_text(KERNEL)
-    # a file where the folder should be: nobody, not even root, can write under it
+    # a file where the folder should be: no user, not even root, can write under it
     (tmp_path / "__pycache__").write_text("")
     home = tmp_path / "home"
     home.write_text("")

@@ -1,4 +1,4 @@
-"""Exploration designs: densities in closed form, exact stratification, safety limits for all seeds, recognition of held draws."""
+"""Exploration designs: densities in closed form, exact stratification, safety limits for all seeds, recognition of sustained draws."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What our own code says of data reaches who reads results; what a library says goes to the log."""
+"""Messages about data reach the reader of results; what a library says goes to the log."""
 
 from __future__ import annotations
 

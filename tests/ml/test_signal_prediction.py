@@ -19,7 +19,7 @@ def model_of(*a: float, residual: float = 1.0) -> Model:
 
 
 def rhythm(n: int, seed: int) -> np.ndarray:
-    """Beta of 5 Hz bandwidth on a background that falls with frequency, and white noise."""
+    """Simulate beta of 5 Hz bandwidth on a background that falls with frequency, and white noise."""
     rng = np.random.default_rng(seed)
     beta = band_pass(rng.normal(size=n), RATE, 18.0, 23.0)
     slow = lfilter([1.0], [1.0, -0.97], rng.normal(size=n))
@@ -69,7 +69,7 @@ def test_pieces_have_the_products_of_the_signal_that_they_are_cut_from(monkeypat
 
 
 def autocovariance(a: tuple[float, ...], n: int) -> np.ndarray:
-    """Of an autoregressive signal with unit residual, by its impulse response, [n]."""
+    """Compute the autocovariance of an autoregressive signal with unit residual, by its impulse response, [n]."""
     response = lfilter([1.0], [1.0, *(-x for x in a)], np.eye(1, 4000)[0])
     return np.array([response[: 4000 - k] @ response[k:] for k in range(n)])
 

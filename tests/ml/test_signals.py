@@ -63,7 +63,7 @@ def test_a_stretch_too_short_for_the_band_is_not_counted():
 
 
 def lossy(x, lost, start_s=1 / RATE, packet=25):
-    """Packets of x that are left when those numbered in `lost` are not there, as stretches; and which samples they hold."""
+    """Return the packets of x that are left without those numbered in `lost`, as stretches; and which samples they hold."""
     there = np.repeat(~np.isin(np.arange(x.size // packet), lost), packet)
     edges = np.flatnonzero(np.diff(np.concatenate(([0], there.astype(np.int8), [0]))))
     return [(start_s + a / RATE, RATE, x[a:b]) for a, b in zip(edges[::2], edges[1::2], strict=True)], there

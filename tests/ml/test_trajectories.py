@@ -20,7 +20,7 @@ SETTINGS = MdpSettings(xi_beta=0.5, window=3)
 
 
 def session(session_id: int = 1, steps: int = 4, **changes: object) -> SessionTrajectory:
-    """Beta rises by 0.1 per row, so that a row can be told by its value; the amplitude of step k is k / 10."""
+    """Build a session whose beta rises by 0.1 per row, so that a row is known by its value; the amplitude of step k is k / 10."""
     whole = SessionTrajectory(
         session_id=session_id,
         visit=1,
@@ -35,7 +35,7 @@ def session(session_id: int = 1, steps: int = 4, **changes: object) -> SessionTr
 
 
 def readable_transitions(s: SessionTrajectory) -> list[tuple[list[float], float, float, list[float]]]:
-    """Straight from the definition: s_k is the W betas before row k, a_k, beta and reward belong to row k."""
+    """Build transitions straight from the definition: s_k is the W betas before row k, a_k, beta and reward belong to row k."""
     out = []
     line = [*s.lead_beta, *s.beta]
     w = len(s.lead_beta)

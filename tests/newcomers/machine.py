@@ -33,7 +33,7 @@ def patience() -> float:
 
 
 def free_port() -> int:
-    """Return a port at which nobody listens."""
+    """Return a port without a listener."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -130,7 +130,8 @@ class Demo:
         """Wait for its end and return the last line.
 
         Raises:
-            Fails: it goes on, ends late, prints a traceback, or leaves processes behind (only asked where nobody else uses the folder).
+            Fails: it goes on, ends late, prints a traceback, or leaves processes behind (only checked where no other process uses the
+                folder).
         """
         try:
             code = self.process.wait(REFUSAL_S * patience())
@@ -181,7 +182,7 @@ def processes_naming(folder: Path) -> dict[int, str]:
 
 
 class Person:
-    """Somebody at a browser: signs in and uploads a file to the first participant."""
+    """A user at a browser, who signs in and uploads a file to the first participant."""
 
     def __init__(self, address: str, password: str) -> None:
         self._address, self._password = address, password

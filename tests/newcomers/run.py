@@ -1,4 +1,4 @@
-"""Try all newcomers' machines, print their table, and compare it with the one in the docs.
+"""Run of all newcomers' machines: it prints their table, and compares it with the one in the docs.
 
 As root, before anything is installed: `python3 -m tests.newcomers.run --work FOLDER --source REPOSITORY --suite CLONE`.
 """
@@ -59,7 +59,7 @@ def main() -> int:
 
 
 def tried(case: Case, ground: Ground) -> tuple[Case, str | None]:
-    """Try one case; None stands for a failure, whose words are printed."""
+    """Try one case; None means a failure, whose words are printed."""
     begun = time.monotonic()
     try:
         result = case.try_it(ground)

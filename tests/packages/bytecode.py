@@ -1,7 +1,7 @@
-"""Write the bytecode of what betaloop, its jobs and its tests load, once, when they are installed.
+"""Bytecode of what betaloop, its jobs and its tests load, written once at their installation.
 
-Of two thirds of the packages' modules nothing ever asks, so that the installation compiles none. Each is compiled when it is first
-imported, and kept where Python may write: not where PYTHONDONTWRITEBYTECODE is set, nor where the service's user does not own the
+Two thirds of the packages' modules are never imported, so that the installation compiles none. Each is compiled when it is first imported,
+and kept where Python may write. It is not kept where PYTHONDONTWRITEBYTECODE is set, nor where the service's user does not own the
 packages. There every start would compile two thousand modules: three to five seconds of the processor.
 """
 

@@ -1,6 +1,7 @@
 """Are flaws of the pinned packages publicly known? `make check` asks OSV (https://osv.dev) about requirements.lock, in one request.
 
-Exit code 1: flaws are known. Where the list cannot be asked, that is said in one line: exit code 0, or 2 with `--required` (`make audit`).
+Exit code 1: flaws are known. Where the list cannot be asked, that is reported in one line: exit code 0, or 2 with `--required` (`make
+audit`).
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parents[2]
 OSV = "https://api.osv.dev"
 PATIENCE_S = 15.0
-"""How long all of it may take: a machine without network must not wait, and looking up a name can take longer than a socket may."""
+"""Longest time of all of it: a machine without network must not wait, and looking up a name can take longer than a socket may."""
 CANARY = ("jinja2", "2.4.1")
 """A version with known flaws, asked about as well: who knows of none for it is not the list, whatever it answers."""
 ACCEPTED: dict[str, str] = {}
-"""Known flaws that do not touch betaloop and cannot be mended by another version, by number, each with the reason."""
+"""Known flaws that do not touch betaloop and cannot be corrected by another version, by number, each with the reason."""
 
 
 class NotDone(Exception):
@@ -47,7 +48,7 @@ def pinned(lock: Path) -> list[tuple[str, str]]:
 
 
 def known_flaws(packages: list[tuple[str, str]], address: str) -> list[Flaw]:
-    """Every known flaw of some packages but the accepted and the withdrawn ones. Raises NotDone."""
+    """Find every known flaw of some packages but the accepted and the withdrawn ones. Raises NotDone."""
     queries = [{"package": {"name": n, "ecosystem": "PyPI"}, "version": v} for n, v in [CANARY, *packages]]
     try:
         answers = _asked(f"{address}/v1/querybatch", {"queries": queries})["results"]
@@ -61,7 +62,7 @@ def known_flaws(packages: list[tuple[str, str]], address: str) -> list[Flaw]:
 
 
 def _summary(number: str, address: str) -> str | None:
-    """What a flaw is; None of one that was withdrawn. One that cannot be looked up counts."""
+    """Describe a flaw; None of one that was withdrawn. One that cannot be looked up counts."""
     try:
         said = _asked(f"{address}/v1/vulns/{number}")
     except (OSError, ValueError):
@@ -77,7 +78,7 @@ def _asked(address: str, body: Any = None) -> dict[str, Any]:
 
 
 def in_time(packages: list[tuple[str, str]], address: str) -> list[Flaw]:
-    """`known_flaws` within PATIENCE_S. Raises NotDone."""
+    """Find `known_flaws` within PATIENCE_S. Raises NotDone."""
     outcome: list[list[Flaw] | BaseException] = []
 
     def ask() -> None:

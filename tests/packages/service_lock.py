@@ -1,4 +1,4 @@
-"""Which of the pinned packages the service itself needs, without those of tests and benchmarks: `make lock` writes them for the image."""
+"""Pinned packages that the service itself needs, without those of tests and benchmarks: `make lock` writes them for the image."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ EXTRAS = ("", "nwb", "recordings", "s3")
 
 
 def pinned() -> dict[str, str]:
-    """Line of `requirements.lock` by the name of the package."""
+    """Return the line of `requirements.lock` by the name of the package."""
     lines = (ROOT / "requirements.lock").read_text().splitlines()
     return {canonicalize_name(re.split(r"[=@ \[]", line)[0]): line for line in lines if line and line[0] not in "#-"}
 
 
 def _wanted(name: str) -> list[str]:
-    """What a package asks for; betaloop itself by its `pyproject.toml`, for what is installed may be of another day."""
+    """List what a package requires; betaloop itself by its `pyproject.toml`, for what is installed may be of another day."""
     if name != "betaloop":
         return requires(name) or []
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -37,7 +37,7 @@ def _wanted(name: str) -> list[str]:
 
 
 def needed(name: str = "betaloop", extras: tuple[str, ...] = EXTRAS, seen: set[tuple[str, tuple[str, ...]]] | None = None) -> Iterator[str]:
-    """Names of the packages that a package needs on this platform, and of what those need."""
+    """Yield names of the packages that a package needs on this platform, and of what those need."""
     seen = set() if seen is None else seen
     try:
         wanted = [Requirement(text) for text in _wanted(name)]
@@ -54,7 +54,7 @@ def needed(name: str = "betaloop", extras: tuple[str, ...] = EXTRAS, seen: set[t
 
 
 def service_packages() -> list[str]:
-    """The lines `name==version` of what the image holds."""
+    """List the lines `name==version` of what the image holds."""
     lines = pinned()
     # what builds the package is part of the image, for it is installed there without the build's isolation
     names = sorted({*needed(), "setuptools"} & set(lines))
@@ -62,7 +62,7 @@ def service_packages() -> list[str]:
 
 
 def held() -> dict[str, list[str]]:
-    """Hashes by line `name==version` of `requirements-service.lock`."""
+    """Return hashes by line `name==version` of `requirements-service.lock`."""
     text = LOCK.read_text().replace("\\\n", " ")
     return {
         line.split()[0]: re.findall(r"--hash=(sha256:[0-9a-f]{64})", line) for line in text.splitlines() if line and line[0] not in "#-"
@@ -70,7 +70,7 @@ def held() -> dict[str, list[str]]:
 
 
 def hashes(packages: list[str]) -> dict[str, str]:
-    """SHA-256 of the file that pip installs for each package, asked of pip's package indexes without installing anything."""
+    """Return the SHA-256 of the file that pip installs for each package, from pip's package indexes without installing anything."""
     with tempfile.TemporaryDirectory() as folder:
         wanted, report = Path(folder, "wanted.txt"), Path(folder, "report.json")
         wanted.write_text("\n".join(packages))
@@ -92,7 +92,7 @@ def _normal(line: str) -> str:
 
 
 def service_lock(known: Mapping[str, str]) -> str:
-    """The text of `requirements-service.lock`."""
+    """Write the text of `requirements-service.lock`."""
     head = (
         "# Written by `make lock` for the image: Linux on x86-64, Python 3.11."
         " The index that PIP_EXTRA_INDEX_URL names has torch without CUDA.\n"

@@ -1,4 +1,4 @@
-"""What processes import has bytecode beside it: nobody compiles the packages at each start."""
+"""Bytecode next to the modules that processes import: packages are not compiled at each start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Known flaws of pinned packages fail `make check`; a list that cannot be asked is said to be so, and is never taken for a clean answer."""
+"""Known flaws of pinned packages fail `make check`; a list that cannot be asked is reported, and never taken for a clean answer."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class List(BaseHTTPRequestHandler):
         self.wfile.write(json.dumps(body).encode())
 
     def log_message(self, *_: Any) -> None:
-        """Nothing to the terminal."""
+        """Write nothing to the terminal."""
 
 
 class Mirror(List):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Promise:
-    """What is promised, a change of the code that breaks it (a file, a text that stands in it once, another text), and the test."""
+    """Promise, a change of the code that breaks it (a file, a text that is in it once, another text), and the test."""
 
     said: str
     file: str
@@ -19,5 +19,5 @@ class Promise:
 
 
 def of(file: str, *broken: tuple[str, str, str, str], at_start: bool = False) -> list[Promise]:
-    """Promises that one file keeps: sentence, text, other text, test."""
+    """List promises that one file keeps: sentence, text, other text, test."""
     return [Promise(said, f"app/{file}.py", old, new, test, at_start) for said, old, new, test in broken]

@@ -1,4 +1,4 @@
-"""Promises about records: the trail, what writes it, the rows that it tells of, and that nothing is deleted."""
+"""Promises about records: the trail, what writes it, its rows, and that nothing is deleted."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ AT_A_TIME = 0.03
 
 @pytest.fixture
 def at_once(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many hashes were running whenever one began; each is real, and lasts AT_A_TIME longer."""
+    """Numbers of hashes that were running whenever one began; each is real, and lasts AT_A_TIME longer."""
     running, seen, lock = [0], [], threading.Lock()
 
     def noted(real: Callable[..., Any]) -> Callable[..., Any]:
@@ -59,7 +59,7 @@ def ada(db: Session) -> int:
 
 
 def in_threads(acts: list[Callable[[], object]]) -> list[object]:
-    """What acts give that begin at the same moment, each in a thread of its own, or what they raise."""
+    """Run acts that begin at the same moment, each in a thread of its own; return their results or errors."""
     gate = threading.Barrier(len(acts))
 
     def run(act: Callable[[], object]) -> object:

@@ -1,4 +1,4 @@
-"""The permissions of each role and scope, written down a second time: whoever changes one says so here, and in the README."""
+"""The permissions of each role and scope, written down a second time: a change is repeated here, and in the README."""
 
 from __future__ import annotations
 

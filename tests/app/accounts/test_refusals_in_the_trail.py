@@ -1,4 +1,4 @@
-"""Refusals that somebody may have to look into: lock-outs, and wrong passwords and codes where a password is asked for again."""
+"""Refusals that a person may have to look into: lock-outs, and wrong passwords and codes where a password is asked for again."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def ada(db: Session) -> User:
 
 
 def refused(db: Session, entity: str) -> list[tuple[str, str, str]]:
-    """Actor, whom it was about, and why, of every refusal in the trail."""
+    """List actor, subject and reason of every refusal in the trail."""
     rows = db.scalars(select(AuditEvent).where(AuditEvent.action == "refuse", AuditEvent.entity == entity).order_by(AuditEvent.id))
     return [(row.actor, row.entity_id, (row.after or {}).get("why", "")) for row in rows]
 

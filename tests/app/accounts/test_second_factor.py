@@ -66,7 +66,7 @@ def test_signing_in_needs_a_code_that_was_not_used(db: Session, ada: tuple[User,
         with pytest.raises(Unauthorized) as refused:
             service.sign_in(db, EMAIL, password, code)
         said.add(str(refused.value))
-    assert len(said) == 1  # which of them was wrong is not told
+    assert len(said) == 1  # which of them was wrong is not shown
     right = code_now(secret, 1)
     assert service.sign_in(db, EMAIL, PASSWORD, right)
     db.commit()

@@ -72,7 +72,7 @@ def signed_on(browser: TestClient, begin: str = "/sign-on?next=/account") -> htt
 
 
 def remember(browser: TestClient, begun: str) -> None:
-    """Have a browser hold this cookie of a begin, and no other."""
+    """Set this cookie of a begin in a browser, and no other."""
     browser.cookies.clear()
     browser.cookies.set("betaloop_sign_on", begun)
 

@@ -59,7 +59,7 @@ def test_a_fresh_sign_on_stands_for_the_password_of_one_signature(
 def test_one_login_at_the_provider_stands_for_one_signature(browser: TestClient, hospital: theirs.Provider, ada: User, db: Session) -> None:
     assert signed_on(browser).status_code == 303
     login = int(hospital.last_login)
-    hospital.change["auth_time"] = login  # a provider that does not ask again, though it is told to
+    hospital.change["auth_time"] = login  # a provider that does not ask again, though it must
     assert "has not asked you again" in signed_on(browser, "/sign-on/confirm").text, "the login of the sign-on signs nothing"
     hospital.change.clear()
     assert signed_on(browser, "/sign-on/confirm").status_code == 303
@@ -130,6 +130,6 @@ def test_a_page_says_until_when_a_confirmation_stands_and_then_that_it_is_over(b
 
 
 def _identity(caller: Caller) -> str:
-    """The part of a signature's form that asks who signs."""
+    """Render the part of a signature's form that asks who signs."""
     macros = _environment.get_template("accounts/signing.html").make_module({})
     return str(macros.identity_again(caller, "/"))  # type: ignore[attr-defined]

@@ -85,8 +85,9 @@ def test_a_narrow_token_of_an_administrator_changes_no_study(
 def test_an_address_in_disguise_opens_nothing_more(
     db: Session, ada: str, client_with: Callable[[str], TestClient], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is open to a token for figures, and to blinded assessors, is told by the address that is answered, not by one that the framework
-    puts together from what the caller says of the host."""
+    """Tokens for figures and blinded assessors open addresses by the one that is answered. The address that the framework puts together
+    from the host header does not count.
+    """
     service.add_user(db, "blind@clinic.example", Role.BLINDED_ASSESSOR, PASSWORD)
     figures = service.create_token(db, ada, "figures", Scope.METRICS)
     blinded = service.create_token(db, "blind@clinic.example", "tablet")
@@ -179,7 +180,7 @@ def test_a_token_changes_no_password_token_or_account(
 
 
 def test_nobody_administers_a_user_without_any_access(db: Session, ada: str) -> None:
-    """Such a user belongs to no study of the caller: whoever administers one site could take the account over."""
+    """Such a user belongs to no study of the caller: the administrator of one site could take the account over."""
     service.add_user(db, "former@clinic.example", Role.VIEWER, PASSWORD).memberships.clear()
     db.flush()
     former = db.query(User).filter_by(email="former@clinic.example").one()

@@ -1,4 +1,4 @@
-"""Tries to sign in whose verdict could not be written lock nobody out for longer than a minute; wrong ones still do."""
+"""Tries to sign in whose verdict could not be written lock no user out for longer than a minute; wrong ones still do."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def ada(db: Session) -> User:
 
 @pytest.fixture
 def full(db: Session, ada: User, owner_db: Session) -> Callable[[bool], None]:
-    """Let the database be full from now on, or no more."""
+    """Function that fills the database from now on, or no more."""
 
     def make(full: bool) -> None:
         db.rollback()  # else the owner waits for it
@@ -46,20 +46,20 @@ def full(db: Session, ada: User, owner_db: Session) -> Callable[[bool], None]:
 
 
 def sign_in(db: Session, password: str) -> str:
-    """As a page does: what is opened is committed."""
+    """Sign in as a page does: what is opened is committed."""
     token = service.sign_in(db, EMAIL, password)
     db.commit()
     return token
 
 
 def later(db: Session, seconds: int) -> None:
-    """The clock, so many seconds on."""
+    """Move the clock forward by so many seconds."""
     db.execute(text("update sign_in_attempt set at = at - make_interval(secs => :seconds)"), {"seconds": seconds})
     db.commit()
 
 
 def without_verdict(db: Session, act: Callable[[], object]) -> None:
-    """As many tries as are judged, none of which is told a verdict."""
+    """Make as many tries as are judged, none of which gets a verdict."""
     for _ in range(service.FAILURES_ALLOWED):
         with pytest.raises(OperationalError) as told:
             act()

@@ -24,12 +24,14 @@ AddSession = Callable[..., int]
 
 @pytest.fixture
 def add_session(db: Session, participant_code: str) -> AddSession:
-    """Add a session of 300 s to a visit of P1: constant beta and amplitude fraction, QoCs; None leaves a thing out. Returns its id."""
+    """Function that adds a session of 300 s to a visit of P1: constant beta and amplitude fraction, QoCs; None omits one. It returns the
+    id.
+    """
     return adder(db, participant_code)
 
 
 def adder(db: Session, code: str) -> AddSession:
-    """What adds sessions to a participant."""
+    """Return a function that adds sessions to a participant."""
     participant = repository.participant_by_code(db, code, SYSTEM)
     device = Device(participant_id=participant.id, pseudonym="d", kind="table")
     db.add(device)

@@ -1,7 +1,7 @@
-"""An outcome that a study adds: its record, and its path from the entry form to the primary analysis. Run as a program by its test.
+"""An outcome that a study adds: its record, and its path from the entry form to the primary analysis. Its test runs this as a program.
 
-The record is put into `ml/outcomes.py` before anything else is imported, and nothing else of the code is changed; the columns are those of
-its migration.
+The record is put into `ml/outcomes.py` before anything else is imported. Nothing else of the code is changed; the columns are those of its
+migration.
 """
 
 from __future__ import annotations

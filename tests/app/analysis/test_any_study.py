@@ -43,12 +43,12 @@ class Given:
     medication_h: float | None = None
 
     def fields(self) -> dict[str, Any]:
-        """Arguments of the helper."""
+        """Return the arguments of the helper."""
         return dict(vars(self))
 
 
 def both(visits: int, each: int = 2, **fields: Any) -> list[Given]:
-    """Visits with both arms, the same values in every session."""
+    """Build visits with both arms, the same values in every session."""
     return [Given(visit=v, controller=c, **fields) for v in range(1, visits + 1) for _ in range(each) for c in ("cdbs", "rl")]
 
 
@@ -76,7 +76,7 @@ sessions = st.lists(
 
 @cache
 def addresses() -> tuple[str, ...]:
-    """Every address of the analyses that can be read, with `CODE` for the participant, each controller and each format filled in."""
+    """List every address of the analyses that can be read, with `CODE` for the participant, each controller and each format filled in."""
     app = create_app()
     answers = app.openapi()["paths"]
     paths = {c.path for c in iter_route_contexts(app.routes) if c.path and "GET" in (getattr(c, "methods", None) or ())}
@@ -97,7 +97,7 @@ def no_such_number(constant: str) -> float:
 
 
 def wrong(kind: str, text: str) -> str:
-    """The first number that is none, in whatever form the answer has; empty where there is none."""
+    """Find the first invalid number, in whatever form the answer has; empty where there is none."""
     try:
         if kind.startswith("application/"):
             json.loads(text, parse_constant=no_such_number)
@@ -116,7 +116,7 @@ def wrong(kind: str, text: str) -> str:
 
 
 def problems(client: TestClient, expected: dict[str, int]) -> dict[str, str]:
-    """What is wrong with the answers at these addresses, each with the status that it should have."""
+    """List what is wrong with the answers at these addresses, each with the status that it should have."""
     found = {}
     for path, status in expected.items():
         answer = client.get(path)

@@ -1,4 +1,4 @@
-"""From every table of the analyses, the sessions behind its numbers are a click away, or stand beside them."""
+"""From every table of the analyses, the sessions behind its numbers are a click away, or next to them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WITHOUT_SESSIONS = ("battery", "readings", "computation")
 
 
 def page(client: TestClient, path: str) -> str:
-    """A page without its charts, whose tables repeat their points."""
+    """Load a page without its charts, whose tables repeat their points."""
     answer = client.get(path)
     assert answer.status_code == 200, path
     shown = re.sub(r"<figure.*?</figure>", "", answer.text, flags=re.DOTALL)
@@ -26,7 +26,7 @@ def page(client: TestClient, path: str) -> str:
 
 
 def behind(client: TestClient, place: str, shown: str) -> list[str]:
-    """The sessions that a link names, or that stand in the row, the card or the page of visits to which it leads."""
+    """List the sessions that a link names, or that are in the row, the card or the page of visits to which it leads."""
     if place.startswith("/sessions/"):
         return [place]
     if "/analyses/visits/" in place and "#" not in place:

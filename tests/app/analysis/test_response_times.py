@@ -1,4 +1,4 @@
-"""How long the server works for the analyses of four participants with 200 sessions each (processor time: other work does not count)."""
+"""Time of the server for the analyses of four participants with 200 sessions each (processor time: other work does not count)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def four_of_200(client: TestClient, db: Session, participant_code: str, monkeypa
 
 
 def milliseconds(client: TestClient, path: str, forget: bool) -> float:
-    """Median processor time of this process for a page, over seven calls."""
+    """Measure the median processor time of this process for a page, over seven calls."""
     found = []
     for _ in range(7):
         if forget:

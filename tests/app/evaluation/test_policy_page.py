@@ -34,7 +34,7 @@ def test_it_shows_what_the_policy_does_and_where_it_comes_from(
 
 
 def test_the_ranking_keeps_to_its_contract_field_by_field(client: TestClient, policies: list[int], judge: Callable[..., int]) -> None:
-    """What programs read of a ranking: names, types, and the one entry for the posterior."""
+    """Programs read these parts of a ranking: names, types, and the one entry for the posterior."""
     judge({policies[0]: judged(50.0), policies[1]: judged(60.0, outcome_draws={"tremor_percent": [45.0] * N})})
     body = client.get("/api/v1/participants/P1/ranking").json()
     assert (body["default_method"], body["choice"]) == ("posterior", None)

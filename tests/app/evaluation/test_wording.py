@@ -28,7 +28,7 @@ WORDS = ("text", "decision_reason", "reason", "notes", "stale_reasons", "stale_r
 
 
 def without_words(found: Any) -> Any:
-    """An answer of the API less what is for people."""
+    """Copy an answer of the API without what is for people."""
     if isinstance(found, dict):
         return {name: without_words(v) for name, v in found.items() if name not in WORDS}
     return [without_words(v) for v in found] if isinstance(found, list) else found
@@ -110,7 +110,7 @@ FACTS = {
 
 
 def codes_of_verdicts() -> set[str]:
-    """Every code that a verdict may rest on, by the sources that make them."""
+    """Collect every code that a verdict may rest on, by the sources that make them."""
     root = Path(wording.__file__).parents[2]
     sources = ["ml/ope/posterior/verdict.py", "ml/ope/posterior/support.py", "app/evaluation/ranking/decisions.py"]
     made = {code for path in sources for code in re.findall(r'(?:Flag|Flag\.of)\(\s*"([a-z_]+)"', (root / path).read_text())}

@@ -24,7 +24,7 @@ SERIALS = {"P1": "SYN000001H", "P2": "SYN000002H"}
 def device_zip(
     controllers: tuple[str, ...] = ("random",), who: str = "P1", minute: float = 0.0, steps: int = 30, gap_s: float = 60.0, seed: int = 3
 ) -> bytes:
-    """An RC+S session folder as zip: one recording that starts `minute` minutes after ten, with one session per controller in it."""
+    """Write an RC+S session folder as zip: one recording that starts `minute` minutes after ten, with one session per controller in it."""
     made = [
         run_session(who, c, visit=1, hour=1.0, seed=seed + i, steps=steps, lead_steps=10, resolution_ma=0.1)  # type: ignore[arg-type]
         for i, c in enumerate(controllers)
@@ -34,18 +34,18 @@ def device_zip(
 
 
 def loose(archive: bytes, folder: str = "") -> list[tuple[str, bytes]]:
-    """The files of an archive as a browser sends them when a folder is dropped."""
+    """List the files of an archive as a browser sends them when a folder is dropped."""
     with zipfile.ZipFile(io.BytesIO(archive)) as zipped:
         return [(f"{folder}{n.rsplit('/', 1)[1]}", zipped.read(n)) for n in zipped.namelist() if not n.endswith("/")]
 
 
 def table(rows: list[tuple[float, float | str, float | str]], amplitude: str = "amplitude_fraction") -> bytes:
-    """A table of steps."""
+    """Write a table of steps."""
     return "\n".join([f"t_s,beta,{amplitude}", *(",".join(map(str, row)) for row in rows)]).encode() + b"\n"
 
 
 def steady(level: float, steps: int = 20, beta: float = 1.0, amplitude: str = "amplitude_fraction") -> bytes:
-    """A table with a constant amplitude; `beta` tells two of them apart."""
+    """Write a table with a constant amplitude; `beta` distinguishes two of them."""
     return table([(2 * k, beta, level) for k in range(steps + 1)], amplitude)
 
 

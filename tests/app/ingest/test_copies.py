@@ -29,12 +29,12 @@ FOLDER = device_zip()
 
 
 def only(*stems: str) -> list[tuple[str, bytes]]:
-    """Loose files of the folder."""
+    """Select loose files of the folder."""
     return [f for f in loose(FOLDER) if any(f[0].startswith(stem) for stem in stems)]
 
 
 def with_member(name: str, content: bytes) -> bytes:
-    """The folder with one more file."""
+    """Add one more file to the folder."""
     sink = io.BytesIO(FOLDER)
     with zipfile.ZipFile(sink, "a") as archive:
         folder = archive.namelist()[-1].rsplit("/", 1)[0]
@@ -43,7 +43,7 @@ def with_member(name: str, content: bytes) -> bytes:
 
 
 def changed(change: Callable[[str, bytes], bytes], folder: bytes = FOLDER) -> bytes:
-    """A folder with every file changed."""
+    """Change every file of a folder."""
     sink = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(folder)) as old, zipfile.ZipFile(sink, "w") as new:
         for name in old.namelist():
@@ -52,12 +52,12 @@ def changed(change: Callable[[str, bytes], bytes], folder: bytes = FOLDER) -> by
 
 
 def cut(name: str, content: bytes) -> bytes:
-    """The first half of the packets of the streams."""
+    """Cut the streams to the first half of their packets."""
     return _packets(name, content, lambda n: slice(n // 2))
 
 
 def cut_off(name: str, content: bytes) -> bytes:
-    """The second half of the packets of the streams."""
+    """Cut the streams to the second half of their packets."""
     return _packets(name, content, lambda n: slice(n // 2, None))
 
 
@@ -72,7 +72,7 @@ def _packets(name: str, content: bytes, kept: Callable[[int], slice]) -> bytes:
 
 
 def other_signal(name: str, content: bytes) -> bytes:
-    """The same packets with other samples."""
+    """Replace the samples of the packets."""
     if "RawDataTD" not in name:
         return content
     body, rng = json.loads(content), np.random.default_rng(1)

@@ -20,7 +20,7 @@ def steps(amplitude: float) -> bytes:
 
 
 def run(client: TestClient, participant: str) -> list[object]:
-    """Everything that is decided on proposals of three uploads: controller, visit open, versions, refusals."""
+    """Collect everything that is decided on proposals of three uploads: controller, visit open, versions, refusals."""
     client.post(f"/api/v1/participants/{participant}/visits", json={"number": 1, "date": "2026-03-02"})
     decided: list[object] = []
     for amplitude, stated in ((0.0, {}), (1.5, {}), (2.0, {"controller": "random"})):
@@ -28,7 +28,7 @@ def run(client: TestClient, participant: str) -> list[object]:
         answer = client.post("/api/v1/uploads", data=form, files={"file": ("a.csv", io.BytesIO(steps(amplitude)))}).json()
         for p in answer["proposals"]:
             url = f"/api/v1/proposals/{p['session']['id']}"
-            # a correction of the part makes a guessed controller be guessed anew, and leaves a stated one alone
+            # a correction of the part makes a guessed controller be guessed again, and leaves a stated one alone
             moved = client.patch(url, json={"version": p["version"], "stop_s": 40}).json()
             named = client.patch(url, json={"version": moved["version"], "controller": "cdbs"}).json()
             again = client.patch(url, json={"version": named["version"], "stop_s": 30}).json()

@@ -1,4 +1,4 @@
-"""The audit trail of somebody who reads it in one of several studies: all of theirs, and nothing of others."""
+"""The audit trail of a user who reads it in one of several studies: all of theirs, and nothing of others."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NOT_OF_A_STUDY = {"app_user", "second_factor", "sign_in", "sign_on_link", "api_t
 
 @pytest.fixture
 def viewer(client_as: Callable[[str], TestClient]) -> TestClient:
-    """Somebody who reads no trail, in the first study."""
+    """A user who reads no trail, in the first study."""
     return client_as("viewer")
 
 

@@ -1,4 +1,4 @@
-"""Every filter of the audit trail, on its page and in its table; who may take the table; and that taking it is a row of the trail."""
+"""Every filter of the audit trail, on its page and in its table. Only some may take the table, and taking it is a row of the trail."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PAGE = {"Accept": "text/html"}
 
 @pytest.fixture
 def used(client: TestClient, client_as: Callable[[str], TestClient], upload: Callable[..., int]) -> int:
-    """A study in which two participants, a monitor and somebody who may not sign in left their rows; the visit of P1."""
+    """A study in which two participants, a monitor and a locked user left their rows; the visit of P1."""
     session = upload("cdbs")
     visit = int(client.get(f"/api/v1/sessions/{session}").json()["visit_id"])
     assert client.post("/api/v1/participants", json={"code": "Q7", "site": "main"}).status_code == 201

@@ -203,7 +203,7 @@ def test_what_comes_with_an_act_never_names_it(name: str) -> None:
 
 
 def test_every_row_that_a_used_study_wrote_is_told(world: World) -> None:
-    """No row stops the page, and none is told as a row."""
+    """No row stops the page, and none is shown as a row."""
     with new_session() as db:
         told = [line for rows in batches(db, true(), TrailFilter()) for line in lines(db, rows, SYSTEM)]
     assert len({line.event.entity for line in told}) > 35

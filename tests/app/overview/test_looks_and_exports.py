@@ -1,4 +1,4 @@
-"""Every route that shows results by controller tells the trail who looked, and every route that delivers a file tells who took it."""
+"""Every route that shows results by controller records who looked, and every route that delivers a file records who took it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SHOWS_NO_RESULTS = {
     # outcomes of a session without what ran, and what it ran under without outcomes
     "/api/v1/sessions/{session_id}/qoc", "/api/v1/sessions/{session_id}/outcomes", "/api/v1/sessions/{session_id}/conditions",
     "/sessions/{session_id}/markers", "/api/v1/sessions/{session_id}/markers",
-    # files that came in, and sessions that nobody has confirmed
+    # files that came in, and sessions that are not confirmed
     "/participants/{code}/upload", "/participants/{code}/upload/progress", "/uploads/{upload_id}", "/api/v1/uploads/{upload_id}",
     "/participants/{code}/proposals", "/api/v1/participants/{code}/proposals", "/proposals/{session_id}", "/api/v1/proposals/{session_id}",
     "/participants/{code}/quarantine", "/api/v1/participants/{code}/quarantine",
@@ -63,7 +63,7 @@ NO_FILES = ("text/html", "application/json", "text/plain", "text/javascript", "t
 
 @dataclass
 class Answer:
-    """What a call gave, and what it put into the trail: (action, entity)."""
+    """Answer to a call, and the rows that it put into the trail: (action, entity)."""
 
     status: int
     is_file: bool
@@ -71,12 +71,12 @@ class Answer:
 
     @property
     def left(self) -> bool:
-        """Whether somebody took something; each bundle is a row of its own table."""
+        """True where a file was taken; each bundle is a row of its own table."""
         return any(action in ("export", "download") or (action, entity) == ("insert", "bundle_release") for action, entity in self.rows)
 
     @property
     def looked(self) -> bool:
-        """Whether somebody looked at results, or took something."""
+        """True where results were looked at, or a file was taken."""
         return self.left or any(action == "view" for action, _ in self.rows)
 
 
@@ -167,7 +167,7 @@ def test_files_that_are_sent_for_leave_a_row_too(world: World) -> None:
 
 
 def test_no_other_module_hands_out_a_file() -> None:
-    """Where a file gets its name: a module that begins to deliver some must be called by a test of this file."""
+    """Files get their names in few places: a module that begins to deliver some must be called by a test of this file."""
     naming = set()
     for path in (ROOT / "app").rglob("*.py"):
         tree = ast.parse(path.read_text())

@@ -23,7 +23,7 @@ RATE = 250
 
 
 def lfp_table() -> tuple[bytes, np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """40 s of samples from 10 s before the session on, of which 5 s are missing; its bytes, times and samples."""
+    """Write 40 s of samples from 10 s before the session on, of which 5 s are missing; return its bytes, times and samples."""
     t = np.round((np.arange(-10 * RATE, 30 * RATE) + 1) / RATE, 4)
     x = np.round(4 * np.sin(2 * np.pi * 20 * t) + np.random.default_rng(1).standard_normal(t.size), 4)
     there = (t <= 8.0) | (t > 13.0)

@@ -106,7 +106,7 @@ def test_two_who_ask_at_once_leave_one_folder(client: TestClient, session: int, 
 
     def twice(*args: Any, **kwargs: Any) -> Any:
         monkeypatch.setattr(signals_rules, "run_limited", build)
-        asked(client, session)  # somebody else is done first
+        asked(client, session)  # another request is done first
         return build(*args, **kwargs)
 
     monkeypatch.setattr(signals_rules, "run_limited", twice)

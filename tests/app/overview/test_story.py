@@ -45,7 +45,7 @@ def test_every_session_is_a_dot_of_its_own_that_leads_to_it(client: TestClient, 
     assert max(grasp["x"][:3]) < min(grasp["x"][3:])
     assert {a["text"] for a in chart.figure["layout"]["annotations"]} == {"settings 2"}
     assert [row[2] for row in chart.rows] == [Link(i, f"/sessions/{i}") for i in ids]
-    # below the axis stand the days of the visits, in the middle of their sessions
+    # below the axis are the days of the visits, in the middle of their sessions
     axis = chart.figure["layout"]["xaxis"]
     assert axis["ticktext"] == [f"visit {v.number}<br>{v.date}" for v in sorted(visits, key=lambda v: v.number)]
     assert [sorted(grasp["x"][3 * k : 3 * k + 3])[1] for k in (0, 1)] == axis["tickvals"]

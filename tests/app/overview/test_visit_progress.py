@@ -1,4 +1,4 @@
-"""Sessions planned, held, and missing."""
+"""Sessions planned, done, and missing."""
 
 from __future__ import annotations
 

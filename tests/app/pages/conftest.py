@@ -20,7 +20,7 @@ HTML = {"Accept": "text/html", "Sec-Fetch-Site": "same-origin"}
 
 @pytest.fixture
 def anonymous(service_app) -> TestClient:  # type: ignore[no-untyped-def]
-    """A browser that nobody has signed in with; redirects are seen, not followed."""
+    """A browser without a sign-in; redirects are seen, not followed."""
     return TestClient(service_app, headers=HTML, follow_redirects=False)
 
 
@@ -32,7 +32,7 @@ def password_hash() -> str:
 
 @pytest.fixture
 def sign_in(service_app, password_hash: str) -> Callable[[str], TestClient]:  # type: ignore[no-untyped-def]
-    """Make a user of a role with PASSWORD and an open browser session."""
+    """Function that makes a user of a role with PASSWORD and an open browser session."""
 
     def make(role: str) -> TestClient:
         with transaction("test") as db:
@@ -54,7 +54,7 @@ def browser(sign_in: Callable[[str], TestClient]) -> TestClient:
 
 @pytest.fixture
 def table() -> bytes:
-    """A table of 40 steps after a full window; steps 11-13 have no beta, step 20 stands above the cDBS amplitude."""
+    """A table of 40 steps after a full window; steps 11-13 have no beta, step 20 is above the cDBS amplitude."""
     lines = ["t_s,beta,amplitude_fraction"]
     for i in range(-9, 41):
         beta = "" if 11 <= i <= 13 else f"{1 + 0.5 * (i % 3):.2f}"

@@ -17,17 +17,17 @@ ELSEWHERE = {
     "/sign-on/end": "the same",
     "/visit-day/files/{path:path}": "a script or a style of the day page, by its name",
 }
-"""Addresses without /api that no page stands at, or none without what other tests bring along."""
+"""Addresses without /api that have no page, or none without what other tests bring along."""
 
 
 def routes(app: Any) -> list[str]:
-    """Every address that a browser may open, less the REST interface's and what operates the service."""
+    """List every address that a browser may open, less the REST interface's and what operates the service."""
     found = {c.path for c in iter_route_contexts(app.routes) if c.path and "GET" in (getattr(c, "methods", None) or ())}
     return sorted(p for p in found if not p.startswith(("/api/", "/healthz", "/readyz", "/metrics")))
 
 
 def addresses(world: World) -> dict[str, str]:
-    """By route: the address of a page that has something to show, for everything that a browser may open."""
+    """Return, by route, the address of a page that has something to show, for everything that a browser may open."""
     own: dict[str, dict[str, Any]] = {
         "/participants/{code}/ranking": {"code": "P2"},
         "/participants/{code}/proposals": {"code": "P4"},
@@ -58,7 +58,7 @@ PARTS = {
 
 
 def ended_jobs(world: World) -> dict[str, str]:
-    """By kind: the page of a succeeded job with steps, learning curves and a log: a pipeline, and what it is made of.
+    """Return, by kind, the page of a succeeded job with steps, learning curves and a log: a pipeline, and what it is made of.
 
     `failed` is one whose step raised what only engineers can read.
     """
@@ -93,5 +93,5 @@ def ended_jobs(world: World) -> dict[str, str]:
 
 
 def _copy(row: Any, but: tuple[str, ...], **more: Any) -> Any:
-    """A row of the same table with the same values."""
+    """Copy a row of a table with its values."""
     return type(row)(**{c.key: getattr(row, c.key) for c in type(row).__table__.columns if c.key not in but} | more)

@@ -21,13 +21,13 @@ NEW = "another good password"
 
 
 def posts(app: Any) -> set[tuple[str, str]]:
-    """(method, path) of every form, all methods that change something."""
+    """List (method, path) of every form, all methods that change something."""
     found = {(m.lower(), c.path) for c in iter_route_contexts(app.routes) if c.path for m in getattr(c, "methods", None) or ()}
     return {(m, p) for m, p in found if m not in ("get", "head", "options") and not p.startswith("/api/")}
 
 
 def browser(app: Any, role: str, study: str | None = None, site: int | None = None) -> TestClient:
-    """A new person with a role in a study, at one site of it or at all, whose browser is signed in; redirects are seen, not followed."""
+    """Create a person with a role in a study or one site, whose browser is signed in; redirects are seen, not followed."""
     with transaction("test") as db:
         address = f"{role}-browser@{study or 'clinic'}.example"
         user = accounts.add_user(db, address, Role(role), PASSWORD, study_code=study)
@@ -38,14 +38,14 @@ def browser(app: Any, role: str, study: str | None = None, site: int | None = No
 
 
 def calls(world: World) -> dict[str, Call]:
-    """By path: what is sent (`data`, `files`), and members of the path that differ from the world's own."""
+    """Return, by path, what is sent (`data`, `files`), and members of the path that differ from the world's own."""
     with new_session() as db:
         people = {name: user.id for name in ("signer", "drafter") if (user := repository.user_by_email(db, f"{name}@clinic.example"))}
     return _of_people(people) | _of_participants(world) | _of_visits(world) | _of_files(world) | _of_learning(world) | _of_plans(world)
 
 
 def of_api(world: World, method: str, path: str) -> Call:
-    """The members of the path of the route that does the same."""
+    """Return the members of the path of the route that does the same."""
     return dict(world.ids_of(method, f"/api/v1{path}"))
 
 

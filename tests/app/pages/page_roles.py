@@ -1,4 +1,4 @@
-"""Who may open each page and send each form: the permission that it needs, and what is open to a blinded assessor."""
+"""Permission that each page and form needs, and what is open to a blinded assessor."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def test_a_page_of_an_error_says_what_to_do(browser: TestClient, method: str, pa
     answer = browser.request(method, path)
     assert answer.status_code == status
     assert f"<h1>{heading}</h1>" in answer.text
-    assert '<a href="/jobs"' in answer.text  # the way on of somebody who has signed in
+    assert '<a href="/jobs"' in answer.text  # the way on of a signed-in user
     assert "Sign out" in answer.text
 
 
@@ -51,7 +51,7 @@ def test_an_expired_sign_in_gives_back_every_entry_and_takes_it_after_signing_in
     assert refused.status_code == 401
     assert "Your sign-in has expired" in refused.text
     assert "<dd>slept &lt;badly&gt; &amp; late</dd>" in refused.text
-    assert "Send it again" not in refused.text  # nobody knows who entered this
+    assert "Send it again" not in refused.text  # it is unknown who entered this
     assert "open the form anew" in refused.text
     browser.cookies.clear()
     browser.cookies.set(COOKIE, live)
@@ -59,7 +59,7 @@ def test_an_expired_sign_in_gives_back_every_entry_and_takes_it_after_signing_in
 
 
 def again(page: str) -> str:
-    """Where the page of an error sends what was entered."""
+    """Find where the page of an error sends what was entered."""
     return re.findall(r'<form method="post" action="([^"]*)"[^>]*data-again', page)[0]
 
 

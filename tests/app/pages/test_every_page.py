@@ -16,11 +16,11 @@ from tests.app.words import above_fold, drawn, drawn_above_fold, methods_named, 
 
 MOST_BYTES = 60_000
 INLINE = re.compile(r'<script(?![^>]*(?:src=|application/json))[^>]*>|\son\w+="|javascript:|(?:src|action)="(?:https?:)?//')
-"""Scripts that stand in a page itself, and what it would load from, or send to, elsewhere."""
+"""Scripts that are in a page itself, and what it would load from, or send to, elsewhere."""
 METHODS_EXPLAINED = {"/glossary": "says what the words of the folds mean"}
 """Pages that are about these words."""
 WITHOUT_A_READER = {"/sign-in", "/visit-day/shell"}
-"""Pages that are shown to nobody in particular."""
+"""Pages that are shown without a user."""
 OF_NO_PARTICIPANT = {
     "/", "/account", "/accounts", "/adverse-events", "/api-reference", "/audit", "/glossary", "/jobs", "/participants/new", "/search",
     "/studies", "/studies/{study_code}/column-mappings", "/visit-day/shell",

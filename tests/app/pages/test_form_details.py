@@ -1,4 +1,4 @@
-"""What forms offer before anybody types: labels, optional fields; and true words where data cannot be read."""
+"""Forms before anything is typed: labels, optional fields; and true words where data cannot be read."""
 
 from __future__ import annotations
 

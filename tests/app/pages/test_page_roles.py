@@ -25,7 +25,7 @@ SHARED = {"/", "/account", "/glossary", "/api-reference", "/styleguide", "/searc
           "/studies", "/accounts", "/audit",
           "/audit.csv",
           "/participants/new", "/visit-day/key", *roles.WITHOUT_SIGN_IN}  # fmt: skip
-"""Pages without an object in their address: whoever opens one sees what they may of what there is."""
+"""Pages without an object in their address: each user sees what they may of it."""
 IDLE = {"/participants/{code}/next-generation", "/sessions/{session_id}/markers"}
 """Forms with nothing to do in this study, without a policy to train further and without markers: they refuse with that reason."""
 
@@ -60,7 +60,7 @@ def sent(client: TestClient, path: str, call: dict[str, Any], ids: dict[str, Any
 
 
 def written() -> int:
-    """Changes of rows so far; looks and refusals are none."""
+    """Count changes of rows so far; looks and refusals are none."""
     with new_session() as db:
         return int(db.scalar(text("select count(*) from audit_event where action in ('insert', 'update', 'delete')")) or 0)
 

@@ -92,7 +92,7 @@ def test_a_correction_saved_from_an_old_form_is_refused_and_kept_and_the_others_
     stored = {i: client.get(f"/api/v1/proposals/{i}").json()["session"]["controller"] for i in (first, second)}
     assert stored == {first: "other", second: "random"}
     again = fields_of(refused.text, URL)
-    # what was typed stands in the form, beside what the other tab had saved
+    # what was typed is in the form, next to what the other tab had saved
     assert (again[f"controller-{second}"], again[f"hemisphere-{second}"]) == ("cdbs", "left")
     assert press(browser, "save:all", again).status_code == 303
     session = client.get(f"/api/v1/proposals/{second}").json()["session"]

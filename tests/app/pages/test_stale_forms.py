@@ -1,4 +1,4 @@
-"""Forms that were opened before somebody else saved: nothing is taken back in silence, nothing typed is lost."""
+"""Forms that were opened before another person saved: nothing is taken back in silence, nothing typed is lost."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STORED = {"grasp_hz": 2.4790827393, "rating": 5, "tremor_percent": 10.0}
 
 
 def fields_of(page: str, action: str) -> dict[str, str]:
-    """What the last form of an address sends when nobody touches it."""
+    """Return what the last form of an address sends when it is not touched."""
     form = page[page.rindex(f'action="{action}"') :]
     form = form[: form.index("</form>")]
     found = {}

@@ -19,26 +19,26 @@ from app.platform.web.schemas import Int, Model
 
 
 class MeanBetaParams(Model):
-    """What `mean_beta` takes."""
+    """Parameters of `mean_beta`."""
 
     newest: Int = Field(1000, ge=1, description="How many of the newest beta amplitudes are averaged.")
 
 
 def mean_beta(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
-    """The mean, in the participant's unit; runs in a child process."""
+    """Compute the mean, in the participant's unit; runs in a child process."""
     beta = np.concatenate([session.padded_beta for session in read_buffer(params["snapshot_sha256"]).sessions])
     report.progress(1.0, "averaged")
     return {"mean": float(np.nanmean(beta[-params["newest"] :]))}
 
 
 def run_mean_beta(job: JobContext) -> dict[str, Any]:
-    """Snapshot, then average; runs in a worker."""
+    """Take a snapshot, then average; runs in a worker."""
     snapshot = plan_on_snapshot(job)["snapshot"]
     return job.compute("average", "mean_beta", {"snapshot_sha256": snapshot["sha256"], "newest": job.params["newest"]})
 
 
 def work() -> None:
-    """A worker process that knows this kind."""
+    """Run a worker process that knows this kind."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     run_worker(1, stop)

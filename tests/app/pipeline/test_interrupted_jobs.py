@@ -48,7 +48,7 @@ class Workers:
         return worker
 
     def computing(self, worker: subprocess.Popen[bytes], step: str) -> psutil.Process | None:
-        """The child that carries out a step."""
+        """Find the child that carries out a step."""
         folder = step.replace("/", "__")
         for process in psutil.Process(worker.pid).children(recursive=True):
             with contextlib.suppress(psutil.Error):  # ended between two looks
@@ -80,7 +80,7 @@ def policy(client: TestClient, upload: Upload) -> int:
 
 
 def wait(condition: Callable[[], Any], timeout_s: float) -> float:
-    """Seconds until the condition held."""
+    """Wait for a condition; return the seconds."""
     start = time.monotonic()
     while not condition():
         if time.monotonic() - start > timeout_s:
@@ -102,7 +102,7 @@ def step(client: TestClient, job: str, key: str) -> dict[str, Any]:
 
 
 def points(db: Session, job: str, key: str) -> list[float]:
-    """Where a step's learning curves have points, in the order in which they came."""
+    """List where a step's learning curves have points, in the order in which they came."""
     db.rollback()
     events = db.scalars(select(JobEvent).where(JobEvent.job_id == job, JobEvent.step_key == key).order_by(JobEvent.id))
     return [point["x"] for e in events if e.kind == "points" for point in e.data["points"]]
@@ -177,7 +177,7 @@ def test_a_killed_workers_evaluation_goes_on_where_it_was_and_gives_the_same_num
     assert {key: attempts[key] for key in before} == before  # what was finished is not done again
     assert (attempts["plan"], attempts["fit/0"], attempts["fit/1"], attempts["estimate/dual_dice"]) == (1, 2, 2, 2)
     for k in range(2):
-        # a member goes on from its last check, not from the start; one that had stored its last has nothing left to tell
+        # a member goes on from its last check, not from the start; one that had stored its last has nothing left to report
         later = points(db, job, f"fit/{k}")[seen[k] :]
         assert min(later, default=reached[k]) > 0.3 * reached[k]
     found = client.get("/api/v1/participants/P1/ranking").json()

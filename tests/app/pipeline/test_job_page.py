@@ -1,4 +1,4 @@
-"""What a job's page shows of a fit: the curves of every member, how it ended, and what was asked for in words."""
+"""Page of a job with a fit: the curves of every member, how it ended, and its parameters in words."""
 
 from __future__ import annotations
 

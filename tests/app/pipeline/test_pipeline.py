@@ -85,7 +85,7 @@ def test_an_evaluation_gives_the_numbers_that_the_estimators_give(
     assert {s["method"]: s["difference_error"] for s in held_out["table"]} == {
         s.method: pytest.approx(s.difference_error) for s in skill.table
     }
-    # nobody named the posterior: it ranks all the same, and its verdict stands beside it
+    # the posterior was not named: it ranks all the same, and its verdict is next to it
     assert (ranking["default_method"], ranking["choice"]) == ("posterior", None)
     assert policy["decision"] in ("test", "test_with_care", "same_as_cdbs", "unsafe", "cannot_tell")
     assert policy["decision_reasons"]
@@ -157,7 +157,7 @@ def test_the_pipeline_walks_from_sessions_to_a_ranking(client: TestClient, sessi
         assert [p["rank"] for p in ranking["policies"]] == [1, 2, 3, 4]
         asked = any(p["supported"] and p["decision"] != "unsafe" for p in ranking["policies"])
         assert sum(p["probability_best"] for p in ranking["policies"]) == pytest.approx(1.0 if asked else 0.0)
-    else:  # eight short sessions may not tell policies apart: then nothing is ordered, and nothing proposed
+    else:  # eight short sessions may not distinguish policies: then nothing is ordered, and nothing proposed
         assert {(p["rank"], p["probability_best"], p["decision"]) for p in ranking["policies"]} == {(None, None, "cannot_tell")}
     assert ranking["horizon_steps"] == int(np.median([50 + k for k in range(8)]))
     for policy in ranking["policies"]:

@@ -29,7 +29,7 @@ AT_ONCE = 4
 
 
 def begin(db: Session, job_id: str) -> None:
-    """The job as a worker leaves it after its first step: it has read its data."""
+    """Leave the job as a worker does after its first step: it has read its data."""
     snapshot = take_snapshot(db, participant_by_code(db, "P1", SYSTEM), SYSTEM)
     job = db.get_one(Job, job_id)
     job.status = JobStatus.RUNNING

@@ -1,6 +1,6 @@
 """The whole loop once, as small as it can be: `make smoke`, the first thing to run after a change.
 
-Upload, fit, ranking, plan, signature, bundle, a session on a simulated device, and its log back into the slot that it ran: through the
+Upload, fit, ranking, plan, signature, bundle, a session on a simulated device, and its log back into its slot. All of it runs through the
 service, its database, a worker in a process of its own, and `betaloop control`.
 """
 

@@ -8,7 +8,7 @@ from fastapi.testclient import TestClient
 
 
 def event(client: TestClient, policy: int) -> dict[str, Any]:
-    """A serious fall of P1 under a policy, as it is stored; nobody has cleared it."""
+    """Add a serious fall of P1 under a policy, as it is stored; it is not cleared."""
     body = {"kind": "fall", "severity": "severe", "serious": True, "policy_id": policy}
     answer = client.post("/api/v1/participants/P1/adverse-events", json=body)
     assert answer.status_code == 201, answer.text
@@ -17,6 +17,6 @@ def event(client: TestClient, policy: int) -> dict[str, Any]:
 
 
 def clear(client: TestClient, found: dict[str, Any]) -> None:
-    """Clear it with a reason, as somebody who approves plans."""
+    """Clear it with a reason, as a user who approves plans."""
     given = {"revision": found["revision"], "reason": "she tripped"}
     assert client.post(f"/api/v1/adverse-events/{found['id']}/clearance", json=given).status_code == 200

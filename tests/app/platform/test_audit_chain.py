@@ -1,4 +1,4 @@
-"""The chain of the audit trail: whoever owns the tables finds no way to change it that `betaloop audit verify` does not see."""
+"""The chain of the audit trail: the owner of the tables has no way to change it that `betaloop audit verify` does not see."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def last() -> int:
         return int(db.scalar(text("select max(position) from audit_link")) or 0)
 
 
-# the trail as its owner would compute it anew after an edit
+# the trail as its owner would recompute it after an edit
 RECOMPUTE = """
 do $$
 declare e audit_event; l audit_link; last bytea := sha256('betaloop audit trail');

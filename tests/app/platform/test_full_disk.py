@@ -1,4 +1,4 @@
-"""A service on disks that are really full: told in words, nothing acknowledged lost, and over as soon as there is room."""
+"""A service on disks that are really full: reported in words, nothing acknowledged lost, and over as soon as there is room."""
 
 from __future__ import annotations
 
@@ -62,14 +62,14 @@ class Asked:
         if status == 429 and "are waiting for an answer" in answer.text:
             return  # the right password, too often without a verdict; never called failed
         in_words = status in SAID and SAID[status] in answer.text and ("retry-after" in answer.headers) == (status == 503)
-        # what is uploaded is noise and no table: where it could be kept and read, that is what it is told
+        # what is uploaded is noise and no table: where it could be kept and read, that is the answer
         if not (in_words or answer.is_success or status in (303, 422)):
             self.wrong.append(f"{answer.request.method} {answer.request.url.path}: {status} {answer.text[:300]}")
 
 
 @contextmanager
 def callers(base: str, token: str) -> Iterator[Asked]:
-    """Somebody who has signed in to a browser, and a program with a token."""
+    """Open a signed-in browser, and a program with a token."""
     browser = {"Accept": "text/html", "Sec-Fetch-Site": "same-origin"}
     with (
         httpx.Client(base_url=base, headers=browser, timeout=60) as page,
@@ -84,7 +84,7 @@ def callers(base: str, token: str) -> Iterator[Asked]:
 
 @contextmanager
 def installed_on_small_disks() -> Iterator[tuple[Installation, Path, Path]]:
-    """An installation whose database and log are on one disk of 256 MiB, and whose stored files are on another of 24."""
+    """Install with the database and log on one disk of 256 MiB, and the stored files on another of 24."""
     with ExitStack() as held:
         folder = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="betaloop-full-", dir="/tmp")))
         folder.chmod(0o711)
@@ -102,7 +102,7 @@ def installed_on_small_disks() -> Iterator[tuple[Installation, Path, Path]]:
 
 
 def seconds_until_healthy(base: str) -> float:
-    """By itself."""
+    """Wait until the service is healthy by itself; return the seconds."""
     begun = time.monotonic()
     while httpx.get(f"{base}/readyz", timeout=patience()).status_code != 200:
         assert time.monotonic() - begun < patience()
@@ -147,7 +147,7 @@ def test_full_disks_are_told_in_words_and_leave_nothing_wrong_behind() -> None:
         writers.stop()
         assert writers.said.answers["507"], "those who write met it too"
         with callers(installed.bases[0], tokens[ADMIN]):
-            pass  # whoever tried meanwhile is let in
+            pass  # a user who tried meanwhile is let in
         received = "select id from upload where status = 'received'"
         installed.wait_until("what was cut short to be read", lambda: installed.ask(received) == [], RESUMED_S)
         assert what_is_wrong(installed, writers.said, study) == []

@@ -1,4 +1,4 @@
-"""A database that dies under the running service, or whose disk is full: told in true words, and mended without a person."""
+"""A database that dies under the running service, or whose disk is full: reported in true words, and repaired without a person."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HEALTHY_WITHIN_S = 10.0
 
 
 def patience() -> float:
-    """Seconds, by how many processes share each processor."""
+    """Return the seconds to wait, by how many processes share each processor."""
     return HEALTHY_WITHIN_S * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 

@@ -1,4 +1,4 @@
-"""What is logged of an error: where it was raised, and no value of any variable."""
+"""Log of an error: where it was raised, and no value of any variable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Bodies that no client should send, to every operation that takes one: answered as the document says, and of nobody not even read."""
+"""Bodies that no client should send, to every operation that takes one: answered as the document says, and not even read without a
+sign-in.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ UNREADABLE = {"not UTF-8", "nested too deep", "a number of 5 000 digits"}
 
 
 def with_a_body(app: FastAPI) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Method, path and description of every operation that takes a body."""
+    """List method, path and description of every operation that takes a body."""
     for path, operations in app.openapi()["paths"].items():
         for method, operation in operations.items():
             if "requestBody" in operation:
@@ -37,7 +39,7 @@ def with_a_body(app: FastAPI) -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 
 def sent(client: TestClient, method: str, address: str, what: str) -> int:
-    """The status of a malformed request."""
+    """Send a malformed request; return its status."""
     kind, body = BODIES[what]
     return client.request(method, address, content=body, headers={"Content-Type": kind}).status_code
 
@@ -61,7 +63,7 @@ def test_every_malformed_body_is_answered_as_described(world: World) -> None:
 
 
 def test_no_body_of_nobody_is_read(service_app: FastAPI, fresh_database: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who has not signed in is told so, whatever they send to the interface, and nothing looks into it."""
+    """Callers without a sign-in are refused, whatever they send to the interface, and nothing looks into it."""
     looked: list[bytes] = []
     monkeypatch.setattr(json_members, "doubled_member", looked.append)
     ids = dict.fromkeys(("code", "study_code", "site_code"), "P1")

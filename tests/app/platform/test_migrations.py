@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def differences(connection: Connection) -> list[Any]:
-    """What a new migration would have to do; tables of the job engine's own schema are not ours."""
+    """List what a new migration would have to do; tables of the job engine's own schema are not ours."""
     context = MigrationContext.configure(connection, opts={"compare_server_default": False})
     return list(compare_metadata(context, METADATA))
 

@@ -1,4 +1,4 @@
-"""What a stolen database password of the service can do: read and write rows, and nothing to the audit trail or the tables themselves."""
+"""Reach of a stolen database password of the service: read and write rows, and nothing to the audit trail or the tables themselves."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def data() -> Iterator[Path]:
 
 
 def left_in(data: Path) -> list[psutil.Process]:
-    """Processes that name the data folder: the database, web services, workers."""
+    """List processes that name the data folder: the database, web services, workers."""
     found = []
     for process in psutil.process_iter():
         try:

@@ -1,4 +1,4 @@
-"""The demo as somebody meets it: begun from nothing, killed in the midst, gone on with, and every page of the tour has its content."""
+"""The demo as a user meets it: begun from nothing, killed in the midst, continued, and each page of the tour has its content."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the demo stores with the package: small, whole, and read as it was written; and how its loader goes on."""
+"""Files that the demo stores with the package: small, whole, and read as written; and how its loader goes on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A whole small study through the service: killed twice, gone on with, and held against the paper's rules."""
+"""A whole small study through the service: killed twice, gone on with, and checked against the paper's rules."""
 
 from __future__ import annotations
 

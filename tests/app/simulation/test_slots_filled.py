@@ -32,21 +32,21 @@ PASSWORD = "a password of the simulated signer"
 
 
 class Silent:
-    """Progress that nobody watches."""
+    """Progress without a watcher."""
 
     def say(self, code: str, what: str) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def session_held(self, code: str) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def job(self, code: str, share: float) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 @pytest.fixture
 def loop(db: Session) -> ParticipantLoop:
-    """P2 enrolled, and nothing held."""
+    """P2 enrolled, without a session."""
     with transaction("test") as people:
         drafter = accounts.caller_of(accounts.add_user(people, "drafter@clinic.example", Role.CLINICIAN, PASSWORD))
         signer = accounts.caller_of(accounts.add_user(people, "second@clinic.example", Role.CLINICIAN, PASSWORD))

@@ -78,7 +78,7 @@ def new_file(db: Session) -> Callable[[StudySession], int]:
 def minutes(
     shares: Sequence[dict[str, float]], first_min: float = 0.0, length_s: float = 60.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Minutes one after another from `first_min` after the session's start; what a minute's shares leave is `none`."""
+    """Build minutes one after another from `first_min` after the session's start; what a minute's shares leave is `none`."""
     fractions = np.array([[{"none": 1 - sum(s.values()), **s}.get(c, 0.0) for c in CLASSES] for s in shares]).reshape(-1, len(CLASSES))
     start = START.timestamp() + 60 * first_min + 60.0 * np.arange(len(shares))
     return start, np.full(len(shares), length_s), fractions, fractions[:, 2:].sum(axis=1)

@@ -82,7 +82,7 @@ def test_locks_of_earlier_versions_say_that_they_have_none(client: TestClient, p
 def test_a_signature_that_was_rewritten_with_its_values_does_not_stand(
     client: TestClient, participant_code: str, owner_db: Session, side: str
 ) -> None:
-    """Whoever owns the tables changes the margins and what was signed; the entry of the audit trail tells of another signature."""
+    """The owner of the tables changes the margins and what was signed; the entry of the audit trail has another signature."""
     assert client.post(LOCKS, json={"version": 1, "reason": "protocol", "password": PASSWORD}).status_code == 201
     content = owner_db.scalars(select(Signature)).one().content | {"tremor_points": 50}
     for table in ("margins_version", "signature", "audit_event"):

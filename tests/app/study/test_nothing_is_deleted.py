@@ -1,4 +1,4 @@
-"""What was entered or measured stays readable when it is taken back or replaced, and the service may not delete it."""
+"""Entries and measurements stay readable when they are taken back or replaced, and the service may not delete them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NO_MARKS = np.zeros(3, dtype=bool)
 
 
 def last(db: Session, entity: str) -> tuple[str, str | None]:
-    """What was done last to rows of a table, and why."""
+    """Return what was done last to rows of a table, and why."""
     found = db.execute(
         select(AuditEvent.action, AuditEvent.reason).where(AuditEvent.entity == entity).order_by(AuditEvent.id.desc())
     ).first()

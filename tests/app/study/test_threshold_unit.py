@@ -1,4 +1,4 @@
-"""A threshold is held against a trace only where somebody has stated its unit and its source."""
+"""A threshold is compared with a trace only where its unit and its source are stated."""
 
 from __future__ import annotations
 

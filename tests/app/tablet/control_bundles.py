@@ -50,12 +50,12 @@ def made(folder: Path, **changes: object) -> Path:
 
 
 def of_slot(folder: Path, **changes: object) -> Path:
-    """The bundle of a session of a signed plan."""
+    """Build the bundle of a session of a signed plan."""
     return made(folder, **{"slot": SLOT, "approvals": (APPROVAL,), "ramp_ma_per_s": 1.5} | changes)
 
 
 def scheduled(folder: Path, schedule: Schedule = SCHEDULE, **changes: object) -> Path:
-    """The bundle of a random session of a signed plan."""
+    """Build the bundle of a random session of a signed plan."""
     slot = dataclasses.replace(SLOT, slot_id=8, position=3, controller="random")
     stated = {"slot": slot, "approvals": (APPROVAL,), "ramp_ma_per_s": 1.5, "min_ma": 0.9, "policy_id": None, "policy_name": "stratified"}
     path = folder / "random.zip"

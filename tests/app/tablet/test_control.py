@@ -240,7 +240,7 @@ def test_the_command_says_in_words_and_as_json_and_its_exit_code(bundle: Path) -
 
 
 def valid_runs(streamed: list[float]) -> int:
-    """Decisions that a window of 10 leaves to the policy."""
+    """Count the decisions that a window of 10 leaves to the policy."""
     runs = [len(list(group)) for valid, group in itertools.groupby(math.isfinite(v) for v in streamed) if valid]
     return sum(max(0, length - 9) for length in runs)
 

@@ -29,7 +29,7 @@ def bundle(tmp_path: Path) -> Path:
 
 
 def betaloop(*arguments: str, **options: Any) -> subprocess.Popen[str]:
-    """The command as a process of its own."""
+    """Start the command as a process of its own."""
     call = [sys.executable, "-c", "from app.cli import main; main()", *arguments]
     return subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
@@ -132,7 +132,7 @@ def test_a_process_killed_in_the_middle_of_its_loop_leaves_whole_rows(bundle: Pa
 
 @pytest.mark.hazard("H13")
 def test_a_decision_that_comes_a_period_late_is_counted_and_gives_cdbs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The machine stands still for three periods: what it then decides is about beta that is long past."""
+    """The machine pauses for three periods: what it then decides is about beta that is long past."""
     said = Signal("uV", "time_domain")
     opened = verified(made(tmp_path, period_s=0.1, ramp_ma_per_s=20.0, window=2), PUBLIC)
     run, held = Run(0.1, 3.0), []

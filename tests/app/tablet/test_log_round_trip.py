@@ -1,4 +1,4 @@
-"""A controller's log gives back what the device had: each beta beside the amplitude that was in force while it was measured."""
+"""A controller's log gives back what the device had: each beta with the amplitude that was in force while it was measured."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Device:
         self.amplitude_ma: dict[float, float] = {}
 
     def measured(self, t_end_s: float, amplitude_ma: float) -> float:
-        """Beta of the period that ends at `t_end_s` under an amplitude; float32, as every runtime takes it."""
+        """Return beta of the period that ends at `t_end_s` under an amplitude; float32, as every runtime takes it."""
         value = float(np.float32(2.2 - 0.4 * amplitude_ma + 0.3 * self._rng.standard_normal()))
         self.beta[t_end_s], self.amplitude_ma[t_end_s] = max(value, 0.05), amplitude_ma
         return self.beta[t_end_s]
@@ -138,7 +138,7 @@ def test_an_uploaded_log_is_the_session_that_the_device_had(logged: tuple[Device
     trace = client.get(f"/api/v1/sessions/{answer.json()['sessions'][0]['id']}/trace").json()
     steps = {t: a for t, a in zip(trace["t_s"], trace["amplitude_ma"], strict=True) if t > 0}
     assert steps == pytest.approx({t: a for t, a in device.amplitude_ma.items() if t > 0})
-    # a table of the same rows, as they stand, would be a step off
+    # a table of the same rows, unshifted, would be a step off
     with log.open() as stream:
         next(stream)
         next(stream)

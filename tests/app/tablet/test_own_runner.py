@@ -29,7 +29,7 @@ def unpacked(bundle: Path, folder: Path) -> Path:
 
 
 def todays(folder: Path, **changes: object) -> Path:
-    """A bundle of a slot of today, with quick decisions."""
+    """Build a bundle of a slot of today, with quick decisions."""
     now = datetime.now().astimezone()
     slot = dataclasses.replace(SLOT, visit_date=now.date().isoformat(), issued_at=(now - timedelta(minutes=1)).isoformat())
     return of_slot(folder, slot=slot, period_s=0.2, window=2, ramp_ma_per_s=50.0, **changes)

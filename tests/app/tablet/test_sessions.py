@@ -29,7 +29,7 @@ from tests.app.tablet.control_bundles import HOLDS, KEY, MORNING, PUBLIC, SLOT, 
 
 
 def run(bundle: Path, folder: Path, now: datetime = MORNING, log: str = "log.csv", **task: object) -> Outcome:
-    """A whole session on the simulated device, in the time that its computations take."""
+    """Run a whole session on the simulated device, in the time that its computations take."""
     stated = Task(log=folder / log, key=PUBLIC, ledger=folder / "ledger", **task)  # type: ignore[arg-type]
     return run_live(verified(bundle, PUBLIC), bundle.name, "simulated:P1:3", stated, now=lambda: now)[0]
 

@@ -1,4 +1,4 @@
-"""What a bundle says of amplitudes, energy and battery before it is used."""
+"""Appraisal of a bundle before it is used: amplitudes, energy and battery."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def pack(files):
 
 
 def with_file(bundle, name, content, *, restate=False):
-    """The bundle with one file changed; `restate` writes the new SHA-256 into the manifest, as a careful forger would."""
+    """Change one file of the bundle; `restate` writes the new SHA-256 into the manifest, as a careful forger would."""
     files = unpack(bundle) | {name: content}
     if restate:
         stated = json.loads(files["manifest.json"])

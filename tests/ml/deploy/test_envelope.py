@@ -22,7 +22,7 @@ UV = Signal("uV", "time_domain")
 
 
 class Answers:
-    """A network that answers what it is told and remembers what it was asked with."""
+    """A network with given answers that remembers its inputs."""
 
     def __init__(self, answer, window=3):
         self.answer, self.asked, self.window = answer, [], [0.0] * window
@@ -42,7 +42,7 @@ def constant(fraction, window=3):
 
 
 def run(network, betas, limits=LIMITS):
-    """Decisions over a stream with one sample per period; None where no sample came."""
+    """Run decisions over a stream with one sample per period; None where no sample came."""
     controller = BoundedController(network, limits, UV)
     times = [limits.period_s * k for k in range(len(betas))]
     return [controller.decide(t, None if b is None else BetaSample(t, b, UV)) for t, b in zip(times, betas, strict=True)]

@@ -1,4 +1,4 @@
-"""Policy files made elsewhere: plain networks are read from their graph and leave in every form; of others it is said why they do not."""
+"""Policy files made elsewhere: plain networks are read from their graph and leave in every form; for others the reason is given."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def single_layer(mean, std):
 
 
 def turned_around(mean, std):
-    """c - x, a negated layer, and a clip by attributes, as before opset 11."""
+    """Build c - x, a negated layer, and a clip by attributes, as before opset 11."""
     n = draw(6)
     g = Graph().add("Sub", np.full(W, mean), first=True).add("Div", std).add("Gemm", n(W, 5), n(5)).add("Neg").add("Relu")
     return g.add("Gemm", n(5, 1), [0.3]).add("Clip", min=0.0, max=1.0).file(opset=10)

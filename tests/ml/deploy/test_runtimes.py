@@ -181,7 +181,7 @@ def test_the_constants_of_the_c_header_lie_inside_the_clinicians_limits(manifest
 
 
 def random_steps(manifest, network, count, seed):
-    """A session in which anything comes at any time, and what the Python controller decides."""
+    """Draw a session in which anything comes at any time, and what the Python controller decides."""
     rng = np.random.default_rng(seed)
     signal = Signal(manifest.beta_unit, manifest.beta_source)
     controller, steps, now = BoundedController(network, manifest.limits(), signal), [], 0.0

@@ -24,7 +24,7 @@ def streamed(stretches, periods, min_valid=0.7):
 
 
 def bursts(seconds, seed=0):
-    """A 20 Hz rhythm that waxes and wanes, in noise with a drift."""
+    """Draw a 20 Hz rhythm that waxes and wanes, in noise with a drift."""
     rng = np.random.default_rng(seed)
     t = np.arange(int(seconds * RATE)) / RATE
     size = 1.0 + 0.8 * np.sin(2 * np.pi * t / 17) + 0.3 * np.repeat(rng.normal(size=seconds), int(RATE))

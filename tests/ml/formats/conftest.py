@@ -21,7 +21,7 @@ def info(ms: float = START_MS) -> dict[str, Any]:
 
 
 def header(index: int, t_s: float, size: int, kind: int = 1) -> dict[str, Any]:
-    """Header of packet number `index` whose last sample is t_s after the start."""
+    """Build the header of packet number `index` whose last sample is t_s after the start."""
     ticks = round((3.0 + t_s) * 10_000)
     return {
         "dataSize": size,
@@ -91,7 +91,7 @@ class Rcs:
         ]
 
     def stim(self, *steps: tuple[float, dict[str, Any]]) -> list[Any]:
-        """Records of (seconds after the start, delta)."""
+        """Build records of (seconds after the start, delta)."""
         return [{"RecordInfo": info(START_MS + 1000 * t), **delta} for t, delta in steps]
 
     def program(self, amplitude: float, program: int = 0) -> dict[str, Any]:
@@ -116,7 +116,7 @@ class Percept:
     def time_domain(
         self, channel: str, samples: np.ndarray, first_tick: int = PERCEPT_TICK, lost: tuple[int, ...] = (), spelling: str = "comma"
     ) -> dict[str, Any]:
-        """Packets of 125 samples every 500 ms; the packets numbered in `lost` are not there."""
+        """Build packets of 125 samples every 500 ms; the packets numbered in `lost` are missing."""
         count = samples.size // 125
         kept = [k for k in range(count) if k not in lost]
         lists = {
@@ -148,7 +148,7 @@ class Percept:
         left_ma: float = 0.0,
         right_ma: float = 2.0,
     ) -> dict[str, Any]:
-        """The device's power at 2 Hz: 100, 101, … on the sensed sides, and constant amplitudes."""
+        """Build the device's power at 2 Hz: 100, 101, … on the sensed sides, and constant amplitudes."""
         sensed = {side: side.upper() in channel for side in ("Left", "Right")}
         rows = [
             {
@@ -173,7 +173,7 @@ class Percept:
         return amplitude * np.sin(2 * np.pi * hz * np.arange(int(seconds * PERCEPT_RATE)) / PERCEPT_RATE)
 
     def report(self, **sections: Any) -> dict[str, Any]:
-        """A whole report with identity in every corner where devices put it."""
+        """Build a whole report with identity in every corner where devices put it."""
         return {
             "AbnormalEnd": False,
             "SessionDate": "2022-12-16T17:28:33Z",
@@ -195,7 +195,7 @@ class Percept:
         }
 
     def one_run(self, channel: str = "ONE_THREE_RIGHT", seconds: float = 20.0, **kwargs: Any) -> dict[str, Any]:
-        """A report of one run of one channel with a sine."""
+        """Build a report of one run of one channel with a sine."""
         domain = self.time_domain(channel, self.sine(seconds), **kwargs)
         return self.report(BrainSenseTimeDomain=[domain], BrainSenseLfp=[self.power(channel, int(2 * seconds) - 1)])
 

@@ -42,14 +42,14 @@ Members = dict[str, bytes]
 
 
 def trimmed(value: Any) -> Any:
-    """A report with the first rows of each of its lists."""
+    """Trim a report to the first rows of each of its lists."""
     if isinstance(value, list):
         return [trimmed(v) for v in value[:ROWS]]
     return {k: trimmed(v) for k, v in value.items()} if isinstance(value, dict) else value
 
 
 def small(path: Path) -> Members:
-    """The files in a recording by their names, shortened."""
+    """Return the files in a recording by their names, shortened."""
     if path.suffix == ".zip":
         with zipfile.ZipFile(path) as archive:
             members = {name: archive.read(name) for name in archive.namelist() if not name.endswith("/")}
@@ -61,7 +61,7 @@ def small(path: Path) -> Members:
 
 
 def packed(members: Members, path: Path) -> bytes:
-    """The recording as it is uploaded."""
+    """Pack the recording as it is uploaded."""
     if path.suffix != ".zip":
         return next(iter(members.values()))
     sink = io.BytesIO()
@@ -72,7 +72,7 @@ def packed(members: Members, path: Path) -> bytes:
 
 
 def edited(content: bytes, rng: random.Random) -> bytes:
-    """One edit of some bytes, of the kinds that transfers, disks and people make."""
+    """Make one edit of some bytes, of the kinds that transfers, disks and people make."""
     if not content:
         return rng.choice(PIECES)
     at = rng.randrange(len(content))
@@ -93,7 +93,7 @@ def edited(content: bytes, rng: random.Random) -> bytes:
 
 
 def variants(path: Path, number: int, rng: random.Random) -> Iterator[bytes]:
-    """The recording with one to four edits of a file in it, now and then of the archive itself."""
+    """Yield the recording with one to four edits of a file in it, now and then of the archive itself."""
     members = small(path)
     for _ in range(number):
         now = dict(members)
@@ -129,7 +129,7 @@ def read(source: Path, clean: Path) -> str:
 
 
 def readings(recordings: Path, folder: Path, each: int, seed: int) -> Counter[str]:
-    """Edit every recording, read each edit, and count what became of them; the first bytes that break a promise are kept in `folder`."""
+    """Count the results of reading edits of every recording; the first bytes that break a promise are kept in `folder`."""
     told: Counter[str] = Counter()
     for place in SOURCES:
         path = recordings / place

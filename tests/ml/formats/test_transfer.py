@@ -1,4 +1,4 @@
-"""What a decoder gave is the same on the other side of a process, bounded in size, and nothing in it can run."""
+"""Results of a decoder are the same on the other side of a process, bounded in size, and nothing in them can run."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class Simulator:
         self.settings = MdpSettings(xi_beta=self.xi)
 
     def run(self, rng: np.random.Generator, n: int, steps: int, act: Act) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Beta [n, W + T], amplitude [n, T] and (grasp, rating, tremor) [n, 3] of n sessions."""
+        """Simulate beta [n, W + T], amplitude [n, T] and (grasp, rating, tremor) [n, 3] of n sessions."""
         base = np.exp(0.05 * rng.standard_normal(n)) if self.kind == "hidden" else np.ones(n)
         beta = np.empty((n, WINDOW + steps))
         beta[:, :WINDOW] = base[:, None] + 0.15 * rng.standard_normal((n, WINDOW))
@@ -48,7 +48,7 @@ class Simulator:
         return beta, amplitude, np.stack([grasp, rating, tremor], axis=1)
 
     def buffer(self, seed: int, n: int = 20, steps: int = 300) -> ReplayBuffer:
-        """Mostly random sessions, a few of cDBS, of a proportional controller and of a constant one; lengths vary."""
+        """Simulate mostly random sessions, a few of cDBS, of a proportional controller and of a constant one; lengths vary."""
         rng = np.random.default_rng(seed)
         proportional = ProportionalPolicy(self.xi - 0.2, self.xi + 0.2, 0.3, 3)
         others: list[tuple[str, Policy]] = (
@@ -75,7 +75,7 @@ class Simulator:
         return ReplayBuffer(self.settings, tuple(sessions), "uV", "table")
 
     def policies(self) -> dict[str, Policy]:
-        """Policies of varying quality; only cDBS is among those that made the data."""
+        """Build policies of varying quality; only cDBS is among those that made the data."""
         xi = self.xi
         return {
             **{f"constant {c}": ConstantPolicy(c) for c in (0.35, 0.5, 0.65, 0.8, 1.0)},
@@ -86,7 +86,7 @@ class Simulator:
         }
 
     def truth(self, horizon: int = 300, n: int = 1000) -> dict[str, tuple[float, float]]:
-        """Expected step return and r_end of every policy, by Monte Carlo."""
+        """Compute the expected step return and r_end of every policy, by Monte Carlo."""
         s, discount = self.settings, self.settings.gamma ** np.arange(horizon)
         result = {}
         for name, policy in self.policies().items():

@@ -20,7 +20,7 @@ STEPS, GAMMA = 6, 0.9
 
 
 def exact_tables():
-    """Q and V of the target with each number of steps to go, [STEPS + 1, 2, 2] and [STEPS + 1, 2]."""
+    """Compute Q and V of the target with each number of steps to go, [STEPS + 1, 2, 2] and [STEPS + 1, 2]."""
     q, v = np.zeros((STEPS + 1, 2, 2)), np.zeros((STEPS + 1, 2))
     for left in range(1, STEPS + 1):
         q[left] = REWARD + GAMMA * GO @ v[left - 1]
@@ -29,7 +29,7 @@ def exact_tables():
 
 
 def logged(n, seed):
-    """States [n, STEPS + 1], actions and log ratios [n, STEPS] of a uniform behaviour from state 0."""
+    """Simulate states [n, STEPS + 1], actions and log ratios [n, STEPS] of a uniform behaviour from state 0."""
     rng = np.random.default_rng(seed)
     s, a = np.zeros((n, STEPS + 1), dtype=int), rng.integers(0, 2, (n, STEPS))
     for t in range(STEPS):
@@ -43,7 +43,7 @@ def temporal_errors(s, a, q, v):
 
 
 def textbook(s, a, log_ratio, q, v):
-    """Eq. 9 of Thomas and Brunskill 2016 by loops: sum of w_t r_t - (w_t Q_t - w_{t-1} V_t)."""
+    """Compute eq. 9 of Thomas and Brunskill 2016 by loops: sum of w_t r_t - (w_t Q_t - w_{t-1} V_t)."""
     n, total = len(s), 0.0
     for t in range(STEPS):
         now = np.exp(log_ratio[:, : t + 1].sum(1))

@@ -15,7 +15,7 @@ GAMMA = 0.8
 
 
 def chain(target):
-    """Every (s, a, s') as often as its probability says, one-hot: inputs now and then under a deterministic target, rewards."""
+    """Repeat every (s, a, s') by its probability, one-hot: inputs now and then under a deterministic target, rewards."""
     now, then, rewards = [], [], []
     for s in range(2):
         for a in range(2):
@@ -28,7 +28,7 @@ def chain(target):
 
 
 def exact(target):
-    """Normalised discounted distribution over (s, a) of the target from state 0, [4]."""
+    """Compute the normalised discounted distribution over (s, a) of the target from state 0, [4]."""
     p, d = np.array([1.0, 0.0]), np.zeros(4)
     for t in range(400):
         for s in range(2):

@@ -23,7 +23,7 @@ TARGET = np.array([1, 0])  # the deterministic policy
 
 
 def exact_q(horizon, gamma):
-    """Q_H(s, a) of the target policy by dynamic programming, [2, 2]."""
+    """Compute Q_H(s, a) of the target policy by dynamic programming, [2, 2]."""
     q = np.zeros((2, 2))
     for _ in range(horizon):
         v = q[np.arange(2), TARGET]
@@ -32,7 +32,7 @@ def exact_q(horizon, gamma):
 
 
 def every_transition():
-    """Each (s, a, s') as often as its probability says, one-hot over (s, a): features now, features under the policy then, rewards."""
+    """Repeat each (s, a, s') by its probability, one-hot over (s, a): features now, features under the policy then, rewards."""
     now, then, rewards = [], [], []
     for s in range(2):
         for a in range(2):

@@ -1,4 +1,4 @@
-"""One hold is one decision: weights of held draws in closed form, and abstention by name where a policy acts within a hold."""
+"""One hold is one decision: weights of sustained draws in closed form, and abstention by name where a policy acts within a hold."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WIDTH = 0.1
 
 
 def held_buffer(log_density=-0.3):
-    """A buffer of 12 random sessions whose amplitudes are held for 10 steps each."""
+    """Simulate a buffer of 12 random sessions whose amplitudes last 10 steps each."""
     w = world("A", 2)
     random = [s for s in w.data("paper").sessions if s.controller == "random"]
     rng, sessions = np.random.default_rng(0), []
@@ -108,7 +108,7 @@ def test_the_bound_of_held_sessions_is_kept_and_they_are_not_taken_for_draws_at_
     assert all(s.uniform_bound is None for s in buffer.sessions)
     stand_in, _ = clones(buffer)["random", None]
     states = buffer.transitions().states[:50]
-    np.testing.assert_array_equal(stand_in.act(states), stand_in.act(states))  # a controller that draws anew would differ
+    np.testing.assert_array_equal(stand_in.act(states), stand_in.act(states))  # a controller that draws again would differ
 
 
 def test_designed_worlds_carry_the_densities_of_their_design():

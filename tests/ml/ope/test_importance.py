@@ -25,7 +25,7 @@ from ml.trajectories import ReplayBuffer
 
 
 def textbook(log_ratio, mask, rewards, end, gamma):
-    """Per-trajectory, self-normalised and per-decision estimates by the loops of a textbook, in linear space."""
+    """Compute per-trajectory, self-normalised and per-decision estimates by the loops of a textbook, in linear space."""
     weights, returns, decisions = [], [], []
     for i in range(len(rewards)):
         w, g, d = 1.0, 0.0, 0.0
@@ -54,7 +54,7 @@ def test_the_vectorised_estimates_are_those_of_the_textbooks_loops(n, steps, gam
 
 
 def tabular(n, seed):
-    """Sessions of a two-state, two-action chain under a uniform behaviour, with the log ratios of a target policy."""
+    """Simulate sessions of a two-state, two-action chain under a uniform behaviour, with the log ratios of a target policy."""
     target = np.array([[0.8, 0.2], [0.3, 0.7]])
     go = np.array([[[0.9, 0.1], [0.4, 0.6]], [[0.5, 0.5], [0.2, 0.8]]])
     reward = np.array([[1.0, -0.5], [0.2, 2.0]])
@@ -160,7 +160,7 @@ def test_sessions_of_unknown_density_can_be_left_out_and_none_left_is_an_error(s
 
 
 def slow_cwpdis(log_ratio, mask, rewards, gamma):
-    """The weighted mean reward of each step, in linear space, by loops."""
+    """Compute the weighted mean reward of each step, in linear space, by loops."""
     total = 0.0
     for t in range(rewards.shape[1]):
         above = below = 0.0

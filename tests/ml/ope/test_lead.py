@@ -23,7 +23,7 @@ AGED = (0.0, 0.5, 1.0)
 
 
 def aged_differently(recorded: bool) -> ReplayBuffer:
-    """Sessions that began after doses of their own, which are on record or not."""
+    """Simulate sessions that began after doses of their own, which are on record or not."""
     rng, sessions = np.random.default_rng(1), []
     for i in range(24):
         before = AGED[i % 3]

@@ -37,7 +37,7 @@ def test_a_session_without_outcomes_counts_for_its_steps(small_buffer):
 
 
 def shifted_days(small_buffer, shift, seed=0):
-    """Twelve cDBS sessions on four days whose ratings differ by day."""
+    """Build twelve cDBS sessions on four days whose ratings differ by day."""
     rng = np.random.default_rng(seed)
     base = next(s for s in small_buffer.sessions if s.controller == "cdbs")
     days = shift * rng.normal(size=4)

@@ -1,6 +1,6 @@
 """Three evaluations by every method of the panel against their recorded numbers: code that moves must not move an estimate.
 
-`python tests/ml/ope/test_recorded_evaluations.py [METHOD ...]` records all methods anew, or those that it names, where numbers
+`python tests/ml/ope/test_recorded_evaluations.py [METHOD ...]` records all methods again, or those that it names, where numbers
 change on purpose; say why in CHANGELOG.
 """
 
@@ -30,12 +30,13 @@ from ml.trajectories import ReplayBuffer
 RECORDED = Path(__file__).resolve().parents[2] / "data" / "recorded-evaluations.json"
 TOLERANCE = {"dlsm": 1e-3, "dlsm_paper": 1e-3, "dlmm": 1e-3, "dual_dice": 1e-3}
 """Relative; 1e-9 for the methods that solve their equations. Networks amplify the last bits in which matrix kernels of processors differ:
-with AVX2 kernels instead of one machine's own the DLSM moved by 2.5e-7; on another processor DualDICE moved by 1.3e-5, the others less."""
+with AVX2 kernels instead of one machine's own the DLSM moved by 2.5e-7. On another processor DualDICE moved by 1.3e-5, the others less.
+"""
 METHODS = ("dlsm", "dlsm_paper", "linear", "impulse", "dlmm", "fqe", "wdr", "dual_dice", "wis", "pdis", "cwpdis", "posterior")
 HORIZON_STEPS = 50
 
 SEED = 11
-# what is held is the arithmetic, not how good the estimates are
+# what is checked is the arithmetic, not how good the estimates are
 SHORT: dict[str, Any] = {"members": 2, "rollouts": 32, "steps": 30, "check_every": 10, "replay_draws": 4}
 SMALL = SHORT | {"latent": 4, "hidden": 8, "heads": (8,)}
 FORMS = {"dlsm": replace(DlsmConfig.expert("full", SEED), **SHORT), "dlsm_paper": replace(DlsmConfig.paper("full", SEED), **SMALL)}
@@ -43,7 +44,9 @@ FORMS = {"dlsm": replace(DlsmConfig.expert("full", SEED), **SHORT), "dlsm_paper"
 
 @cache
 def buffer(name: str) -> ReplayBuffer:
-    """P1: ten sessions over two visits. P2: with a no-DBS session. P4: with invalid beta, a missing amplitude and missing QoCs."""
+    """Build a buffer. P1: ten sessions over two visits. P2: with a no-DBS session. P4: with invalid beta, a missing amplitude and missing
+    QoCs.
+    """
     if name == "P1":
         return random_controller_buffer("P1", 2, 5, 60, seed=101)
     if name == "P2":
@@ -58,7 +61,7 @@ def buffer(name: str) -> ReplayBuffer:
 
 
 def numbers(name: str, method: str) -> dict[str, Any]:
-    """What a method says of five policies, at full precision."""
+    """Estimate five policies by a method, at full precision."""
     seen = buffer(name)
     xi = seen.settings.xi_beta
     policies = {
@@ -105,7 +108,7 @@ def test_an_evaluation_gives_its_recorded_numbers(name: str, method: str) -> Non
 
 
 def differences(new: Any, old: Any, rel: float, place: str = "") -> list[str]:
-    """Places where two nested records differ."""
+    """List the places where two nested records differ."""
     if isinstance(old, dict):
         if new.keys() != old.keys():
             return [f"{place}: {sorted(new.keys() ^ old.keys())}"]

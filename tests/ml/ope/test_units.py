@@ -18,13 +18,13 @@ NETWORKS = ("dlsm", "dlsm_paper", "dlmm", "dual_dice")
 
 
 def measured_in(buffer: ReplayBuffer, unit: float) -> ReplayBuffer:
-    """The same sessions with beta and its threshold times a factor."""
+    """Multiply beta and its threshold by a factor."""
     sessions = tuple(replace(s, lead_beta=s.lead_beta * unit, beta=s.beta * unit) for s in buffer.sessions)
     return replace(buffer, settings=replace(buffer.settings, xi_beta=buffer.settings.xi_beta * unit), sessions=sessions)
 
 
 def estimated(method: str, buffer: ReplayBuffer, unit: float) -> dict[str, list[float]]:
-    """Value, interval and predictions of three policies; mean beta in the first unit."""
+    """Estimate value, interval and predictions of three policies; mean beta in the first unit."""
     xi = buffer.settings.xi_beta
     policies = {"cdbs": ConstantPolicy(1.0), "half": ConstantPolicy(0.5), "eager": ProportionalPolicy(0.7 * xi, 1.1 * xi, 0.4, 2)}
     found = estimators(3, demo=True)[method].fit(buffer).evaluate(policies, HORIZON_STEPS)

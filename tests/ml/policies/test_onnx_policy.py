@@ -24,7 +24,7 @@ def file(nodes, constants=(), *, given=("N", W), answer=("N", 1), dtype=TensorPr
 
 
 def linear(*, last="Sigmoid", weight=0.01, np_dtype=np.float32, **shape):
-    """A policy made elsewhere: weighted sum of the window, then `last`."""
+    """Build a policy made elsewhere: weighted sum of the window, then `last`."""
     constants = [numpy_helper.from_array(np.full((W, 1), weight, np_dtype), "w")]
     nodes = [helper.make_node("MatMul", ["x", "w"], ["m"]), helper.make_node(last, ["m"], ["y"])]
     kind = TensorProto.FLOAT if np_dtype == np.float32 else TensorProto.DOUBLE
@@ -154,7 +154,7 @@ def test_a_policy_whose_answer_depends_on_the_rest_of_the_batch_is_refused():
 
 
 def scaled_sigmoid(factor):
-    """Fine on the probe of flat and positive windows only if `factor` times a sigmoid of minus the window stays within the range."""
+    """Build a file that passes the probe of flat and positive windows only if `factor` times a sigmoid of minus the window is in range."""
     constants = [
         numpy_helper.from_array(np.full((W, 1), -1.0, np.float32), "w"),
         numpy_helper.from_array(np.array([factor], np.float32), "f"),

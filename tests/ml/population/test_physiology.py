@@ -1,4 +1,4 @@
-"""What the participants must do to be worth measuring policies on; each bound is the published or required one."""
+"""Requirements of participants that are worth measuring policies on; each bound is the published or required one."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def envelopes():
 
 
 def burst_seconds(envelope, threshold):
-    """Stretches above the threshold [sessions] of at least 100 ms, as bursts are counted in the literature."""
+    """Measure stretches above the threshold [sessions] of at least 100 ms, as bursts are counted in the literature."""
     durations = []
     for one, level in zip(envelope, threshold, strict=True):
         edges = np.diff(np.concatenate([[0], (one > level).astype(int), [0]]))

@@ -85,7 +85,7 @@ def returns():
 
 
 def difference(one, other):
-    """Mean and standard error of the paired difference between two truths over the same sessions."""
+    """Compute the mean and standard error of the paired difference between two truths over the same sessions."""
     paired = one.returns - other.returns
     return paired.mean(), paired.std(ddof=1) / np.sqrt(paired.size)
 

@@ -89,7 +89,7 @@ def test_a_u_is_best_at_its_half_and_worse_at_full_amplitude():
 
 
 def quiet(kind=0, **changes):
-    """A patient without noise, drift, days and other mechanisms' parts."""
+    """Build a patient without noise, drift, days and other mechanisms' parts."""
     none = dict.fromkeys(
         ("noise", "drift_sd", "act_beta", "act_half", "act_need", "act_tolerance", "day_level", "day_gain", "day_half", "day_need",
          "session_level", "med_beta", "med_need", "ring_gain"),

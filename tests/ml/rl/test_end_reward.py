@@ -17,7 +17,7 @@ SETTINGS = MdpSettings(xi_beta=1.0)
 
 
 def buffer(grasp, sessions=16, steps=60, seed=0):
-    """Random amplitudes around a level of each session, beta without memory; `grasp(a, beta)` is the session's only QoC."""
+    """Simulate random amplitudes around a level of each session, beta without memory; `grasp(a, beta)` is the session's only QoC."""
     rng = np.random.default_rng(seed)
     made = []
     for k in range(sessions):
@@ -62,12 +62,12 @@ def test_shares_and_step_rewards_stand_in_the_proportion_of_the_return():
 
 
 def told_of(share, session):
-    """r_end that the share tells of a session."""
+    """Compute the r_end that the share gives a session."""
     return float(share.per_step(session).mean()) / share.factor
 
 
 def told_at(share, level):
-    """r_end that the share tells of a session at a constant amplitude, beta at 0.5."""
+    """Compute the r_end that the share gives a session at a constant amplitude, beta at 0.5."""
     return told_of(share, SessionTrajectory(0, 1, "other", np.full(10, 0.5), np.full(20, 0.5), np.full(20, float(level))))
 
 
@@ -133,7 +133,7 @@ def test_steps_with_a_gap_have_no_share():
 
 
 def test_a_dose_is_worth_more_in_minutes_of_high_beta_where_tremor_goes_by_both():
-    # tremor comes where beta is high and the dose low: the dose has nothing to mend in quiet minutes
+    # tremor comes where beta is high and the dose low: the dose has nothing to improve in quiet minutes
     rng, made = np.random.default_rng(4), []
     for k in range(36):
         a = np.full(300, rng.uniform(0, 1))
@@ -146,7 +146,7 @@ def test_a_dose_is_worth_more_in_minutes_of_high_beta_where_tremor_goes_by_both(
     assert share is not None
 
     def worth(beta):
-        """What the whole dose adds beside none, r_end units."""
+        """Compute what the whole dose adds over none, r_end units."""
         told = []
         for level in (0.0, 1.0):
             session = SessionTrajectory(0, 1, "other", np.full(10, beta), np.full(300, beta), np.full(300, level))

@@ -1,14 +1,14 @@
 """Six policies from three visits of a synthetic participant, against controllers without learning.
 
-Coefficients are the publications'. Three of the six are of an earlier six that was measured on these data sets; in the other three cDBS
-holds the actor instead of the logged action (`anchor`), because logged actions of the random controller are draws that nobody prefers:
-they, and everything else here, were fixed before their true returns were seen, but for one rule. That a state may be kept only where it
-stays in the random controller's range was added after a data set of another seed had gone wrong; it changes none of these three here.
+Coefficients are the publications'. Three of the six are of an earlier six that was measured on these data sets. In the other three cDBS
+anchors the actor instead of the logged action (`anchor`), because logged actions of the random controller are draws without a preference.
+They, and everything else here, were fixed before their true returns were seen, but for one rule. A state may be kept only where it stays in
+the random controller's range. That rule was added after a data set of another seed had gone wrong; it changes none of these three here.
 
-Nothing in training or selection sees a true return: the best state of each training is chosen by fitted Q evaluation on left-out sessions
-among those in range (`ml.policies.logged_range`); the policy to prefer by the lower bound of its estimated gain over cDBS
-(`ml.ope.compare.selection`), and none is where no bound lies above 0. True returns are for measuring alone, and all controllers meet the
-same days and noise.
+Nothing in training or selection sees a true return. The best state of each training is chosen by fitted Q evaluation on held-out sessions
+among those in range (`ml.policies.logged_range`). The policy to prefer is chosen by the lower bound of its estimated gain over cDBS
+(`ml.ope.compare.selection`), and none where no bound is above 0. True returns are for measuring alone, and all controllers meet the same
+days and noise.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ DAYS = 40
 
 @dataclass(frozen=True)
 class Learned:
-    """One of the six: how it was trained, what the data say of it, what is true of it; whether its critic's sum holds shares of r_end."""
+    """One of the six: its training, its estimates, its truth, and whether its critic's sum holds shares of r_end."""
 
     label: str
     training: TrainedPolicy
@@ -56,7 +56,7 @@ class Learned:
     shares: bool
 
     def over_estimate(self, gamma):
-        """Q(s_0, pi(s_0)) of the state that was kept, less the true value of what its critic sums, continued for ever at its own rate."""
+        """Compute Q(s_0, pi(s_0)) of the kept state, less the true value of what its critic sums, continued for ever at its own rate."""
         watched = self.training.held_out
         kept = watched["update"] == (self.training.best_update or watched["update"][-1])
         true = float(self.returns.mean()) if self.shares else self.step_return
@@ -64,12 +64,12 @@ class Learned:
 
 
 def kind(changes):
-    """What policies trained side by side must share."""
+    """Return what policies trained side by side must share."""
     return changes.get("aim", "steps"), changes.get("anchor", "logged")
 
 
 def six_policies(train, watch):
-    """The six trainings in the order of `SIX`; those of one algorithm, aim and anchor side by side."""
+    """Train the six in the order of `SIX`; those of one algorithm, aim and anchor side by side."""
     trained = [None] * len(SIX)
     for name, shared in dict.fromkeys((name, kind(changes)) for name, changes in SIX):
         places = [k for k, (own, changes) in enumerate(SIX) if (own, kind(changes)) == (name, shared)]

@@ -1,4 +1,4 @@
-"""Critics that remember past amplitudes: against a closed form, and where a window of beta cannot tell what a dose does."""
+"""Critics that remember past amplitudes: against a closed form, and where a window of beta cannot show what a dose does."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_rows_of_transitions_get_the_memory_of_their_own_step() -> None:
 
 
 def delayed(count: int = 4000) -> tuple[Transitions, tuple[np.ndarray, np.ndarray]]:
-    """The reward is three times the mean amplitude of the last ten seconds less the amplitude of now; beta is chance.
+    """Simulate a reward of three times the mean amplitude of the last ten seconds less the amplitude of now; beta is chance.
 
     A dose of a is worth 3 a - a for ever, so that 1 is best. What pays for it comes later and shows in no window: by the window alone an
     amplitude only costs, and 0 is best.

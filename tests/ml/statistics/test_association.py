@@ -1,4 +1,4 @@
-"""Associations within and between visits, told apart."""
+"""Associations within and between visits, separated."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def test_intervals_have_no_unit_however_large_the_values(scale):
 
 def test_a_correction_that_reverses_gives_the_percentile_interval_and_says_so():
     draws = np.linspace(0.0, 1.0, 10**5)
-    # every draw lies below the estimate, and one session of 500 carries all of it: bias 4.4, acceleration 0.17
+    # every draw is below the estimate, and one session of 500 carries all of it: bias 4.4, acceleration 0.17
     one_of_many = np.append(np.ones(499), 0.0)
     assert bca_interval(draws, 2.0, one_of_many, 0.8).method == "bca"
     reversed_at = bca_interval(draws, 2.0, one_of_many, 0.999)

@@ -11,7 +11,7 @@ from ml.statistics.within_visits.contrasts import Measurements, Reason, Unavaila
 
 
 def energies(shares, each=2, unit=1.0):
-    """cDBS at `unit`, the controller saving a share at each visit."""
+    """Build cDBS at `unit`, the controller saving a share at each visit."""
     visit = np.repeat(np.arange(len(shares)), 2 * each)
     arms = np.tile(np.repeat([False, True], each), len(shares))
     return Measurements.of(unit * np.where(arms, 1 - np.array(shares)[visit], 1.0), visit, arms)

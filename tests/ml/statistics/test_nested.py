@@ -1,5 +1,7 @@
-"""Sessions within visits without a column of their own, against the same model with one dense column per level, which is slow to read rows
-into but plain: the equations are then those of `MixedModel` over all columns."""
+"""Sessions within visits without a column of their own, against the same model with one dense column per level.
+
+The dense model is slow to read rows into but plain: its equations are those of `MixedModel` over all columns.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +34,12 @@ class Twin:
         self.nested = SessionSums(np.stack([rows.T @ rows for rows in joint]), np.array([len(part) for part in y]), VISIT)
 
     def sums(self, without: int | None = None) -> Sums:
-        """Of all rows, or of those outside one session."""
+        """Sum over all rows, or over those outside one session."""
         kept = [i for i in range(len(VISIT)) if i != without]
         return Sums.of(np.concatenate([self.parts[i] for i in kept]), np.concatenate([self.y[i] for i in kept]))
 
     def left_out(self, i: int, ratios: Floats, noise: Floats, rng: np.random.Generator) -> Floats:
-        """Draws of all coefficients for noise [D, q] from all sessions but one, by the Cholesky factor of the whole matrix."""
+        """Draw all coefficients for noise [D, q] from all sessions but one, by the Cholesky factor of the whole matrix."""
         sums = self.sums(i)
         live = np.flatnonzero(np.diag(sums.gram) > 1e-12)
         penalty = np.full(self.model.columns, 1e-10 * np.trace(sums.gram))
@@ -56,7 +58,7 @@ class Twin:
 
 
 def twin(unit: float = 1.0, empty: bool = False) -> Twin:
-    """Eight sessions in four visits whose levels differ; with `empty`, one session has no row."""
+    """Build eight sessions in four visits whose levels differ; with `empty`, one session has no row."""
     rng = np.random.default_rng(5)
     columns, y = [], []
     visits, sessions = rng.normal(size=4), 0.5 * rng.normal(size=len(VISIT))

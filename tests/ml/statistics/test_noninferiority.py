@@ -155,7 +155,7 @@ def test_the_rating_may_be_judged_by_the_win_probability():
 
 
 def ratings(one, two, visits=6, margin=1.0, scale="ordinal"):
-    """The same ratings of either arm at every visit, but for one session of cDBS that differs from visit to visit."""
+    """Build equal ratings of either arm at every visit, but for one session of cDBS that differs from visit to visit."""
     value = np.concatenate([np.r_[one, two, 7 + v % 2] for v in range(visits)])
     arms = np.tile(np.r_[np.ones(len(one)), np.zeros(len(two) + 1)] == 1, visits)
     visit = np.repeat(np.arange(visits), len(one) + len(two) + 1)
@@ -247,7 +247,7 @@ def test_margins_that_mean_nothing_are_refused_in_words():
 
 
 def test_a_failure_is_not_explained_away_as_a_drift():
-    # the stopped sessions stand last in their visits, where a drift fitted through them would take them out of the contrast
+    # the stopped sessions are last in their visits, where a drift fitted through them would take them out of the contrast
     visit, place = np.repeat(np.arange(5), 7), np.tile(np.arange(7.0), 5)
     arms = np.tile([False, True, False, True, False, True, True], 5)
     stopped = (place == 6) & (visit < 4)

@@ -1,7 +1,7 @@
-"""The statistics against R: `tests/data/r-reference.R` made tables with R 4.2.2: coin 1.4-2, lmerTest 3.1-3, lme4 1.1-31, metafor 3.8-1.
+"""The statistics against R. `tests/data/r-reference.R` made tables with R 4.2.2: coin 1.4-2, lmerTest 3.1-3, lme4 1.1-31, metafor 3.8-1.
 
-The values are stored, so that no R is needed here. Where ties meet groups of unequal size, coin's two-sided p counts every outcome that
-lies as far from the mean as the observed one; ours doubles the smaller tail. One-sided p-values are the same number in both.
+The values are stored, so that no R is needed here. Where ties meet groups of unequal size, coin's two-sided p counts every outcome that is
+as far from the mean as the observed one. Ours doubles the smaller tail. One-sided p-values are the same number in both.
 """
 
 from __future__ import annotations

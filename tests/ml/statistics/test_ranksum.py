@@ -101,7 +101,7 @@ SIZES = [(n, m) for n in range(1, 7) for m in range(1, 7)]
 
 
 def covers(found: RankSum, shift: float) -> bool:
-    """Whether the interval holds a shift; one that does not exist leaves every shift open."""
+    """Check whether the interval holds a shift; one that does not exist leaves every shift open."""
     return found.low is None or found.high is None or found.low <= shift <= found.high
 
 

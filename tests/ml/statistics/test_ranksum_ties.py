@@ -14,7 +14,7 @@ from ml.statistics.ranksum import rank_sum, u_distribution_given_ties
 
 
 def enumerated_p(x: list[float], y: list[float]) -> float:
-    """Two-sided p: twice the smaller tail of U over every choice of the first group."""
+    """Compute the two-sided p: twice the smaller tail of U over every choice of the first group."""
     pooled = np.array([*x, *y])
     us = []
     for chosen in combinations(range(pooled.size), len(x)):

@@ -25,7 +25,7 @@ ADA = "ada@clinic.example"
 
 @pytest.fixture
 def ada(client: TestClient) -> TestClient:
-    """Somebody who reads the first study, signed in with a browser."""
+    """A user who reads the first study, signed in with a browser."""
     with transaction("test") as db:
         accounts.add_user(db, ADA, Role.VIEWER, PASSWORD)
     return browser(client, ADA)

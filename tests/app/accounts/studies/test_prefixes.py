@@ -1,4 +1,4 @@
-"""Participants' codes of two studies: each has its own beginning, and nobody is told which codes the other study has."""
+"""Participants' codes of two studies: each has its own beginning, and neither shows which codes the other study has."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def enrol(client: TestClient, code: str, site: str) -> Any:
 
 
 def stranger(client: TestClient, study: str) -> TestClient:
-    """Somebody who enrols in one study and sees no other."""
+    """Create a user who enrols in one study and sees no other."""
     with transaction("test") as db:
         accounts.add_user(db, f"eve@{study}.example", Role.COORDINATOR, PASSWORD, study_code=study)
         token = accounts.create_token(db, f"eve@{study}.example", "tests")
@@ -36,7 +36,7 @@ def stranger(client: TestClient, study: str) -> TestClient:
 
 
 def test_who_enrols_learns_no_code_of_another_study(client: TestClient) -> None:
-    """A code that the other study has and one that nobody has are answered alike, in the interface and on the page."""
+    """A code that the other study has and an unused one are answered alike, in the interface and on the page."""
     assert add(client, "ADAPT").json()["code_prefix"] == "ADAPT-"
     assert [enrol(client, code, site).status_code for code, site in (("ADAPT-7", "ADAPT"), ("P7", "main"))] == [201, 201]
     of_main, of_adapt = stranger(client, "main"), stranger(client, "ADAPT")
@@ -44,7 +44,7 @@ def test_who_enrols_learns_no_code_of_another_study(client: TestClient) -> None:
     for who, there, nowhere in pairs:
 
         def said(answer: Any, there: str = there, nowhere: str = nowhere) -> str:
-            """An answer without its own number, and as if it were about the code that nobody has."""
+            """Return an answer without its own number, and as if it were about the unused code."""
             return re.sub(r'"request_id":"[0-9a-f]+"|(?<=request )[0-9a-f]{16}', "", answer.text).replace(there, nowhere)
 
         first, second = (who.post("/api/v1/participants", json={"code": code}) for code in (there, nowhere))
@@ -91,7 +91,7 @@ def test_a_code_too_long_for_a_prefix_asks_for_one(client: TestClient) -> None:
 
 
 def test_a_study_of_earlier_versions_gets_its_prefix_once(client: TestClient, db: Session) -> None:
-    """Its older codes stay, and until it has one another study without a prefix is told that a code is taken."""
+    """Its older codes stay, and until it has one another study without a prefix learns that a code is taken."""
     db.add(study := Study(code="old", name="Old"))
     db.flush()
     db.add(Site(study_id=study.id, code="old", name="Old"))
@@ -111,7 +111,7 @@ def test_a_study_of_earlier_versions_gets_its_prefix_once(client: TestClient, db
 
 
 def test_only_who_administers_all_studies_gives_a_prefix(client: TestClient) -> None:
-    """What stands in the way of a prefix may be another study's."""
+    """An obstacle to a prefix may be another study's."""
     assert add(client, "ADAPT").status_code == 201
     with transaction("test") as db:
         accounts.add_user(db, "eve@clinic.example", Role.ADMIN, PASSWORD, study_code="main")

@@ -20,7 +20,7 @@ Clients = Callable[[str], TestClient]
 
 
 def add_second(client: TestClient) -> None:
-    """A second study with two sites, made by the administrator of the first."""
+    """Add a second study with two sites, made by the administrator of the first."""
     made = client.post("/api/v1/studies", json={"code": "ADAPT", "name": "Adaptive", "site": {"code": "north", "name": "North"}})
     assert made.status_code == 201, made.text
     assert client.post("/api/v1/studies/ADAPT/sites", json={"code": "south", "name": "South"}).status_code == 201

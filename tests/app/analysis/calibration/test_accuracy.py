@@ -78,7 +78,7 @@ def test_nothing_is_divided_by_a_range_within_the_noise_of_a_session() -> None:
         assert (row.mae_of_range.value, row.regret_of_range.value) == (None, None)
         assert "closer together than sessions of one policy" in row.mae_of_range.missing
         assert row.mae.value == pytest.approx(29.5)
-    # nobody was tested twice: a range of 1 around 80 is none either, and one of 20 is
+    # no policy was tested twice: a range of 1 around 80 is none either, and one of 20 is
     assert accuracies("fqe", [pair(109.5, 80.0), pair(110.5, 81.0)])[0].mae_of_range.value is None
     assert accuracies("fqe", [pair(109.5, 80.0), pair(110.5, 100.0)])[0].mae_of_range.value == pytest.approx(1.0)
     # two sessions that agree by chance say nothing of the noise

@@ -37,7 +37,7 @@ def calibration(client: TestClient) -> dict[str, Any]:
 
 
 def by_hand(client: TestClient, session: int, level: float, horizon: int = 60) -> float:
-    """r_end + discounted rewards of the first H steps, from the trace as the REST interface gives it."""
+    """Compute r_end + discounted rewards of the first H steps, from the trace as the REST interface gives it."""
     beta = np.array(client.get(f"/api/v1/sessions/{session}/trace").json()["beta"][10 : 10 + horizon])
     steps = np.where(beta < 1.0, 0.0, -1.0) - 0.3 * level
     return float(steps @ 0.99 ** np.arange(beta.size) + 10 * 2.0 + 10 * 8 - 10 * 0.2)

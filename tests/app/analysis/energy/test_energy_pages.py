@@ -1,4 +1,4 @@
-"""What stimulation took, by every measure; a battery's days under stated assumptions."""
+"""Energy of stimulation by every measure; a battery's days under stated assumptions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PATH = "/api/v1/participants/P1/analyses/energy"
 
 
 def logged(db: Session, width_us: float, rate_hz: float) -> None:
-    """Every recording says its pulses from its start on."""
+    """Write the pulses of every recording, from its start on."""
     state = {"rate_hz": rate_hz, "programs": [{"program": 0, "amplitude_ma": 3.0, "pulse_width_us": width_us}]}
     for recording in db.scalars(select(Recording)):
         recording.details = {"events": [{"t_s": 0.0, "kind": "stimulation", "label": "", "data": state}, {"t_s": 1.0, "kind": "note"}]}

@@ -21,7 +21,7 @@ Upload = Callable[..., int]
 
 
 def evaluated(db: Session, snapshot: BufferSnapshot, seed: int, horizon: int, values: dict[int, float], preset: str = "full") -> None:
-    """An evaluation of one seed."""
+    """Store an evaluation of one seed."""
     table = {"estimates": {str(i): estimate("dlsm", v) for i, v in values.items()}}
     config = {"seed": seed, "preset": preset}
     store_evaluation(

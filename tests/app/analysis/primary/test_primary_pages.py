@@ -1,4 +1,4 @@
-"""What the visits have shown: over REST, as pages, as a table; and the sentences where nothing can be shown."""
+"""Results of the visits: over REST, as pages, as a table; and the sentences where nothing can be shown."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_the_lock_holds_what_was_locked_and_new_margins_need_a_new_one(client: T
 
 
 def relock(client: TestClient, **margins: float) -> None:
-    """New margins, locked."""
+    """Change the margins and lock them."""
     change = client.put("/api/v1/participants/P1/margins", json={"margins": margins, "reason": "after the interim look"}).json()
     body = {"version": change["version"], "reason": "protocol 4", "password": PASSWORD}
     assert client.post("/api/v1/participants/P1/margins/locks", json=body).status_code == 201

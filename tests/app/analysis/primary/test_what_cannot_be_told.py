@@ -33,13 +33,13 @@ def session(number: int, visit: int, controller: Controller, values: Mapping[str
 
 
 def study(values: Iterable[Mapping[str, float | None]], each: int = 2) -> list[Facts]:
-    """One visit for each entry, so many sessions of either arm in it."""
+    """Build one visit for each entry, so many sessions of either arm in it."""
     planned = [(visit, c, v) for visit, v in enumerate(values, start=1) for _ in range(each) for c in (CDBS, RL)]
     return [session(i, *p) for i, p in enumerate(planned)]
 
 
 def varied(visits: int, **fixed: float | None) -> list[Facts]:
-    """Sessions that differ from each other, but for what is given."""
+    """Build sessions that differ from each other, but for what is given."""
     made = study([SAME] * visits, each=4)
     for k, s in enumerate(made):
         values = {name: v[(7 * k + s.visit * (k % 3)) % 4] for name, v in VARIED.items()} | fixed
@@ -125,7 +125,7 @@ def test_each_reason_has_a_sentence_of_its_own() -> None:
     sentences = {primary_words.verdict_sentence("RL", found, 5, planned=True) for found in asked}
     assert len(sentences) == len(Reason) + 1
     assert all(s.endswith(".") and ".." not in s and ". " not in s for s in sentences)
-    # nothing is said about further visits where it was not asked, but what could not be tested is
+    # nothing is reported about further visits where it was not requested, but what could not be tested is
     beyond, tied = Inconclusive(("grasp",), None), Inconclusive(("grasp",), None, (("grasp", Reason.ALL_EQUAL),))
     assert ";" not in primary_words.verdict_sentence("RL", beyond, 5, planned=False)
     assert ";" in primary_words.verdict_sentence("RL", tied, 5, planned=False)

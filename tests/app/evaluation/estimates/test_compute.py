@@ -1,4 +1,4 @@
-"""What the child processes of evaluation give, called directly: every method but the DLSM, on data that it can and cannot work on."""
+"""Results of evaluation's child processes, called directly: every method but the DLSM, on data that it can and cannot work on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ FITTED = [m for m in registry.method_keys() if m not in ("dlsm", registry.AGGREG
 
 
 def sessions(lead: float = 1.0) -> tuple[SessionTrajectory, ...]:
-    """Nine sessions of three controllers over two visits; `lead` is the beta before them, NaN where recording began with the first step."""
+    """Build nine sessions of three controllers over two visits; `lead` is the beta before them, NaN where recording began with the first
+    step.
+    """
     rng = np.random.default_rng(5)
     made = []
     for k, controller in enumerate(("random", "cdbs", "random", "no_dbs", "random", "cdbs", "random", "no_dbs", "random")):
@@ -42,7 +44,7 @@ def sessions(lead: float = 1.0) -> tuple[SessionTrajectory, ...]:
 
 
 def call(db: Session, buffer: ReplayBuffer, **more: Any) -> dict[str, Any]:
-    """Params of a compute function on a stored buffer, with one policy that holds 0.6."""
+    """Build params of a compute function on a stored buffer, with one policy of constant 0.6."""
     stored = files.store(db, to_parquet(buffer)).sha256
     policy = files.store(db, constant_onnx(0.6, 10)).sha256
     return {

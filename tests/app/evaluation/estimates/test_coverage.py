@@ -1,4 +1,4 @@
-"""What the data can say stands before the estimates: stored with the evaluation, worded; a failed check counts for every method."""
+"""Coverage by the data comes before the estimates: stored with the evaluation, worded; a failed check counts for every method."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ FEW = Flag.of("weights_need_sessions", 1.23, 10.0, "sessions", sessions=4.0)
 
 
 def checked(*, failing: tuple[Flag, ...] = (), notes: tuple[Flag, ...] = ()) -> dict[str, Any]:
-    """What `Diagnostics.to_json` gives of one policy."""
+    """Build what `Diagnostics.to_json` gives of one policy."""
     values = {"outside_range": (0.4 if failing else 0.0, 0.2, "refused" if failing else "passed"), "thin": (0.1, 0.2, "noted")}
     values |= {"far": (0.004, 0.2, "passed"), "below_random_bound": (None, 0.05, "told")}
     values |= {"unseen_dose": (0.7 if notes else 0.0, 0.05, "noted" if notes else "passed"), "distance": (0.314, None, "told")}
@@ -64,7 +64,9 @@ def checked(*, failing: tuple[Flag, ...] = (), notes: tuple[Flag, ...] = ()) -> 
 
 @pytest.fixture
 def store(db: Session, policies: list[int]) -> Callable[..., Evaluation]:
-    """Store an evaluation by the posterior and two methods, with a coverage outcome; cDBS is at 45, the candidates at 60, 99 and 50."""
+    """Function that stores an evaluation by the posterior and two methods, with coverage; cDBS is at 45, the candidates at 60, 99 and
+    50.
+    """
 
     def make(outcome: Callable[[list[int]], dict[str, Any]] | dict[str, Any] | None) -> Evaluation:
         participant = participant_by_code(db, "P1", SYSTEM)

@@ -31,12 +31,12 @@ SETTINGS = "/api/v1/participants/P1/settings"
 
 
 def said(shape: int) -> dict[str, Any]:
-    """What an evaluation stores of a participant of whom one shape of the grasp is known."""
+    """Build what an evaluation stores of a participant of whom one shape of the grasp is known."""
     return {"shapes": dose_shapes.KNOWN, "evidence": {"grasp": [30.0 * (k == shape) for k in range(K)]}, "pooling": {}}
 
 
 def proof(*shapes: int) -> dict[str, Any]:
-    """What is found of pooling the grasp of participants whose shapes are known, the first one's own."""
+    """Pool the grasp of participants whose shapes are known, the first one's own; return the proof."""
     first, *others = (said(k)["evidence"] for k in shapes)
     return pool(first, others).proofs["grasp"].to_json()
 
@@ -46,7 +46,7 @@ def enrol(client: TestClient, code: str, site: str = "main") -> None:
 
 
 def store(db: Session, code: str, like: int, told: dict[str, Any]) -> int:
-    """An evaluation of a participant, in all but its diagnostics like another one."""
+    """Store an evaluation of a participant, in all but its diagnostics like another one."""
     other = db.get_one(Evaluation, like)
     copied = {c.key: getattr(other, c.key) for c in Evaluation.__table__.columns if c.key not in ("id", "job_id", "created_at")}
     owner = participant_by_code(db, code, SYSTEM).id

@@ -1,4 +1,4 @@
-"""What left-out controllers showed of each method: its intervals, the combination, what is stored and shown."""
+"""Results of each method on held-out controllers: its intervals, the combination, what is stored and shown."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def build(key: str, seed: int, size: Size) -> MeanOfSessions:
 
 
 def evaluate_here(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
-    """`evaluate_method` in a child that knows the method of this file."""
+    """Run `evaluate_method` in a child that knows the method of this file."""
     registry.register(MEAN)
     return evaluate_method(params, workdir, report)
 

@@ -1,4 +1,4 @@
-"""One row of the ranking is one behaviour: who asks for the same stands together, whatever each was trained from."""
+"""One row of the ranking is one behaviour: policies with the same amplitudes are together, whatever each was trained from."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ WORSE = {"outcome_draws": {"tremor_percent": [45.0] * N}}
 
 
 def apart(policies: list[int], ab: float, ac: float = 0.3, bc: float = 0.3) -> dict[str, Any]:
-    """What an evaluation stores of three policies that are so far apart."""
+    """Build what an evaluation stores of three policies that are so far apart."""
     a, b, c = map(str, policies)
     found = stored_map(policies[0])
     return {"policies": {}, "map": {**found["map"], "apart": {a: {b: ab, c: ac}, b: {c: bc}}}}  # type: ignore[dict-item]
 
 
 def rows(client: TestClient) -> dict[str, list[str]]:
-    """Names of the table's rows, each with those that are said to do the same."""
+    """List names of the table's rows, each with those listed as doing the same."""
     page = client.get(PAGE).text
     body = re.search(r'id="candidates".*?</table>', page, re.S)
     assert body is not None

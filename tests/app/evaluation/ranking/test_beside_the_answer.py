@@ -1,4 +1,4 @@
-"""What stands beside the answer of the ranking: the best fixed amplitude, and the sessions to hold where no policy is worth a test."""
+"""Additions to the answer of the ranking: the best fixed amplitude, and sessions near an amplitude where no policy is worth a test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sessions that would settle what the recordings cannot tell: how many, near which amplitude, for which policies."""
+"""Sessions that would settle what the recordings leave open: how many, near which amplitude, for which policies."""
 
 from __future__ import annotations
 

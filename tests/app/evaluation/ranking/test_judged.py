@@ -1,4 +1,4 @@
-"""What follows from an evaluation is computed once, and again as soon as anything that it depends on is another."""
+"""Consequences of an evaluation are computed once, and again as soon as anything that they depend on changes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PAGES = (
 
 
 def seen(client: TestClient, policies: list[int]) -> list[str]:
-    """Everything that shows what was estimated: the interface's ranking and the pages."""
+    """Read everything that shows what was estimated: the interface's ranking and the pages."""
     answers = [client.get("/api/v1/participants/P1/ranking")]
     answers += [client.get(path.format(*policies), headers={"accept": "text/html"}) for path in PAGES]
     assert [a.status_code for a in answers] == [200] * len(answers)

@@ -27,7 +27,7 @@ PAGE = "/participants/P1/ranking"
 
 
 def stored_map(policy: int) -> dict[str, object]:
-    """A policy that asks for 0.4 of cDBS at every beta, over sessions that held 0.5 to 0.55."""
+    """Build the map of a policy that requests 0.4 of cDBS at every beta, over sessions at 0.5 to 0.55."""
     curve = Curve((0.4,) * COLUMNS, (0.3,) * COLUMNS, (0.5,) * COLUMNS)
     tried = tuple(tuple(7 if row == 10 else 0 for row in range(DOSES)) for _ in range(COLUMNS))
     edges = tuple(1.0 + 0.1 * k for k in range(COLUMNS + 1))
@@ -62,7 +62,7 @@ def test_a_ranking_of_before_says_how_to_get_the_figure(client: TestClient, poli
 
 
 def more_policies(client: TestClient, wanted: int) -> list[int]:
-    """Ids of further policies made elsewhere, named q0 and on."""
+    """Upload further policies made elsewhere, named q0 and on; return their ids."""
     files = [(f"q{k}", {"file": (f"q{k}.onnx", constant_onnx(0.30 + 0.01 * k, 10))}) for k in range(wanted)]
     answers = [client.post("/api/v1/participants/P1/policies", data={"name": name}, files=file) for name, file in files]
     return [int(answer.json()["id"]) for answer in answers]

@@ -298,7 +298,7 @@ def test_the_filter_keeps_ranks_and_says_how_many_it_leaves_out(
 def test_an_evaluation_without_a_posterior_proposes_nothing_and_says_so(
     client: TestClient, policies: list[int], evaluate: Callable[..., int]
 ) -> None:
-    """Nothing can be told without the chances of outcomes, but a certain loss is unsafe."""
+    """Nothing can be decided without the chances of outcomes, but a certain loss is unsafe."""
     a, b, c = policies
     evaluate({a: estimate("dlsm", 60.0), b: estimate("dlsm", 30.0), c: estimate("dlsm", 70.0, supported=False)}, {1.0: 45.0})
     found = {p["policy_id"]: p for p in ranked(client)["policies"]}

@@ -179,7 +179,7 @@ def test_what_a_transaction_read_before_a_change_does_not_hide_it(client: TestCl
     participant = participant_by_code(db, "P1", SYSTEM)
     evaluation = repository.newest_evaluation(db, participant.id)
     assert evaluation is not None
-    read = sessions_of_participant(db, participant.id)  # a page reads sessions, and meanwhile somebody else excludes one
+    read = sessions_of_participant(db, participant.id)  # a page reads sessions, and meanwhile another user excludes one
     assert not any(s.excluded_reason for s in read)
     client.patch("/api/v1/sessions/1", json={"excluded_reason": "tablet froze"})
     here = [wording.sentence(reason) for reason in stale_reasons(db, participant, evaluation)]

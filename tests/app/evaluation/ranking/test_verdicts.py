@@ -38,7 +38,7 @@ Judge = Callable[..., int]
 
 
 def few_near(sessions: int) -> dict[str, Any]:
-    """The finding that too few sessions are near, as it is stored."""
+    """Build the finding that too few sessions are near, as it is stored."""
     return Flag.of("few_near_sessions", float(sessions), 2.0, "sessions", refuses=True, dose=0.6).to_json()
 
 
@@ -50,7 +50,7 @@ def ranked(client: TestClient) -> dict[str, Any]:
 
 
 def first_screen(client: TestClient) -> str:
-    """The page's words above the fold."""
+    """Return the page's words above the fold."""
     page = client.get(PAGE)
     assert page.status_code == 200
     return above_fold(page.text)
@@ -242,7 +242,7 @@ def test_the_keyboard_reaches_the_first_tick_in_fifteen_tabs(client: TestClient,
     skips = before[: before.index('href="#candidates"')]
     way = after[: after.index('name="policy_ids"')]
     focusable = r"<(?:a|button|input(?! type=.hidden)|select|summary|textarea)\b"
-    # a script makes a button of each head of a column; the way is: the links that skip, then from the table to its first tick
+    # A script makes a button of each head of a column. The way is: the links that skip, then from the table to its first tick
     assert len(re.findall(focusable, skips)) + len(re.findall(focusable, way)) + len(re.findall("<th\\b", way)) <= 15
 
 

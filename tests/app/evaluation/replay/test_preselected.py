@@ -19,13 +19,13 @@ WORSE = {"outcome_draws": {"tremor_percent": [45.0] * N}}
 
 
 def link(client: TestClient, page: str) -> str:
-    """Where a page leads for a comparison."""
+    """Find where a page leads for a comparison."""
     (found,) = re.findall(r'href="([^"]*/compare[^"]*)"', client.get(page).text)
     return unescape(found)
 
 
 def compared(client: TestClient, path: str) -> tuple[int, list[str]]:
-    """The session and the policies with which a comparison opens."""
+    """Return the session and the policies with which a comparison opens."""
     answer = client.get(path)
     assert answer.status_code == 200, answer.text
     named = [re.search(r'<option value="(\d+)" selected>([^<]*)<', select) for select in answer.text.split("<select")[1:]]

@@ -31,7 +31,7 @@ T0_MS = 1_772_445_600_000
 
 
 def strange(rows: int = 20, begin_ms: int = T0_MS, beta: float = 1.0, title: str = "Export of the clinic's system") -> bytes:
-    """Steps as a program of a clinic writes them: a title, its own names, a line of units, Unix milliseconds, decimal commas."""
+    """Write steps as a program of a clinic does: a title, its own names, a line of units, Unix milliseconds, decimal commas."""
     head = f"{title}\n\nZeit;Signal links;Signal rechts;Strom links;Strom rechts;Kommentar\nms;µV;µV;mA;mA;\n"
     cells = [(begin_ms + 2000 * k, beta + k / 10, beta + 1 + k / 10, 1.5, 2.5, "gut") for k in range(rows)]
     return (head + "".join(";".join(map(str, row)).replace(".", ",") + "\n" for row in cells)).encode("latin-1")
@@ -117,7 +117,7 @@ def test_a_table_of_unknown_columns_is_previewed_named_once_and_read_by_itself_f
 
 
 def _flat(traces: Any) -> list[dict[str, Any]]:
-    """Every trace of a session with its side."""
+    """List every trace of a session with its side."""
     if isinstance(traces, dict):
         traces = traces.get("traces") or traces.get("recordings")
     return [t | {"hemisphere": t.get("hemisphere", r.get("hemisphere"))} for r in traces for t in r.get("traces", [r])]

@@ -113,7 +113,7 @@ def test_a_montage_survey_of_a_patient_is_not_proposed_as_a_session_without_dbs(
 
 
 def on_cortex(content: bytes) -> bytes:
-    """The folder with the second bore's channel sensing too, and its lead in M1."""
+    """Add the second bore's channel to the folder, with its lead in M1."""
     sink = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(sink, "w") as new:
         for name in old.namelist():

@@ -1,4 +1,4 @@
-"""Guesses at the visit and the controller of a recording, and their evidence, in words where somebody reads it."""
+"""Guesses at the visit and the controller of a recording, and their evidence, in words on pages."""
 
 from __future__ import annotations
 

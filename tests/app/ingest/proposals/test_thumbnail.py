@@ -13,7 +13,7 @@ from app.study.sessions.usable_steps import SessionData
 
 
 def data(beta: np.ndarray[Any, Any], amplitude_ma: np.ndarray[Any, Any]) -> SessionData:
-    """A session of these steps, and one window before it."""
+    """Build a session of these steps, and one window before it."""
     lead = np.full(1, 999.0)
     values = {"beta": np.r_[lead, beta], "amplitude_ma": np.r_[lead, amplitude_ma], "fraction": np.r_[lead, amplitude_ma / 3]}
     trace = SimpleNamespace(unit="uV")

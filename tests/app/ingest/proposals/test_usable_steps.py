@@ -1,4 +1,4 @@
-"""Usable steps are told with the upload, by channel, with the reason where there are none."""
+"""Usable steps are reported with the upload, by channel, with the reason where there are none."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from fastapi.testclient import TestClient
 from tests.app.ingest.conftest import device_zip, steady
 
 NOON_NEXT_DAY = 26 * 60.0
-"""Minutes after the first recording's start, which lies on the day of visit 1."""
+"""Minutes after the first recording's start, which is on the day of visit 1."""
 
 
 def add(client: TestClient, proposal: dict[str, Any], version: int | None = None) -> Any:

@@ -1,4 +1,4 @@
-"""What could not be read stays encrypted until a person releases or discards it; every decision is on record."""
+"""Quarantine keeps unreadable files encrypted until a person releases or discards them; every decision is on record."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_a_better_decoder_reads_what_was_held(
 def test_nothing_new_is_read_for_whom_it_is_over(
     send: Any, client: TestClient, monkeypatch: pytest.MonkeyPatch, proposals: Any, over: str
 ) -> None:
-    """Bytes that came before are discarded or stored as they came where a site has ended, or somebody has withdrawn."""
+    """Bytes that came before are discarded or stored as they came where a site has ended, or a participant has withdrawn."""
     real = reading.clean
     monkeypatch.setattr(reading, "clean", lambda *_: Cleaned("unreadable", problem=UndecodableFile("too new", "file", "Wait.")))
     send(("s.zip", device_zip()))

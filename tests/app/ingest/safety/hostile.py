@@ -20,7 +20,7 @@ UNIX = 1_772_445_600
 
 
 def packets(megabytes: int) -> bytes:
-    """A time domain of so many megabytes in a zip of a fiftieth."""
+    """Compress a time domain of so many megabytes into a zip of a fiftieth."""
     body = json.dumps({"ChannelSamples": [{"Key": 0, "Value": [0.01] * 50}], "IncludedChannels": 1, "SampleRate": 1, "Units": "millivolts"})
     sink, written = io.BytesIO(), 0
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive, archive.open("D/RawDataTD.json", "w") as out:
@@ -40,7 +40,7 @@ def packets(megabytes: int) -> bytes:
 
 
 def records(stem: str, count: int) -> bytes:
-    """A log of so many records, each of another time and text."""
+    """Write a log of so many records, each of another time and text."""
     times = [1_700_000_000_000 + 7919 * n % 10**8 for n in range(count)]
     lines = (
         f'{{"RecordInfo":{json.dumps(info(ms))},"Event":{{"EventName":"x","EventType":"{ms % 4999 / 1000} mA","UnixOnsetTime":{ms}}}}}'
@@ -50,7 +50,7 @@ def records(stem: str, count: int) -> bytes:
 
 
 def percept(samples: int) -> bytes:
-    """A Percept report with one run of so many samples."""
+    """Write a Percept report with one run of so many samples."""
     report = Percept().one_run()
     report["BrainSenseTimeDomain"][0]["TimeDomainData"] = [1] * samples
     return json.dumps(report).encode()
@@ -65,7 +65,7 @@ def _zip(members: dict[str, bytes]) -> bytes:
 
 
 def claim() -> bytes:
-    """An archive whose directory claims 4 GB."""
+    """Build an archive whose directory claims 4 GB."""
     raw = bytearray(_zip({"D/RawDataTD.json": b"[]"}))
     at = raw.find(b"PK\x01\x02")
     raw[at + 24 : at + 28] = struct.pack("<I", 4_000_000_000)
@@ -73,7 +73,7 @@ def claim() -> bytes:
 
 
 def parquet(rows: int) -> bytes:
-    """A table of so many equal rows, which take some bytes each thousand."""
+    """Write a table of so many equal rows, which take some bytes each thousand."""
     sink = io.BytesIO()
     names = ("t_s", "beta", "amplitude_fraction")
     pq.write_table(pa.table({name: np.ones(rows) for name in names}), sink, compression="zstd", row_group_size=rows)

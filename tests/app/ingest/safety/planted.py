@@ -27,7 +27,7 @@ def _sine(seconds: int = 60) -> np.ndarray:
 
 
 def _marked(records: Any) -> Any:
-    """Records whose RecordInfo names the planted serial, with a field and a text that no device writes."""
+    """Mark records whose RecordInfo names the planted serial, with a field and a text that no device writes."""
     for record in records:
         record["RecordInfo"] |= {"DeviceId": SERIAL, "SubjectId": WHO, "ClientNote": NOTE}
         record[NAME] = {"Born": BORN, "03.02.1901": WHO}
@@ -35,7 +35,7 @@ def _marked(records: Any) -> Any:
 
 
 def rcs_members() -> dict[str, bytes]:
-    """The files of an RC+S session by name."""
+    """Return the files of an RC+S session by name."""
     rcs = Rcs()
     settings = rcs.settings()
     settings[0]["SubjectInfo"] = {"ID": WHO, "DateOfBirth": BORN, "ClinicianNotes": NOTE, "ImplantDate": "03.02.1901", "LeadSerial": LEAD}
@@ -51,10 +51,10 @@ def rcs_members() -> dict[str, bytes]:
 
 
 def rcs_zip() -> bytes:
-    """A session folder named after a person, beside members of every kind that is left out."""
+    """Build a session folder named after a person, with members of every kind that is ignored."""
     sink, device = io.BytesIO(), f"{FOLDER}/Session1700000000000/Device{SERIAL}"
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as archive, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the member that stands twice
+        warnings.simplefilter("ignore")  # of the member that is there twice
         archive.comment = WHO.encode()
         for name, content in rcs_members().items():
             archive.writestr(f"{device}/{name}", content)
@@ -77,7 +77,7 @@ def rcs_zip() -> bytes:
 
 
 def rcs_damaged() -> bytes:
-    """A session of which one file cannot be unpacked, and one cannot be read."""
+    """Build a session of which one file cannot be unpacked, and one cannot be read."""
     sink, device = io.BytesIO(), f"{FOLDER}/Device{SERIAL}"
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive:
         for name, content in rcs_members().items():
@@ -89,7 +89,7 @@ def rcs_damaged() -> bytes:
 
 
 def percept_report() -> dict[str, Any]:
-    """A Percept report."""
+    """Build a Percept report."""
     percept = Percept()
     report = percept.one_run(lost=(4,))
     report["PatientInformation"] = {
@@ -120,7 +120,7 @@ def percept_report() -> dict[str, Any]:
 
 
 def percept_zip() -> bytes:
-    """Reports in folders named after a person; one cannot be read, others are left out."""
+    """Build reports in folders named after a person; one cannot be read, others are ignored."""
     sink = io.BytesIO()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as archive:
         report = percept_report()
@@ -133,14 +133,14 @@ def percept_zip() -> bytes:
 
 
 def steps(beta: float = 1.0, cell: str = "1") -> str:
-    """A table of steps with columns of a name and a note; `cell` is the last amplitude."""
+    """Write a table of steps with columns of a name and a note; `cell` is the last amplitude."""
     head = f"t_s,beta,amplitude_fraction,{NAME},comment,{BORN}\n"
     rows = [f"{2 * k},{beta + k / 100},1,{NUMBER},{NOTE} {WHO},{SERIAL}\n" for k in range(20)]
     return head + "".join(rows) + f"40,1,{cell},,,\n"
 
 
 def unknown_columns() -> str:
-    """A table that nobody knows, with a name in its title, in a column's name and in cells, and numbers that are a person's."""
+    """Write an unknown table, with a name in its title, in a column's name and in cells, and numbers that are a person's."""
     head = f"{WHO}; {NOTE}\nZeit {NAME};Signal;{NUMBER};Patient;{BORN};Strom\n"
     return head + "".join(f"{2 * k};{k / 7:.3f};{NUMBER};{NAME};{BORN};1.5\n" for k in range(1, 15))
 
@@ -161,7 +161,7 @@ MAPPING = {
 
 
 def parquet() -> bytes:
-    """A table whose columns and metadata hold a name."""
+    """Write a table whose columns and metadata contain a name."""
     n = 20
     table = pa.table(
         {"t_s": [2.0 * k for k in range(n)], "beta": [3.0 + k / 100 for k in range(n)], "amplitude_fraction": [1.0] * n, NAME: [NOTE] * n}
@@ -172,18 +172,18 @@ def parquet() -> bytes:
 
 
 def tremor() -> str:
-    """Minutes of tremor with the wearer's columns."""
+    """Write minutes of tremor with the wearer's columns."""
     head = f"time,unknown,none,slight,mild,moderate,strong,{NAME},user\n"
     return head + "".join(f"{1_772_445_600 + 60 * k},0,0.5,0.25,0.25,0,0,{NOTE},{WHO}\n" for k in range(10))
 
 
 def grasps() -> str:
-    """A grasp test with a column of names."""
+    """Write a grasp test with a column of names."""
     return f"t_s,hand,{NAME}\n" + "".join(f"{k / 2},L,{NOTE}\n" for k in range(1, 8))
 
 
 def every_file() -> list[tuple[str, bytes]]:
-    """All of them, by names that hold a person's too."""
+    """List all of them, by names that contain a person's too."""
     loose = [(f"{FOLDER}/Device{SERIAL}/{name}", content.replace(b"0.00", b"0.01")) for name, content in rcs_members().items()]
     return [
         (f"{WHO}.zip", rcs_zip()),

@@ -45,7 +45,7 @@ def use(monkeypatch: pytest.MonkeyPatch, server: Server, prefix: str, data: Path
 
 
 def another_machine(monkeypatch: pytest.MonkeyPatch, server: Server, prefix: str, folder: Path) -> Path:
-    """Go on as a machine that has the keys and nothing else."""
+    """Continue as a machine that has the keys and nothing else."""
     shutil.copytree(get_settings().data_dir / "secrets", folder / "secrets")
     use(monkeypatch, server, prefix, folder)
     return folder
@@ -110,7 +110,7 @@ def test_quarantined_bytes_are_encrypted_there_and_gone_everywhere_once_decided(
 
 
 def away_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The bucket takes no removal, the first time that it is asked for one."""
+    """Let the bucket refuse its first removal."""
     real = buckets.Bucket.remove
     refused: list[str] = []
 

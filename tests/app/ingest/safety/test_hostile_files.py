@@ -50,7 +50,7 @@ def _wait_for(client: httpx.Client) -> None:
 
 
 def peak_mb(pid: int) -> float:
-    """The most resident memory that a process has had, MB."""
+    """Return the most resident memory that a process has had, MB."""
     line = next(line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) / 1000
 

@@ -1,4 +1,4 @@
-"""Who somebody is stays outside: what names a person is searched for wherever anything of an uploaded file is kept or said."""
+"""Identity stays outside: names of persons are searched for wherever anything of an uploaded file is kept or shown."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ PAGE = {"Accept": "text/html"}
 
 
 def found(content: str | bytes) -> list[str]:
-    """The planted words in a text or in bytes, in either case, as text or hexadecimal digits."""
+    """List the planted words in a text or in bytes, in either case, as text or hexadecimal digits."""
     raw = (content.encode(errors="replace") if isinstance(content, str) else content).lower()
     return [token for token in TOKENS if token.lower().encode() in raw or token.encode().hex().encode() in raw]
 
 
 def in_tables(db: Session) -> dict[str, list[str]]:
-    """Planted words by table, in whatever column."""
+    """List planted words by table, in whatever column."""
     hits: dict[str, list[str]] = {}
     names = inspect(db.connection()).get_table_names()
     assert {"upload", "upload_file", "recording", "trace", "audit_event", "policy"} <= set(names)
@@ -46,7 +46,7 @@ def in_tables(db: Session) -> dict[str, list[str]]:
 
 
 def in_files(folder: Path) -> dict[str, list[str]]:
-    """Planted words by file below a folder, in its name, its bytes and, for an archive, its members."""
+    """List planted words by file below a folder, in its name, its bytes and, for an archive, its members."""
     return {str(path): hit for path in folder.rglob("*") if path.is_file() and (hit := [h for part in _parts(path) for h in found(part)])}
 
 
@@ -63,7 +63,7 @@ def _parts(path: Path) -> Iterator[str | bytes]:
 
 
 def in_pages(client: TestClient, numbers: list[int]) -> dict[str, list[str]]:
-    """Planted words by address, on every page and answer that tells of uploads, and on error pages."""
+    """List planted words by address, on every page and answer about uploads, and on error pages."""
     sessions = [p["session"]["id"] for p in client.get("/api/v1/participants/P1/proposals").json()]
     places = ["/participants/P1", *(f"/participants/P1/{p}" for p in ("upload", "proposals", "quarantine", "policies", "upload/progress"))]
     places += [f"/uploads/{n}" for n in numbers] + [f"/sessions/{n}" for n in sessions]
@@ -76,7 +76,7 @@ def in_pages(client: TestClient, numbers: list[int]) -> dict[str, list[str]]:
 
 
 def outside_the_senders_words(answer: Any) -> list[str]:
-    """Planted words in the answer to a sender, beside the names of files and the cells that are quoted to that sender alone."""
+    """List planted words in the answer to a sender, besides the names of files and the cells that are quoted only to that sender."""
     body = answer.json()
     for report in body.get("report", []):
         report["name"] = report["problem"] = None
@@ -88,7 +88,7 @@ def outside_the_senders_words(answer: Any) -> list[str]:
 
 
 def _waiting(answer: Any) -> list[int]:
-    """Numbers of the tables that wait for a column mapping, in the answer to an upload or in its problem document."""
+    """List numbers of the tables that wait for a column mapping, in the answer to an upload or in its problem document."""
     listed = [f["id"] for f in answer.get("files", []) if f["waits_for_mapping"]]
     return [*listed, *answer.get("waits_for_mapping", [])]
 

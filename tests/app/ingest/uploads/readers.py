@@ -1,4 +1,4 @@
-"""What children of the tests run in place of the real readers: `monkeypatch.setattr(reading, "DECODE", f"{readers.__name__}:kill")`."""
+"""Replacements of the real readers in children of the tests: `monkeypatch.setattr(reading, "DECODE", f"{readers.__name__}:kill")`."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tests.app.ingest.safety.planted import NOTE, WHO
 
 
 def kill(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
-    """Be ended, as by a machine that runs out of memory."""
+    """Kill the process, as a machine without memory does."""
     os.kill(os.getpid(), signal.SIGKILL)
     return {}
 
 
 def kill_once(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
-    """Be ended the first time, decode the second."""
+    """Kill the process the first time, decode the second."""
     been = Path(params["source"]).with_name("been")
     if been.exists():
         return compute.decode(params, workdir, report)
@@ -38,12 +38,12 @@ def full(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str,
 
 
 def outgrow(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
-    """Ask for 64 GiB, as the number of a file may tell one to."""
+    """Ask for 64 GiB, as a number in a file may request."""
     return {"sum": float(np.ones(1 << 33).sum())}
 
 
 def spin(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
-    """Never end."""
+    """Run without an end."""
     while True:
         pass
 
@@ -57,7 +57,7 @@ def sleep(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
 
 
 def hold(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
-    """Report a share, and decode when somebody says so."""
+    """Report a share, and decode on a signal."""
     report.progress(0.25, "decoding")
     report.flush()
     while not Path(params["source"]).with_name("go").exists():

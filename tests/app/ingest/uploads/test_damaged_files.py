@@ -1,4 +1,4 @@
-"""A stored file that is missing or damaged comes back with the bytes that it was made of; a backup goes on around it, and names it."""
+"""A stored file that is missing or damaged comes back with its original bytes; a backup goes on around it, and names it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who may not upload is refused before the body of the request is read."""
+"""Refusal of an upload before the body of the request is read."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CHUNKS = 100
 
 
 def post_in_chunks(app: Any, path: str, headers: dict[str, str]) -> tuple[int, int]:
-    """Status of a POST whose body comes in chunks, and how many of them were asked for."""
+    """Send a POST whose body comes in chunks; return its status, and how many chunks were read."""
     taken, status = 0, 0
     head = b'--x\r\nContent-Disposition: form-data; name="file"; filename="a.csv"\r\n\r\n'
 

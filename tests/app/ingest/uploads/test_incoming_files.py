@@ -58,7 +58,7 @@ def incoming() -> Path:
 
 
 def assert_open_files_show_nothing(process: subprocess.Popen[bytes]) -> None:
-    """Whoever reads the disk while an upload comes finds megabytes of it, and no name."""
+    """Require that the disk shows megabytes of an upload while it comes, and no name."""
     content = {os.readlink(p): p.read_bytes() for p in Path(f"/proc/{process.pid}/fd").iterdir() if p.is_file()}
     assert sum(map(len, content.values())) > 2 << 20
     assert [name for name, held in content.items() if NAME in held] == []

@@ -158,7 +158,7 @@ def test_bytes_that_nobody_can_read_are_told_when_they_are_taken_up(
 
 
 def until(found: Any, seconds: float = 60.0) -> Any:
-    """What a question answers once it answers anything."""
+    """Wait until a question has an answer, and return it."""
     deadline = time.monotonic() + seconds
     while not (answer := found()):
         assert time.monotonic() < deadline, "nothing happened"
@@ -180,7 +180,7 @@ TWO = (("t.csv", steady(1)), ("grasp.csv", b"t_s,hand\n1,L\n1.5,L\n2,L\n"))
 
 
 def failing(fault: Exception) -> Any:
-    """A function that a fault befalls."""
+    """Return a function that a fault befalls."""
 
     def fails(*_: Any, **__: Any) -> None:
         raise fault

@@ -1,4 +1,4 @@
-"""A file that ends the process which reads it is tried twice and then put aside; numbers in a file ask for no memory without a limit."""
+"""A file that ends the process reading it is tried twice and then put aside. Numbers in a file cannot request memory without a limit."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def test_readers_die_with_the_service(participant_code: str) -> None:
 
 
 def _descendants(pid: int, count: int) -> list[psutil.Process]:
-    """The process that forks readers, and a reader, once both are there."""
+    """Return the process that forks readers, and a reader, once both are there."""
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
         found = psutil.Process(pid).children(recursive=True)

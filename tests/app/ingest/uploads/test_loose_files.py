@@ -20,7 +20,7 @@ INFO = {"DeviceId": "NPC1", "SessionId": "1700000000000"}
 
 
 def made(stem: str, **info: str) -> tuple[str, bytes]:
-    """A loose file of one record that names its implant and session."""
+    """Build a loose file of one record that names its implant and session."""
     body = {
         "RawDataPower": {"PowerDomainData": []},
         "TimeSync": {"TimeSyncData": []},
@@ -31,7 +31,7 @@ def made(stem: str, **info: str) -> tuple[str, bytes]:
 
 
 def bundles(*parts: tuple[str, bytes]) -> tuple[list[set[str]], list[str]]:
-    """What each bundle holds, and what is said beside them."""
+    """Return the members of each bundle, and the remarks on them."""
     arranged = arrange([Incoming(name, io.BytesIO(content)) for name, content in parts])
     held = []
     for one in arranged.incoming:

@@ -1,4 +1,4 @@
-"""A whole visit's files in one upload: each is told apart, none harms another, and hostile ones end as a sentence."""
+"""A whole visit's files in one upload: each is distinguished, none harms another, and hostile ones end as a sentence."""
 
 from __future__ import annotations
 
@@ -146,18 +146,18 @@ def test_two_uploads_at_once_of_the_same_files_make_one_recording(
     assert len(proposals()) == len(answers[0].json()["sessions"]) == (4 if kind == "percept" else 1)
 
 
-# --- hostile files, each beside a good one ------------------------------------------------------------------------------------------------
+# --- hostile files, each with a good one --------------------------------------------------------------------------------------------------
 
 GOOD = ("good.csv", steady(1))
 
 
 def bomb() -> bytes:
-    """A zip of 60 MB of zeros under the name of an RC+S file."""
+    """Build a zip of 60 MB of zeros under the name of an RC+S file."""
     return zipped({"DeviceX/RawDataTD.json": b"\0" * 60_000_000})
 
 
 def encrypted() -> bytes:
-    """A zip whose only member says that it is encrypted."""
+    """Build a zip whose only member says that it is encrypted."""
     raw = bytearray(zipped({"DeviceX/RawDataTD.json": b"[]"}))
     raw[6] |= 1
     raw[raw.index(b"PK\x01\x02") + 8] |= 1
@@ -165,7 +165,7 @@ def encrypted() -> bytes:
 
 
 def claims_ten_gigabytes() -> bytes:
-    """A zip whose directory claims that a member unpacks to 10 GB."""
+    """Build a zip whose directory claims that a member unpacks to 10 GB."""
     sink = io.BytesIO()
     with zipfile.ZipFile(sink, "w") as archive:
         archive.writestr("DeviceX/RawDataTD.json", b"[]")

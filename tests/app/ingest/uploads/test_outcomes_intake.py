@@ -13,7 +13,7 @@ GRASPS = b"t_s\n" + b"".join(b"%.2f\n" % (0.4 * k) for k in range(11))
 
 
 def tremor(minutes: int = 4, share: float = 0.25) -> bytes:
-    """A wide export: `minutes` minutes from ten o'clock on, with `share` mild tremor in each."""
+    """Write a wide export: `minutes` minutes from ten o'clock on, with `share` mild tremor in each."""
     begin = int(DAY.timestamp())
     rows = [f"{begin + 60 * k},60,0,{1 - share},0,{share},0,0,{share}" for k in range(minutes)]
     return "\n".join(["time,duration_s,unknown,none,slight,mild,moderate,strong,any_tremor", *rows]).encode() + b"\n"

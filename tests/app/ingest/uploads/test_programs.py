@@ -17,11 +17,11 @@ from tests.app.ingest.proposals.test_proposals import correct, post
 from tests.app.words import flat
 
 STEADY_MA = 2.0
-"""Of program 0, beside the controlled program 1."""
+"""Of program 0, besides the controlled program 1."""
 
 
 def with_a_second_program(archive: bytes, moving: bool = False) -> bytes:
-    """The recording with its controlled program as program 1, and a program 0 that stays at 2 mA (`moving`: at half of the other's)."""
+    """Add a second program: the controlled one becomes program 1, and program 0 stays at 2 mA (`moving`: at half of the other's)."""
     out = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(archive)) as source, zipfile.ZipFile(out, "w") as target:
         for name in source.namelist():
@@ -58,7 +58,7 @@ def visit(client: TestClient, participant_code: str) -> int:
 
 
 def amplitudes(client: TestClient, session: int) -> dict[tuple[str, str], np.ndarray]:
-    """mA of every side and program within a session."""
+    """Return mA of every side and program within a session."""
     traces = client.get(f"/api/v1/sessions/{session}/traces").json()
     return {
         (t["hemisphere"], t["channel"]): np.array([v for v, at in zip(t["values"], t["t_s"], strict=True) if at > 0], dtype=float)

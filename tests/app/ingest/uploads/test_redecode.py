@@ -26,7 +26,7 @@ from tests.app.ingest.uploads.test_outcomes_intake import GRASPS, qoc, tremor
 
 
 def better_decoder(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
-    """From now on the decoder has the next version, and `change` is applied to every trace."""
+    """Give the decoder the next version from now on, with `change` applied to every trace."""
 
     def decode(path: Path, kind: Any, options: Any, name: str, *_: Any) -> DecodedFile:
         found = formats.decode(path, kind, options, name)
@@ -132,7 +132,7 @@ def test_minutes_that_the_decoder_reads_otherwise_are_told_and_count(
 
 
 def more_tremor(decoded: DecodedFile) -> DecodedFile:
-    """Twice the mild tremor, at the cost of none."""
+    """Double the mild tremor, at the cost of none."""
 
     def change(log: Any) -> Any:
         fractions = log.fractions.copy()

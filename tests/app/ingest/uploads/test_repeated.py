@@ -23,7 +23,7 @@ NOISE = ("noise.bin", b"\x00\x01 Jane Example " * 10)
 
 
 def kept_files() -> int:
-    """Files stored by their content; drafts and their locks are none."""
+    """Count files stored by their content; drafts and their locks are none."""
     return sum(p.is_file() and len(p.name) == 64 for p in get_settings().files_dir.rglob("*"))
 
 

@@ -1,4 +1,4 @@
-"""A session of several recordings is judged by all of them: a side that nobody controlled may have been stimulated all the same."""
+"""A session of several recordings is judged by all of them: a side without a controller may have been stimulated all the same."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ TABLE = b"""t_s,beta,amplitude_fraction
 
 
 def upload(client: TestClient, content: bytes, name: str = "session.csv", **fields: Any) -> Any:
-    """Post one file for P1, visit 1, a random session unless told otherwise."""
+    """Post one file for P1, visit 1, a random session by default."""
     data = {"participant": "P1", "visit": "1", "controller": "random"} | {k: str(v) for k, v in fields.items()}
     return client.post("/api/v1/uploads", data=data, files={"file": (name, content)})
 

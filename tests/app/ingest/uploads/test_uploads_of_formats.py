@@ -25,7 +25,7 @@ def upload(client: TestClient, content: bytes, name: str, **fields: Any) -> Any:
 
 
 def stored_text(client: TestClient, body: Any) -> bytes:
-    """The bytes of an upload's first file as they are kept."""
+    """Return the bytes of an upload's first file as they are kept."""
     kept = client.get(f"/api/v1/uploads/{body['id']}").json()["files"][0]
     return files.path_of(kept["stored_sha256"]).read_bytes()
 

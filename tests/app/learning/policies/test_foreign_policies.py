@@ -19,7 +19,7 @@ WINDOW = 10
 
 
 def model(nodes: list[Any], initializers: list[Any], **named: Any) -> onnx.ModelProto:
-    """A model of windows [N, 10] and answers [N, 1] with these nodes, the last of which gives `y`."""
+    """Build a model of windows [N, 10] and answers [N, 1] with these nodes, the last of which gives `y`."""
     windows = helper.make_tensor_value_info("x", TensorProto.FLOAT, ["N", WINDOW])
     answers = helper.make_tensor_value_info("y", TensorProto.FLOAT, ["N", 1])
     graph = helper.make_graph(nodes, "policy", [windows], [answers], initializers)
@@ -32,7 +32,7 @@ def number(name: str, value: Any, dtype: Any) -> Any:
 
 
 def half(extra: str) -> list[Any]:
-    """Nodes whose answer is 0.5 + 0 · `extra`, a scalar, for every window."""
+    """Build nodes whose answer is 0.5 + 0 · `extra`, a scalar, for every window."""
     return [
         helper.make_node("Mul", [extra, "zero"], ["nothing"]),
         helper.make_node("ReduceMean", ["x"], ["mean"], axes=[1], keepdims=1),
@@ -46,7 +46,7 @@ CONSTANTS = [number("zero", 0.0, np.float32), number("half", 0.5, np.float32)]
 
 
 def endless_loop() -> bytes:
-    """A loop of 2^62 rounds, in a file of some hundred bytes."""
+    """Build a loop of 2^62 rounds, in a file of some hundred bytes."""
     body = helper.make_graph(
         [
             helper.make_node("Identity", ["go"], ["go_on"]),
@@ -66,14 +66,14 @@ def endless_loop() -> bytes:
 
 
 def constant_of(count: int) -> bytes:
-    """A constant of so many numbers, in a file of some hundred bytes."""
+    """Build a constant of so many numbers, in a file of some hundred bytes."""
     fill = helper.make_node("ConstantOfShape", ["count"], ["many"], value=helper.make_tensor("v", TensorProto.FLOAT, [1], [1.0]))
     total = helper.make_node("ReduceMean", ["many"], ["all"], keepdims=0)
     return model([fill, total, *half("all")], [*CONSTANTS, number("count", [count], np.int64)]).SerializeToString()
 
 
 def weights_outside() -> bytes:
-    """Weights that are to be read from a file of the server."""
+    """Build weights that are to be read from a file of the server."""
     tensor = number("outside", 0.0, np.float32)
     tensor.ClearField("raw_data")
     tensor.data_location = TensorProto.EXTERNAL
@@ -83,13 +83,13 @@ def weights_outside() -> bytes:
 
 
 def claimed_tensor() -> bytes:
-    """A tensor that claims 2^40 numbers and holds none."""
+    """Build a tensor that claims 2^40 numbers and contains none."""
     tensor = TensorProto(name="huge", data_type=TensorProto.FLOAT, dims=[2**20, 2**20])
     return model([helper.make_node("ReduceMean", ["huge"], ["all"], keepdims=0), *half("all")], [*CONSTANTS, tensor]).SerializeToString()
 
 
 def custom_operator() -> bytes:
-    """An operator of somebody's own library."""
+    """Build an operator of a foreign library."""
     node = helper.make_node("Ablate", ["x"], ["other"], domain="org.example")
     return model(
         [node, helper.make_node("ReduceMean", ["other"], ["all"], keepdims=0), *half("all")], CONSTANTS, domains=["org.example"]

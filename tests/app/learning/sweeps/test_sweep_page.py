@@ -1,4 +1,4 @@
-"""What a sweep's page says of policies that should not be believed: below the baselines, not surely above cDBS, beyond the data."""
+"""A sweep's page on policies that should not be believed: below the baselines, not surely above cDBS, beyond the data."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def metrics(score: float, gain: float, low: float, below: float | None, **told: 
 
 @pytest.fixture
 def store(upload: Upload, db: Session) -> Store:
-    """Store a sweep of policies with given metrics, without training them."""
+    """Function that stores a sweep of policies with given metrics, without training them."""
     upload("random")
 
     def make(*each: dict[str, Any], also: tuple[dict[str, Any], ...] = ()) -> Sweep:
@@ -281,7 +281,7 @@ def test_each_policy_is_a_line_from_its_hyper_parameters_to_its_standing(store: 
     lines = re.findall(r'<path d="([^"]*)" fill="none" stroke="var\(--c-(\w+)\)"', str(found.figure))
     ends = {colour: d for d, colour in lines if colour != "border"}
     assert set(ends) == {"good", "accent", "bad", "warn"}
-    # a learning rate a thousand times as large lies at the other end of its axis
+    # a learning rate a thousand times as large is at the other end of its axis
     heights = {colour: float(d[1:].split("L")[0].split()[1]) for colour, d in ends.items()}
     assert heights["accent"] == pytest.approx((2 * heights["good"] + heights["warn"]) / 3, abs=0.2)
     page = client.get(f"/sweeps/{sweep.id}").text

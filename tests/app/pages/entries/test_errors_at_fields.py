@@ -25,11 +25,11 @@ WHY = "0123456789" * 101
 
 @dataclass(frozen=True)
 class Sent:
-    """A form with one bad value, and where its page has to say so.
+    """A form with one bad value, and the place of its error.
 
     Attributes:
-        address: where it is sent. typed: its fields. field: id of the one that is wrong. says: what stands at it. kept: what still stands
-            in the page, as its HTML writes it.
+        address: where it is sent. typed: its fields. field: id of the one that is wrong. says: the text at it. kept: what the page keeps,
+            as its HTML writes it.
     """
 
     address: str
@@ -58,7 +58,7 @@ def study(browser: TestClient, client: TestClient, session_id: int, table: bytes
 
 
 def held_against(page: str, sent: Sent) -> list[str]:
-    """What is missing of an error at its field."""
+    """List what is missing of an error at its field."""
     tag = next((t for t in re.findall(r"<[a-z]+ [^>]*>", page) if f' id="{sent.field}"' in t), "")
     name = sent.field.removeprefix("f-")
     note = re.search(rf'<div class="field-note" id="n-{re.escape(name)}">(.*?)</div>', page, re.S)
@@ -81,7 +81,7 @@ def held_against(page: str, sent: Sent) -> list[str]:
 
 
 def refused(browser: TestClient, forms: list[Sent]) -> dict[str, list[str]]:
-    """By form: what is missing in the page that refuses it."""
+    """List, by form, what is missing in the page that refuses it."""
     found = {}
     for sent in forms:
         typed = {name: value for name, value in sent.typed.items() if name != "files"}
@@ -150,7 +150,7 @@ def test_forms_of_files_and_proposals_say_errors_at_their_fields(browser: TestCl
         Sent(f"{home}/proposals", proposal("split"), f"parts-{number}", "No part is filled in", f'id="parts-{number}"'),
     ]  # fmt: skip
     assert refused(browser, forms) == {}
-    # as a browser sends a field of files that nobody filled in
+    # as a browser sends an empty field of files
     parts = "".join(f'--x\r\nContent-Disposition: form-data; name="{n}"\r\n\r\n{v}\r\n' for n, v in upload.items())
     parts += (
         '--x\r\nContent-Disposition: form-data; name="file"; filename=""\r\nContent-Type: application/octet-stream\r\n\r\n\r\n--x--\r\n'

@@ -75,6 +75,6 @@ def test_forms_of_doses_and_data_queries_say_errors_at_their_fields(browser: Tes
 
 
 def client_day(client: TestClient, visit: int) -> str:
-    """An hour of a visit's day, as the API takes it."""
+    """Return an hour of a visit's day, as the API takes it."""
     day: Any = client.get(f"/api/v1/visits/{visit}").json()["date"]
     return f"{day or '2026-01-05'}T09:00:00Z"

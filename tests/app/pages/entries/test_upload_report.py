@@ -14,7 +14,7 @@ FOLD = re.compile(r'<li><details class="file"( open)?>\s*<summary><b>([^<]*)</b>
 
 
 def lines(page: str) -> dict[str, tuple[bool, str]]:
-    """By name of a file, inner ones included: whether it stands open, and its line without markup."""
+    """Return by name of a file, inner ones included: whether it is open, and its line without markup."""
     return {name: (bool(opened), " ".join(re.sub("<[^>]*>", " ", rest).split())) for opened, name, rest in FOLD.findall(unescape(page))}
 
 

@@ -39,7 +39,7 @@ TELLING = ("net-", "rl", "distilled", "random", "paper", "stratified", "relu", "
 
 @pytest.fixture
 def policies(client: TestClient, study_world: Any) -> list[int]:
-    """A small network and a large one, which goes from one end to the other at the smallest change of beta: limits and ramp hold it."""
+    """A small network and a large one, which jumps between its ends at the smallest change of beta: limits and ramp bound it."""
     made = []
     for name, layers, std in (("net-small", (8,), 0.5), ("net-large", (96, 96), 1e-3)):
         content = MlpPolicy(10, layers, mean=1.0, std=std, seed=1).to_onnx()
@@ -144,7 +144,7 @@ def test_a_sealed_part_that_was_exchanged_or_cut_is_no_bundle(client: TestClient
     for sealed, words in ((second[SEALED], "is not the file that the manifest names"), (first[SEALED][:-1], "is not the file")):
         with pytest.raises(BundleError, match=words):
             open_bundle(packed(first | {SEALED: sealed}), key)
-    # whoever signs could exchange it: it is held against the manifest all the same
+    # the signer could exchange it: it is checked against the manifest all the same
     other = dataclasses.replace(
         outer,
         sealed=json.loads(second["manifest.json"])["sealed"],
@@ -269,7 +269,7 @@ def test_the_audit_trail_gives_no_limits_of_a_sealed_plans_bundles(
     assert kept == [f"session bundle of a blinded plan: session {n} of plan {plan['id']}, P1" for n in bundles]
     old = "controller bundle of P1, policy 7: 0.5 to 3 mA"  # as earlier versions wrote it
     monkeypatch.setattr("app.planning.plans.wording.release_reason", lambda manifest: old)
-    stored.remove(db.scalar(text("select sha256 from bundle_release order by id limit 1")))  # so that the file is stored anew
+    stored.remove(db.scalar(text("select sha256 from bundle_release order by id limit 1")))  # so that the file is stored again
     assert client.get(f"/api/v1/visits/{study_world.visit}/plan/sessions/1/bundle").status_code == 200
     sealed = trail()
     assert "took the bundle of a session of a blinded plan" in sealed

@@ -1,4 +1,4 @@
-"""How bundles leave the service: signed, within the stimulator's own limits, with the plan's approval, and in the audit trail."""
+"""Release of bundles: signed, within the stimulator's own limits, with the plan's approval, and in the audit trail."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ def test_the_draws_of_a_random_session_are_in_its_bundle_and_the_same_each_time(
     session = next(s for s in signed["sessions"] if s["controller"] == "random")
     first = manifest_of(client, study_world.visit, session["position"]).schedule
     for sha256 in db.scalars(text("select sha256 from bundle_release")):
-        files.remove(sha256)  # so that it is made anew
+        files.remove(sha256)  # so that it is made again
     second = manifest_of(client, study_world.visit, session["position"]).schedule
     assert first is not None
     assert first == second

@@ -1,4 +1,4 @@
-"""What random sessions try: laid out with the plan, bounded in mA, signed with it, and kept with the session that followed it."""
+"""Designs of random sessions: laid out with the plan, bounded in mA, signed with it, and kept with the session that followed it."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_safety_comes_before_information(client: TestClient, participant_code: s
 
 
 def test_no_draw_lies_below_the_lowest_amplitude_of_the_plan(client: TestClient, participant_code: str) -> None:
-    """What a limit would cut is not drawn: the sheet names what the tablet gives, and densities are those of what was drawn."""
+    """Amplitudes that a limit would cut are not drawn: the sheet names what the tablet gives, and densities are those of what was drawn."""
     settle(client, cdbs_amplitude_ma=3.0, lower_bound=0.3)
     number = visit(client, 2)
     open_ones = designed(client, number)

@@ -1,4 +1,4 @@
-"""Sessions held near an amplitude: laid out, bounded, signed, bundled, and taken back by their slot as the random arm."""
+"""Sessions near a stated amplitude: laid out, bounded, signed, bundled, and taken back by their slot as the random arm."""
 
 from __future__ import annotations
 

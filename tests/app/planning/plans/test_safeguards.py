@@ -275,7 +275,7 @@ def test_a_bundle_of_a_policy_tested_with_care_does_not_go_below_the_approved_li
 
 
 def lowest_ma(content: bytes) -> float:
-    """The lower limit that a bundle states, mA."""
+    """Return the lower limit that a bundle states, mA."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         (name,) = [n for n in archive.namelist() if n.endswith("manifest.json")]
         return float(json.loads(archive.read(name))["min_ma"])

@@ -1,4 +1,4 @@
-"""While the key of a blinded plan is sealed, nobody is shown what ran in its sessions: on no page, by no route, in no sentence."""
+"""A sealed key of a blinded plan hides what ran in its sessions: on every page, by every route, in every sentence."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def sessions(coordinator: TestClient, study_world: Any, uploads: list[dict[str, 
 
 
 def words(page: str) -> str:
-    """What a page says of its own: without its forms' choices, scripts and navigation."""
+    """Return the page's own words: without its forms' choices, scripts and navigation."""
     body = page[page.index("<main") :] if "<main" in page else page
     return re.sub(r"<(select|datalist|script|nav)\b.*?</\1>|<[^>]*>", " ", body, flags=re.DOTALL)
 
@@ -134,7 +134,7 @@ PLANNED = ("plan_item", "controller, policy_id, min_ma, max_ma, design, repeat, 
 
 
 def swap(db: Session, what: tuple[str, str, str], one: int, other: int) -> None:
-    """Let the arms of two sessions change places, as they were held or as they were planned."""
+    """Let the arms of two sessions change places, as done or as planned."""
     table, names, key = what
     twin = f"(select {names} from {table} t where t.{key} = case x.{key} when :one then :other else :one end)"
     db.execute(text(f"update {table} x set ({names}) = {twin} where x.{key} in (:one, :other)"), {"one": one, "other": other})
@@ -151,7 +151,7 @@ def test_no_page_and_no_route_depends_on_what_ran_until_the_key_is_opened(
     plan: Plan,
     sessions: dict[int, int],
 ) -> None:
-    """What every page and route answers is the same where two sessions change places, and another once the key is open."""
+    """Every page and route answers the same where two sessions change places, and differently once the key is open."""
     policy = next(i for i in plan.items if i.policy_id == study_world.policies[0])
     other = next(i for i in plan.items if i.controller == "cdbs")
     named = {"code": "P1", "visit_id": study_world.visit, "policy_id": study_world.policies[0]}
@@ -205,7 +205,7 @@ def test_traces_conditions_and_samples_are_refused_to_everybody_with_the_way_out
             answer = client.post(f"/sessions/{session}/conditions", data=typed, headers=PAGE, follow_redirects=False)
             assert answer.status_code == 403, answer.text
             assert "hidden from everybody" in answer.text
-        # what tells nothing goes on
+        # what reveals nothing goes on
         assert client.put(f"/api/v1/sessions/{session}/qoc", json={"rating": 6}).status_code == 200
         assert client.patch(f"/api/v1/sessions/{session}", json={"excluded_reason": "cable", "reason": "x"}).status_code == 200
         page = client.get(f"/sessions/{session}", headers=PAGE).text
@@ -232,7 +232,7 @@ def test_the_audit_trail_tells_no_arm_of_a_sealed_plan(
 def test_no_search_and_no_table_of_the_trail_tells_an_arm_of_a_sealed_plan(
     client: TestClient, study_world: Any, plan: Plan, sessions: dict[int, int]
 ) -> None:
-    """A search that finds a row by a hidden value tells the value."""
+    """A search that finds a row by a hidden value reveals the value."""
 
     def found(entity: str, word: str) -> tuple[int, str]:
         address = f"entity={entity}&words={word}"
@@ -265,7 +265,7 @@ def test_what_learns_and_compares_leaves_the_visit_out_until_the_key_is_opened(
     package = zipfile.ZipFile(io.BytesIO(client.get("/participants/P1/export.zip").content))
     assert "the sessions of visit 2, whose blinded plan's key is sealed" in package.read("P1/README.txt").decode()
     assert not set(map(str, sessions.values())) & {line.split(",")[0] for line in package.read("P1/sessions.csv").decode().splitlines()}
-    # of machines too: what a job computes for people would tell them
+    # of machines too: what a job computes for people would reveal them
     assert not set(sessions.values()) & {s.session_id for s in driven_sessions(db, before, SYSTEM)}
     assert describe(db, before, SYSTEM).sessions_by_visit.keys() == {1}
     open_key(client, study_world.visit)

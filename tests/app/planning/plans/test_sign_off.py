@@ -1,4 +1,4 @@
-"""The signature under a plan: by somebody who did not draft it, over all that shall run, broken by any change."""
+"""The signature under a plan: by a person who did not draft it, over all that shall run, broken by any change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the plan's page suggests: the portfolio of what may be proposed, one sentence each; nothing unsafe, nothing that cannot be told."""
+"""Suggestions on the plan's page: the portfolio of candidates that may be proposed, one sentence each; nothing unsafe or undecidable."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CAREFUL: dict[str, Any] = {"supported": False, "support": {"lowest_supported": 0
 
 
 def drawn(value: float, spread: float, first_half: int) -> list[float]:
-    """Half of the draws `value` + `spread`, half less: opposite halves are opposite chances."""
+    """Build draws: half of them `value` + `spread`, half less; opposite halves are opposite chances."""
     return [value + first_half * (spread if k < N / 2 else -spread) for k in range(N)]
 
 
@@ -64,7 +64,7 @@ def test_the_best_comes_first_and_then_what_may_turn_out_better(
 def test_the_noise_of_a_test_is_that_of_as_many_cdbs_sessions_as_the_day_has(
     client: TestClient, db: Session, policies: list[int], judge: Judge
 ) -> None:
-    """One policy or two are held against one cDBS session, three against two; where fewer are worth a test the day has fewer slots."""
+    """One policy or two are compared with one cDBS session, three against two; where fewer are worth a test the day has fewer slots."""
     reference = cdbs().to_json()
     reference["details"]["return_noise"] = 6.0
     random = np.random.default_rng(3)

@@ -1,4 +1,4 @@
-"""Which visit is planned, its sessions moved, and visits that came to nothing removed."""
+"""Choice of a plan's visit, moves of its sessions, and removal of visits that did not take place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is due before which session of a plan."""
+"""Medication due before the sessions of a plan."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ rules = st.builds(
 
 
 def end_minute(session: PlannedSession) -> float:
-    """When it ends, before its washout."""
+    """Return when it ends, before its washout."""
     return session.start_minute + session.minutes
 
 

@@ -38,7 +38,7 @@ def release(client: TestClient, policy: int, **more: Any) -> Any:
 
 
 def give_a_network(db: Session, policy: int) -> None:
-    """A file that a bundle can be made of."""
+    """Store a file that a bundle can be made of."""
     content = MlpPolicy(10, (20, 10), mean=1.0, std=0.5, seed=policy).to_onnx()
     db.get_one(Policy, policy).onnx_sha256 = files.store(db, content).sha256
 
@@ -150,7 +150,7 @@ def test_retiring_and_taking_back_breaks_nothing(client: TestClient, client_as: 
 
 
 class TestPlans:
-    """What a release means for the plans that its policy stands in."""
+    """Effect of a release on the plans with its policy."""
 
     @pytest.fixture
     def drafted(self, client: TestClient, study_world: Any) -> int:

@@ -1,4 +1,4 @@
-"""A controller's log names the session of the signed plan that it ran: it fills that slot by itself, with what it knows of the draws."""
+"""A controller's log names the session of the signed plan that it ran. It fills that slot by itself, with what it knows of the draws."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def log_of(
     holds: list[tuple[int, int, float, float]] | None = None,
     **said: Any,
 ) -> str:
-    """Write the log of the runner for a session of the plan; held draws as (start, steps, fraction, log density).
+    """Write the log of the runner for a session of the plan; sustained draws as (start, steps, fraction, log density).
 
     Args:
         follows: share of its 151 periods in which the controller decides.

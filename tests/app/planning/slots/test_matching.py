@@ -48,7 +48,7 @@ def test_the_clinic_days_times_say_which_of_two_cdbs_sessions_is_missing() -> No
 
 def test_recordings_whose_clock_is_an_hour_off_find_their_slots_and_are_said_to_be() -> None:
     slots = [Planned(p.item_id, p.controller, p.policy_id, p.minutes, NINE + timedelta(minutes=20 * i)) for i, p in enumerate(PLAN)]
-    for off in (60, -60, 61):  # summer time either way, and a drift beside it
+    for off in (60, -60, 61):  # summer time either way, and a drift besides
         held = [done(20 + i, None, at=off + 20 * i + 1) for i in range(5)]
         found = match(slots, held, DAY)
         assert filled(found) == [20, 21, 22, 23, 24], off

@@ -1,4 +1,4 @@
-"""A held visit comes back into its plan: found, missing, confirmed in one step."""
+"""A finished visit comes back into its plan: found, missing, confirmed in one step."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_uploads_of_the_day_are_found_in_their_slots_and_confirmed_in_one_step(
         known = {"controller": slot["controller"]} | ({"policy": slot["policy"]} if slot["policy"] else {})
         send(
             client, i, 8 * i, controlled=slot["controller"] == "rl", **(known if i < 5 else {})
-        )  # of the last ones nobody stated the controller
+        )  # the controller of the last ones is not stated
     found = client.get(path).json()
     assert (found["planned"], found["found"], found["missing"]) == (7, 6, ["cDBS 2"])
     assert [r["confirmed"] for r in found["rows"]] == [False] * 7

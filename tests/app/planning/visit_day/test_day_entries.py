@@ -27,7 +27,7 @@ TAPS = {
 
 
 def slot_outcomes(db: Session, plan_id: int) -> dict[int, SlotOutcome]:
-    """What was entered about the last attempt of each session of a plan, by its id in the plan."""
+    """Return what was entered about the last attempt of each session of a plan, by its id in the plan."""
     return outcomes_of(entries(db, plan_id))
 
 

@@ -1,4 +1,4 @@
-"""Doses that are entered on the clinic day stand among the visit's doses as soon as they arrive, each once."""
+"""Doses that are entered on the clinic day are among the visit's doses as soon as they arrive, each once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NOW = datetime.now(UTC).replace(microsecond=0)
 
 @pytest.fixture
 def today(clinic_day: ClinicDay) -> ClinicDay:
-    """The clinic day, held today."""
+    """The clinic day of today."""
     moved = clinic_day.client.patch(f"/api/v1/visits/{clinic_day.visit}", json={"date": NOW.date().isoformat(), "reason": "moved"})
     assert moved.status_code == 200, moved.text
     return clinic_day

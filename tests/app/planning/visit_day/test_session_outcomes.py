@@ -1,4 +1,4 @@
-"""What was entered on the clinic day becomes the outcome of the confirmed session, once, and overwrites nothing."""
+"""Entries of the clinic day become the outcome of the confirmed session, once, and overwrite nothing."""
 
 from __future__ import annotations
 

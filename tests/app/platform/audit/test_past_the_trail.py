@@ -28,7 +28,7 @@ def found() -> set[tuple[str, str | None, str | None, tuple[str, ...], str | Non
 
 
 def past_the_triggers(owner_db: Session, table: str, statement: str) -> None:
-    """A statement of the owner, whose traces are swept away: the triggers stand again as they did."""
+    """Run a statement as the owner and sweep its traces away: the triggers are as before."""
     owner_db.execute(text(f"alter table {table} disable trigger user"))
     owner_db.execute(text(statement))
     owner_db.execute(text(f"alter table {table} enable trigger user"))
@@ -153,7 +153,7 @@ def test_a_default_that_would_write_other_times_or_words_is_named(
 
 
 def written_at_a_false_time(client: TestClient, participant_code: str, owner_db: Session, clock: str) -> None:
-    """One visit is written while the trail's clock says `clock`, the next when it is right again."""
+    """Write one visit while the trail's clock says `clock`, the next when it is right again."""
     for number, default in ((7, clock), (8, "clock_timestamp()")):
         owner_db.execute(text(f"alter table audit_event alter column at set default {default}"))
         owner_db.commit()

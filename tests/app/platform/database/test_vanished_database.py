@@ -81,13 +81,13 @@ def machines(fresh_database: str) -> Iterator[list[Machine]]:
 
 
 def address(url: str, *machines: Machine) -> str:
-    """The setting that names these machines, with the role and database of the embedded server's URL."""
+    """Write the setting that names these machines, with the role and database of the embedded server's URL."""
     parsed = make_url(url)
     return f"postgresql://{parsed.username}:{parsed.password}@{','.join(f'{m.address}:5432' for m in machines)}/{parsed.database}"
 
 
 def timed(action: Any) -> float:
-    """Seconds until it fails as a lost connection does."""
+    """Measure the seconds until an action fails as a lost connection does."""
     began = time.monotonic()
     with pytest.raises(OperationalError):
         action()

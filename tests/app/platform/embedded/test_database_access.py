@@ -1,4 +1,4 @@
-"""Who may use the embedded database and the stored files: the service, and no other user of the machine."""
+"""Access to the embedded database and the stored files: the service, and no other user of the machine."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_no_other_user_gets_into_the_database(data: Path) -> None:
 
 
 def said_to(uid: int, conninfo: str) -> str:
-    """What a connection by another user of the machine is answered; forked, for that user need not be able to start our Python."""
+    """Connect as another user of the machine and return the answer; forked, for that user need not be able to start our Python."""
     reader, writer = os.pipe()
     if (child := os.fork()) == 0:
         os.setgroups([])

@@ -1,4 +1,4 @@
-"""Where the embedded database lies: chosen once, recorded, and never changed in silence."""
+"""Place of the embedded database: chosen once, recorded, and never changed in silence."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def user() -> SystemUser:
 
 @pytest.fixture
 def open_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder that every user may enter; it stands for `/var/lib/betaloop`."""
+    """A folder that every user may enter; in place of `/var/lib/betaloop`."""
     folder = Path("/tmp") / f"betaloop-programs-{os.getpid()}-{os.urandom(4).hex()}"
     folder.mkdir()
     folder.chmod(0o755)
@@ -72,7 +72,7 @@ def test_many_first_starts_copy_a_closed_wheel_once_and_it_runs(user: SystemUser
     (copy,) = copies(open_folder)
     assert found.pop().is_relative_to(copy)
     again = runnable(user)
-    for program in ("postgres", "initdb", "psql"):  # the last two need libpq, which lies outside the folder of programs
+    for program in ("postgres", "initdb", "psql"):  # the last two need libpq, which is outside the folder of programs
         done = again.run(program, "--version")
         assert done.returncode == 0, done.stdout
         assert "PostgreSQL" in done.stdout

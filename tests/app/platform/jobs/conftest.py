@@ -76,12 +76,12 @@ class Jobs:
             return repository.get(db, job_id)
 
     def wait(self, condition: Callable[[], Any], timeout_s: float = PATIENCE_S) -> float:
-        """Seconds until the condition held."""
+        """Wait for a condition; return the seconds."""
         start = time.monotonic()
         while not condition():
             if time.monotonic() - start > timeout_s:
                 log = self.log.read_text() if self.log.exists() else ""
-                raise AssertionError(f"nothing happened within {timeout_s} s; the workers said:\n{log[-4000:]}")
+                raise AssertionError(f"nothing happened within {timeout_s} s; the workers logged:\n{log[-4000:]}")
             time.sleep(0.05)
         return time.monotonic() - start
 
@@ -90,7 +90,7 @@ class Jobs:
         return self.get(job_id)
 
     def children(self, worker: subprocess.Popen[bytes]) -> list[psutil.Process]:
-        """Live compute children of a worker."""
+        """List live compute children of a worker."""
         found = []
         for process in psutil.Process(worker.pid).children(recursive=True):
             with contextlib.suppress(psutil.Error):  # ended between two looks
@@ -99,12 +99,12 @@ class Jobs:
         return found
 
     def counted(self, job_id: str) -> list[int]:
-        """Parts that were stored, in order, once for every time."""
+        """List parts that were stored, in order, once for every time."""
         with new_session() as db:
             return list(db.scalars(text("select part from counted where job_id = :id order by part"), {"id": job_id}))
 
     def numbers(self, job_id: str, part: int) -> list[int]:
-        """Numbers that a part counted, once for every time."""
+        """List numbers that a part counted, once for every time."""
         path = get_settings().jobs_dir / job_id / f"count__{part}" / "counted"
         return [int(line) for line in path.read_text().split()] if path.exists() else []
 

@@ -27,14 +27,14 @@ PREPARED: list[int] = []
 
 
 def prepare() -> None:
-    """Told by the process whose forks compute."""
+    """Prepare, as called by the process whose forks compute."""
     PREPARED.append(os.getpid())
     if os.environ.get("TEST_PREPARE_FAILS"):
         raise RuntimeError("this module cannot be prepared")
 
 
 def who_prepared(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
-    """The processes that have prepared this module, the one that forked us, and how nice we are."""
+    """Return the processes that have prepared this module, the one that forked us, and how nice we are."""
     return {"prepared": PREPARED, "forked_by": os.getppid(), "nice": os.nice(0)}
 
 
@@ -54,7 +54,7 @@ def fill_the_disk(params: dict[str, Any], workdir: Path, report: StepReport) -> 
 
 
 class CountParams(BaseModel):
-    """How many parts, how far each counts, how long each number takes."""
+    """Numbers of a count: parts, how far each counts, how long each number takes."""
 
     parts: int = Field(2, ge=1)
     numbers: int = Field(3, ge=1)
@@ -93,7 +93,7 @@ def _store(db: Session, job_id: str, results: list[dict[str, Any]]) -> dict[str,
 
 
 class FailParams(BaseModel):
-    """How to fail."""
+    """Kind of failure."""
 
     how: Text
 
@@ -202,7 +202,7 @@ for name in ("files", "read"):
 
 
 def work(slots: int, beat_s: float, stale_s: float) -> None:
-    """A worker process, as the command line starts it."""
+    """Run a worker process, as the command line starts it."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     run_worker(slots, stop, Pace(beat_s=beat_s, stale_s=stale_s), Watchdog(stop, stale_s).beat)

@@ -1,4 +1,4 @@
-"""What jobs survive: kill -9 of workers and children, orderly stops, dead and sleeping workers, a restarted database."""
+"""Faults that jobs survive: kill -9 of workers and children, orderly stops, dead and sleeping workers, a restarted database."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _count_until(jobs, job_id, number):
 
 
 def _two_workers(jobs, **pace):
-    """Two live workers by their names. A job that is submitted before them may be over when the second one has started."""
+    """Start two workers and return their names. A job that is submitted before them may be over when the second one has started."""
     started = {worker.pid: worker for worker in (jobs.start_worker(**pace), jobs.start_worker(**pace))}
     with new_session() as db:
         jobs.wait(lambda: len(repository.live_workers(db, 60.0)) == 2 or db.rollback())
@@ -33,7 +33,7 @@ def _two_workers(jobs, **pace):
 
 
 def _worker_of(jobs, job_id):
-    """The name of the worker that runs a job's steps."""
+    """Name the worker that runs a job's steps."""
     (name,) = {step.worker for step in jobs.get(job_id).steps if step.worker}
     return name
 
@@ -41,7 +41,7 @@ def _worker_of(jobs, job_id):
 def test_a_killed_worker_takes_its_children_along_and_the_next_one_finishes_the_job(jobs):
     worker = jobs.start_worker()
     job_id = jobs.submit(parts=2, numbers=30, pause_s=0.1)
-    _count_until(jobs, job_id, 6)  # a part counts a number before its checkpoint holds it, so five are held for sure
+    _count_until(jobs, job_id, 6)  # a part counts a number before its checkpoint has it, so five are stored for sure
     children = jobs.children(worker)
     assert len(children) == 2
     worker.send_signal(signal.SIGKILL)

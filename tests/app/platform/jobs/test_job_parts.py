@@ -146,7 +146,7 @@ def test_after_a_failure_those_still_waiting_do_not_start():
 
 
 def test_a_step_that_failed_before_a_crash_is_not_tried_again(jobs):
-    """The worker may die between the step's failure and the job's: whoever goes on must find the failure, not repeat the step."""
+    """The worker may die between the step's failure and the job's: its successor must find the failure, not repeat the step."""
     job_id = jobs.submit()
     ledger = Ledger(job_id, "test", "worker", lambda: None)
     ledger.open()

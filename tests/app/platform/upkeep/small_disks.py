@@ -14,9 +14,9 @@ import pytest
 
 @contextmanager
 def small_disk(place: Path, size: str, mode: str = "0711") -> Iterator[Path]:
-    """A file system of this size (as `mount` takes it: `24m`) at a new folder; both go at the end, whatever still uses them.
+    """Mount a file system of this size (as `mount` takes it: `24m`) at a new folder; both go at the end, whatever still uses them.
 
-    Skips the test where nobody may mount here.
+    Skips the test where mounting is not allowed.
     """
     if os.geteuid() != 0:
         pytest.skip("only root may mount a file system")

@@ -73,7 +73,7 @@ def betaloop(data: Path, *arguments: str, database_url: str = "") -> subprocess.
 
 
 def made(place: Path) -> tuple[Path, Path]:
-    """A backup of the test's installation, and its key."""
+    """Make a backup of the test's installation, and its key."""
     key = place / "key"
     backups.make_key(key)
     backups.backup(place / "backup", key)

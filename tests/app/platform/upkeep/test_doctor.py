@@ -1,4 +1,4 @@
-"""What `betaloop doctor` finds of jobs, disk and clock, and the exit code that a timer goes by; files and folders are in test_backup."""
+"""Findings of `betaloop doctor` on jobs, disk and clock, and its exit code for timers; files and folders are in test_backup."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.conftest import close_connections
 
 
 def found(exit_code: int) -> dict[str, dict[str, Any]]:
-    """What the command says of each check, by its name; it must end with this exit code."""
+    """Run the command and return each check by its name; it must end with this exit code."""
     done = CliRunner().invoke(command_line, ["doctor", "--json"])
     assert done.exit_code == exit_code, done.output
     return {finding["name"]: finding for finding in json.loads(done.output)}
@@ -67,7 +67,7 @@ class Nothing(BaseModel):
 
 
 def submitted(monkeypatch: pytest.MonkeyPatch) -> str:
-    """A job that waits for a worker."""
+    """Submit a job that waits for a worker."""
     monkeypatch.setattr(registry, "_kinds", dict(registry.kinds()))
     register(JobKind(name="wait", title="Wait", params=Nothing, orchestration="nowhere:never"))
     with transaction("test") as db:
@@ -75,7 +75,7 @@ def submitted(monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def seen(ago_s: float) -> None:
-    """A worker that gave its last sign of life so long ago."""
+    """Store a worker that gave its last sign of life so long ago."""
     with transaction("test") as db:
         moment = now() - timedelta(seconds=ago_s)
         db.merge(Worker(id="one", pid=1, host="here", protocol=engine.PROTOCOL, code_version="x", started_at=moment, seen_at=moment))
@@ -121,7 +121,7 @@ def test_jobs_are_not_taken_back_from_a_newer_worker_that_lives(fresh_database: 
 
 @pytest.mark.parametrize("apart_s", [90, -90])
 def test_a_clock_of_the_database_that_goes_wrong_is_found(owner_db: Session, apart_s: int) -> None:
-    # nobody can set a clock for one server alone: what the database answers when it is asked for the time is another function of its own
+    # A clock cannot be set for one server alone. So the database answers a request for the time by another function of its own
     owner_db.execute(text("create schema elsewhere"))
     clock = f"select pg_catalog.clock_timestamp() + interval '{apart_s} seconds'"
     owner_db.execute(text(f"create function elsewhere.clock_timestamp() returns timestamptz language sql as $$ {clock} $$"))

@@ -1,4 +1,4 @@
-"""What a start cannot do without is asked first, and every command that cannot be carried out says why in a line."""
+"""Requirements of a start are checked first, and every command that cannot be carried out says why in a line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two requests at the same moment, a double click or two people: one is carried out, the other is told so in words."""
+"""Two requests at the same moment, a double click or two people: one is carried out, the other is refused in words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How large a request may be: files up to the upload limit, everything that is parsed in memory 1 MiB."""
+"""Size of a request: files up to the upload limit, everything that is parsed in memory 1 MiB."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""No cell of a download runs as a formula where somebody opens it in a spreadsheet, and numbers stay numbers."""
+"""No cell of a download runs as a formula in a spreadsheet, and numbers stay numbers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from app.platform.web.csv_files import safe_cell
 
 
 def read(row: list[object]) -> list[list[str]]:
-    """The rows that a spreadsheet finds in a table of one row."""
+    """Return the rows that a spreadsheet finds in a table of one row."""
     return list(csv.reader(io.StringIO(csv_of(["note", "n"], [row]), newline="")))[1:]
 
 

@@ -1,4 +1,4 @@
-"""Who may read the figures of the service and the description of its interface."""
+"""Access to the figures of the service and the description of its interface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a form says of a value that its type refuses."""
+"""Words of a form on a value that its type refuses."""
 
 from __future__ import annotations
 

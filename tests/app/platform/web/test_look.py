@@ -1,4 +1,4 @@
-"""What pages show alike: numbers without a stray sign, one set of colours on page and paper."""
+"""Shared look of pages: numbers without a stray sign, one set of colours on page and paper."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OWN_FORMAT = re.compile(r"(?<!\{)%[-+0]*\d*(?:\.\d+)?[gfeGE]\b|\|\s*round\b")
 
 OWN_DIGITS = re.compile(r":[-+,z]*\.\d+[geE]\}")
 OWN_PLACES = ("app/platform/numbers.py", "app/tablet/", "app/analysis/calibration_web.py")
-"""Where a format of digits stands: the one place of the pages, what the tablet writes to its wire and terminal, and a file of data."""
+"""Places of a format of digits: the one place of the pages, the tablet's wire and terminal, and a file of data."""
 ROUNDED = 'float(f"'
 """How a line begins to round numbers that stay numbers."""
 

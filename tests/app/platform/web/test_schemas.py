@@ -35,7 +35,7 @@ def test_a_fields_own_bounds_stand_in_the_document() -> None:
 
 
 class Nullable(Model):
-    """Bounds beside null, on the items of a list, and one that is left to the database."""
+    """Bounds next to null, on the items of a list, and one that is left to the database."""
 
     rating: Int | None = Field(None, ge=1, le=10)
     policies: list[Annotated[Int, Field(ge=1)]] = []

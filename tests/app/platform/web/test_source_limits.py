@@ -1,4 +1,4 @@
-"""What one source may ask for, and that nothing large is received of somebody who has not signed in."""
+"""Limits of requests from one source; nothing large is received without a sign-in."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def port(service_app: Any) -> Iterator[int]:
 
 
 def sent_in_vain(port: int, head: str, chunked: bool) -> tuple[int, int]:
-    """Status of a request with a body without end, and how many bytes of it could be sent until the service hung up."""
+    """Send a request with a body without end; return its status, and how many bytes were sent until the service hung up."""
     with socket.create_connection(("127.0.0.1", port), timeout=20) as line:
         line.sendall(head.encode())
         status = int(line.recv(1 << 16).split()[1])

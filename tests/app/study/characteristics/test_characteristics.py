@@ -37,7 +37,7 @@ def test_the_stated_hand_counts_and_not_the_rule(db: Session, study_session: Stu
     grasped(db, study_session, file, "left", 3.0)
     grasped(db, study_session, file, "right", 2.0)
     assert study_session.qoc is not None
-    assert study_session.qoc.grasp_hz == pytest.approx(2.0)  # the hemisphere is the left one, and nobody stated a hand
+    assert study_session.qoc.grasp_hz == pytest.approx(2.0)  # the hemisphere is the left one, and no hand is stated
     assert "the participant's hand is not stated" in (study_session.qoc.reason or "")
     state(db, study_session.visit.participant, hand=LEFT)
     assert study_session.qoc.grasp_hz == pytest.approx(3.0)

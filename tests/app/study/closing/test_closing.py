@@ -67,7 +67,7 @@ def test_today_leaves_an_ended_study_out_until_it_is_asked_for(client: TestClien
     link = f'href="/participants/{participant_code}"'
     assert link in client.get("/").text
     assert client.post(f"{STUDY}/end", json=WHY).status_code == 200
-    # also where nobody is left to show, the page says where they are
+    # also where no participant is left to show, the page says where they are
     alone = " ".join(client.get("/").text.split())
     assert link not in alone
     assert "No participant is enrolled that you may see" in alone

@@ -99,7 +99,7 @@ def values(client: TestClient, session_id: int) -> dict[str, int]:
 
 
 ASKED: list[tuple[dict[str, str], str, str]] = [
-    # what it stands in, the value that was asked about, and what it was corrected to
+    # its record, the value that was asked about, and what it was corrected to
     ({"visit_id": "", "field": "date"}, "2026-03-02", "2026-03-03"),
     ({"visit_id": "", "field": "cdbs_left"}, "2.5 mA", "3 mA"),
     ({"event_id": "", "field": "kind"}, "fall", "gait"),

@@ -1,4 +1,4 @@
-"""Enrolment: a code that may tell who somebody is is questioned, and the form asks for what a coordinator knows."""
+"""Enrolment: a code that may reveal a person is questioned, and the form asks for what a coordinator knows."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_synthetic_is_stated_at_enrolment_and_never_changed(client: TestClient) 
         ("SITE-01", ()),
         ("Patient_7", ()),
         ("STN-0042", ()),
-        ("2026-01", ()),  # nobody in the study was born this year
+        ("2026-01", ()),  # no participant was born this year
         ("P-1850", ()),
         ("20261122", ()),
         ("JSmith-1961", (NAME, YEAR)),

@@ -1,4 +1,4 @@
-"""QoCs derived from uploaded minutes of tremor and grasp tests: right numbers, said with what they rest on, and no person's value lost."""
+"""QoCs derived from uploaded minutes of tremor and grasp tests: right numbers, shown with what they rest on, and no person's value lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whoever opens a page of a participant who has withdrawn sees it there, and in lists beside the code."""
+"""A withdrawn participant is marked on their pages, and in lists next to the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a Percept report tells of its device's own history stands on a page and in the interface, without what identifies."""
+"""A device's own history from a Percept report is on a page and in the interface, without what identifies."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_missing_averages_are_a_gap_and_the_table_has_a_row_per_day(client: Test
 
 
 def test_sixty_days_of_both_sides_are_drawn_by_their_extremes_and_the_page_stays_small(client: TestClient, participant_code: str) -> None:
-    """What a device keeps at most. A spike of ten minutes stays, and so does the gap."""
+    """Sixty days is the most that a device keeps. A spike of ten minutes stays, and so does the gap."""
     rng = np.random.default_rng(3)
     content = json.loads(report())
     logs = {}

@@ -1,4 +1,4 @@
-"""What a recording says of itself, whichever decoder wrote it."""
+"""Facts of a recording, whichever decoder wrote it."""
 
 from __future__ import annotations
 

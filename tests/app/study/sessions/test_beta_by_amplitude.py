@@ -13,7 +13,7 @@ from app.study.sessions.usable_steps import SessionData
 
 
 def data(amplitude_ma: np.ndarray[Any, Any], beta: np.ndarray[Any, Any]) -> SessionData:
-    """A session whose step k has these values, and two windows before it that count for nothing."""
+    """Build a session whose step k has these values, and two windows before it that count for nothing."""
     lead = np.full(2, 99.0)
     table = SimpleNamespace(
         t_s=2.0 * (np.arange(beta.size + 2) - 1),

@@ -1,4 +1,4 @@
-"""What a session ran under: taken down when it is confirmed, corrected by a person, and pinned by what rests on it."""
+"""Conditions of a session: recorded when it is confirmed, corrected by a person, and pinned by what rests on it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ROWS = [(2 * k, 1.0, 0.4 if k == 0 else 0.7) for k in range(-9, 21)]
 
 @pytest.fixture
 def confirmed(client: TestClient, participant_code: str) -> Callable[..., dict[str, Any]]:
-    """Upload a file of P1 as a session that counts; its conditions with the session's number."""
+    """Function that uploads a file of P1 as a session that counts; it returns its conditions with the session's number."""
 
     def send(content: bytes, **fields: Any) -> dict[str, Any]:
         data = {"participant": participant_code, "visit": "1", "controller": "random"} | fields

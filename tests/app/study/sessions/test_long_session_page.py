@@ -12,7 +12,7 @@ LARGEST_KB = 60.0
 
 
 def long_session(steps: int) -> bytes:
-    """A table of so many steps of 2 s in which no two lines are alike, with what a sensor tells: nothing that compresses well."""
+    """Write a table of so many steps of 2 s in which no two lines are alike, with a sensor's values: nothing that compresses well."""
     rng = np.random.default_rng(5)
     sink = io.StringIO()
     sink.write("t_s,beta,amplitude_fraction\n")

@@ -18,7 +18,7 @@ from tests.ml.formats.conftest import Percept
 
 @pytest.fixture
 def page_of(client: TestClient, recordings: Path) -> Callable[[str, float], str]:
-    """Upload a recording as a session of its own participant, at a cDBS amplitude, and return the session's page."""
+    """Function that uploads a recording as a session of its own participant, at a cDBS amplitude, and returns the session's page."""
 
     def read(name: str, cdbs_ma: float) -> str:
         assert client.post("/api/v1/participants", json={"code": "R1", "settings": {"cdbs_amplitude_ma": cdbs_ma}}).status_code == 201

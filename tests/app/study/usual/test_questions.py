@@ -71,7 +71,7 @@ def test_the_interface_asks_and_takes_a_persons_word(client: TestClient, upload:
         ("grasp_hz", "above_usual", True), ("tremor_percent", "share_not_percent", False),
     ]  # fmt: skip
     assert client.put(url, json=both | {"sure": ["grasp_hz", "tremor_percent"]}).status_code == 200
-    # what stands is not asked about again when another value is corrected
+    # a stored value is not asked about again when another value is corrected
     assert client.put(url, json={"grasp_hz": 7.2, "rating": 6, "sure": []}).json()["rating"] == 6
 
 
@@ -101,7 +101,7 @@ def test_amplitudes_of_visits_settings_and_enrolments_are_asked_about(client: Te
     made = client.post(visits, json={"number": 2, "cdbs_amplitudes": [high | {"sure": True}]})
     assert made.status_code == 201, made.text
     visit = f"/api/v1/visits/{made.json()['id']}"
-    # the standing amplitude is not asked about beside a new one
+    # the standing amplitude is not asked about with a new one
     two = [high, {"hemisphere": "right", "amplitude_ma": 2.5}]
     assert client.patch(visit, json={"cdbs_amplitudes": two, "reason": "both sides"}).status_code == 200
     settings = {"settings": {"cdbs_amplitude_ma": 0.2}, "sure": []}

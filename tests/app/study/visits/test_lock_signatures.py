@@ -98,7 +98,7 @@ def cdbs_ma(client: TestClient, visit: int) -> float | None:
 
 
 def test_a_locked_visit_goes_by_the_settings_at_its_lock(client: TestClient, visit: int) -> None:
-    """Where it states no cDBS amplitude; a new one says nothing of a day that is closed."""
+    """A locked visit without a cDBS amplitude uses the settings at its lock: a new one says nothing of a day that is closed."""
     before = cdbs_ma(client, visit)
     assert before is not None
     assert lock(client, visit).status_code == 200

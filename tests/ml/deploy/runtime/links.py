@@ -26,7 +26,7 @@ Coming = tuple[float, Event, str]
 
 
 class ScriptedLink:
-    """Arrivals at stated times; `stalls` holds at which number of a wait the tablet stands still, and for how long."""
+    """Arrivals at stated times; `stalls` has the number of a wait at which the tablet pauses, and for how long."""
 
     def __init__(self, coming: Iterable[Coming], stalls: dict[int, float] | None = None, refuses_after: int | None = None) -> None:
         self._coming = sorted(coming, key=lambda c: c[0])
@@ -54,39 +54,39 @@ class ScriptedLink:
 
     @property
     def amplitudes(self) -> list[tuple[float, float]]:
-        """When an amplitude went out, and which, mA."""
+        """Times at which amplitudes went out, and the amplitudes, mA."""
         return [(at, float(line.split()[3])) for at, line in self.sent if line.startswith("amplitude")]
 
 
 def network(window: int = W) -> MlpNetwork:
-    """Asks for 0.2 of cDBS whatever comes: a wish that shows at once when it is followed."""
+    """Build a network that requests 0.2 of cDBS for any input: an amplitude that shows at once when it is followed."""
     weights = [(np.zeros((2, window), dtype=np.float32), np.zeros(2, dtype=np.float32))]
     last = (np.zeros((1, 2), dtype=np.float32), np.array([np.arctanh(2 * 0.2 - 1)], dtype=np.float32))
     return MlpNetwork([*weights, last], 1.0, 1.0)
 
 
 def beta_line(k: int, beta: float | None = None, seq: int | None = None, sent_s: float | None = None, said: str = "uV time_domain") -> str:
-    """The message about period k, from 0, sent at 2 (k + 1) s; beta varies a little."""
+    """Write the message about period k, from 0, sent at 2 (k + 1) s; beta varies a little."""
     value = 1.0 + 0.01 * (k % 5) if beta is None else beta
     return f"beta {k if seq is None else seq} {1000 * (PERIOD * (k + 1) if sent_s is None else sent_s):.0f} {value} {said}"
 
 
 def betas(periods: Iterable[int], **changes: object) -> list[Coming]:
-    """Messages in time about periods."""
+    """List messages in time about periods."""
     return [(PERIOD * (k + 1), Event.LINE, beta_line(k, **changes)) for k in periods]  # type: ignore[arg-type]
 
 
 def session(
     link: ScriptedLink, rows: list[Row] | None = None, controller: BoundedController | None = None, **changes: object
 ) -> LiveSession:
-    """A session that has not run yet."""
+    """Build a session that has not run yet."""
     kept: list[Row] = [] if rows is None else rows
     log: Callable[[Row], None] = kept.append
     return LiveSession(controller or BoundedController(network(), LIMITS, SIGNAL), PEER, link, log, **changes)  # type: ignore[arg-type]
 
 
 def ran(coming: Iterable[Coming], until_s: float, hello: bool = True, **options: object) -> tuple[ScriptedLink, LiveSession, End]:
-    """A session that ends when its input does."""
+    """Run a session that ends when its input does."""
     greeted = [(0.0, Event.LINE, HELLO)] if hello else []
     link = ScriptedLink([*greeted, *coming, (until_s, Event.ENDED, "")], **options)  # type: ignore[arg-type]
     one = session(link)
@@ -94,5 +94,5 @@ def ran(coming: Iterable[Coming], until_s: float, hello: bool = True, **options:
 
 
 def followed(one: LiveSession) -> list[bool]:
-    """For each decision whether the network was followed."""
+    """List for each decision whether the network was followed."""
     return [not d.fallback for d in one.decisions]

@@ -1,4 +1,4 @@
-"""The control loop, broken in every way that a link, a device and a tablet break: cDBS within one period, and a last line that says so."""
+"""The control loop under all faults of a link, a device and a tablet: cDBS within one period, and a last line that says so."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.ml.deploy.runtime.links import (
 
 
 def returns_to_cdbs_within(link: ScriptedLink, from_s: float, seconds: float) -> None:
-    """The first amplitude after a fault is cDBS, and comes in time."""
+    """Require that the first amplitude after a fault is cDBS, and comes in time."""
     assert any(ma < CDBS for at, ma in link.amplitudes if at < from_s), "the network had taken over before"
     at, ma = next((at, ma) for at, ma in link.amplitudes if at >= from_s)
     assert ma == CDBS
@@ -340,7 +340,7 @@ def test_a_network_that_fails_or_answers_nonsense_gives_cdbs() -> None:
 
 
 def device(link: ScriptedLink) -> DeviceSide:
-    """The reference device side after every line of a runner that was killed then: nothing more comes."""
+    """Return the reference device side after every line of a runner that was killed then: nothing more comes."""
     one = DeviceSide("P1", "left", CDBS, 0.5, 3.2)
     for at, line in link.sent:
         if not line.startswith("end"):

@@ -96,7 +96,7 @@ def test_a_typed_text_stays_where_all_its_words_are_known():
 
 
 def full(percept):
-    """A report with annotations in a section of its own, within a run and below known sections, names among them."""
+    """Build a report with annotations in a section of its own, within a run and below known sections, names among them."""
     report = percept.one_run()
     report["BrainSenseTimeDomain"][0]["AdaAnnotations"] = [{"OffsetInSeconds": 3.0, "Text": "tremor", "Author": "Ada Lovelace"}]
     return report | {

@@ -86,7 +86,7 @@ def test_the_devices_power_follows_the_band_power_of_the_samples_it_is_paired_wi
     domains, powers = time_domains("run", report["BrainSenseTimeDomain"]), device_powers(report["BrainSenseLfp"])
     for run in (0, 2, 3):
         domain, power = domains[run], powers[run]
-        # 11.72 Hz was sensed, averaged over 3 s; the device tells it some 1.5 s late
+        # 11.72 Hz was sensed, averaged over 3 s; the device reports it some 1.5 s late
         band = band_pass(domain.values, 250.0, 9.22, 14.22) ** 2
         total = np.concatenate(([0.0], np.cumsum(band)))
         end = ((power.ticks_ms - domain.begin_ms - 1500.0) / 4.0).astype(int)

@@ -21,7 +21,7 @@ def placed(sizes, ticks, samples=None, sequences=None):
 
 
 def slow_times_ms(sizes, ticks):
-    """Time of every sample, packet by packet from the last to the first, as Medtronic's published loop walks."""
+    """Compute the time of every sample, packet by packet from the last to the first, as Medtronic's published loop walks."""
     step = 1000.0 / RATE
     times = []
     for k in range(len(sizes) - 1, -1, -1):

@@ -17,7 +17,7 @@ NO_SETTINGS = Settings(Timeline(), Timeline(), {}, False)
 
 
 def placed(last_ms, counts, chunk, samples=None, key=0):
-    """Packets of one key whose last samples are at `last_ms`."""
+    """Build packets of one key whose last samples are at `last_ms`."""
     counts = np.array(counts)
     n = counts.size
     nothing = np.zeros(n)

@@ -121,7 +121,7 @@ def test_samples_beyond_what_the_device_can_stream_are_left_out_and_said(rcs, pa
 
 
 def packet_ends(text):
-    """Where each packet of a stream ends in the text of its file."""
+    """Find where each packet of a stream ends in the text of its file."""
     starts = [i for i in range(len(text)) if text.startswith('{"Header"', i)]
     return [b - 2 for _, b in pairwise(starts)] + [len(text) - 3]
 

@@ -48,7 +48,7 @@ def test_files_are_grouped_by_what_they_name_and_never_mixed():
 
 
 def in_one_folder(rcs, other):
-    """Settings and stimulation of an implant or session named by `other` beside a time domain of the usual one."""
+    """Put settings and stimulation of an implant or session named by `other` next to a time domain of the usual one."""
     files = {
         "RawDataTD": rcs.time_domain(np.full(5000, 0.01)),
         "DeviceSettings": rcs.settings(),

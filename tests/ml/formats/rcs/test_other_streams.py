@@ -20,7 +20,7 @@ def trace(recording, stream):
 
 
 def packets(rcs, body, interval_s, count, drop=()):
-    """Packets numbered from 0 that end at multiples of the interval; `body` gives the fields of each."""
+    """Build packets numbered from 0 that end at multiples of the interval; `body` gives the fields of each."""
     out = []
     for i in range(count):
         t_s = (i + 1) * interval_s
@@ -49,7 +49,9 @@ def accel(rcs, seconds=20.0, amplitude=3.0, drop=()):
 
 
 def fft(rcs, amplitude_mv, bins=64, size=256, rate=250.0, count=40):
-    """Spectra as the device makes them: 4 |FFT| / N of 250 samples under a Hann window, padded to 256; a sine in the middle of a bin."""
+    """Compute spectra as the device makes them: 4 |FFT| / N of 250 samples under a Hann window, padded to 256; a sine in the middle of a
+    bin.
+    """
     n = {256: 250}[size]
     hz = 26 * rate / size
     spectrum = 4 * np.abs(np.fft.rfft(amplitude_mv * np.sin(2 * np.pi * hz * np.arange(n) / rate) * np.hanning(n), size)) / size

@@ -10,7 +10,7 @@ INTERVAL_S, WINDOW_S = 0.1, 2.0
 
 
 def band_power(count=3000, seed=0):
-    """Power of some bins in overlapping windows: smoothed chi-square, as the device streams it without stimulation."""
+    """Draw the power of some bins in overlapping windows: smoothed chi-square, as the device streams it without stimulation."""
     drawn = np.random.default_rng(seed).chisquare(8, count + 19)
     return 25.0 * np.convolve(drawn, np.full(20, 1 / 20), mode="valid")
 

@@ -35,7 +35,7 @@ def template():
 
 
 def session_like(template, tenths, seed):
-    """A session with these amplitudes in 0.1 mA and noise for an LFP."""
+    """Build a session with these amplitudes in 0.1 mA and noise for an LFP."""
     cdbs = PARTICIPANTS["P1"].cdbs_amplitude_ma
     steps = len(tenths)
     lfp = np.random.default_rng(seed).normal(0, 0.003, (LEAD + steps) * 500).astype(np.float32)
@@ -46,7 +46,7 @@ def session_like(template, tenths, seed):
 
 
 def packets_of(content):
-    """Time-domain packets of a zip, the index of each in the stream, and its samples; from the device's clock alone."""
+    """Read time-domain packets of a zip, the index of each in the stream, and its samples; from the device's clock alone."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         raw = archive.read(next(name for name in archive.namelist() if name.endswith("RawDataTD.json")))
     packets = json.loads(raw)[0]["TimeDomainData"]

@@ -63,7 +63,7 @@ def scanned(text):
 
 
 def gathered(text, scanner):
-    """All packets of a file as one list of rows, so that runs may be cut anywhere."""
+    """Gather all packets of a file as one list of rows, so that runs may be cut anywhere."""
     rows = []
     notes = JsonNotes()
     for batch in _batches(value for value, _ in read_elements(io.BytesIO(text.encode()), notes, scanner)):

@@ -19,7 +19,7 @@ START_MS = 1.7e12
 
 
 def packets(count=200, lost=(), first_s=3.0, noise_ms=0.0, seed=0):
-    """A stream of 100 ms packets whose true times are known, and those times in ms."""
+    """Build a stream of 100 ms packets whose true times are known, and those times in ms."""
     index = np.array([i for i in range(count) if i not in set(lost)])
     t = (index + 1) * PER_PACKET / RATE
     ticks = np.rint((first_s + t) * 10_000).astype(np.int64)

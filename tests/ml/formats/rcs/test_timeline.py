@@ -20,7 +20,7 @@ PER_PACKET = 50
 
 
 def packets(count=380, keep=None, first_s=3.0, noise_ms=0.0, drift=0.0, implant_step=(0, 0.0), pc_step=(0, 0.0)):
-    """Packets of 100 ms, and their true times in ms of the implant's ticks.
+    """Build packets of 100 ms, and their true times in ms of the implant's ticks.
 
     Steps are (packet from which the clock is set, by how many s); `drift` is the gain of the PC's clock on the implant's.
     """

@@ -27,7 +27,9 @@ def raw(std):
 
 
 def linear_gaussian(a, reward_slope):
-    """z_t = a z_{t-1} + 0.8 u + noise, s_t = 1.3 z_t + noise, r_{t-1} = slope z_t + noise, r_end = 0.5 z_T + noise; q exact filtering."""
+    """Build z_t = a z_{t-1} + 0.8 u + noise, s_t = 1.3 z_t + noise, r_{t-1} = slope z_t + noise, r_end = 0.5 z_T + noise; q exact
+    filtering.
+    """
     net = DlsmNetworks(1, LINEAR).double()
     emission, b, q, r = 1.3, 0.8, NOISES["transition"] ** 2, NOISES["state"] ** 2
     gain = q * emission / (emission**2 * q + r)
@@ -55,7 +57,7 @@ def linear_gaussian(a, reward_slope):
 
 
 def exact_log_likelihood(a, reward_slope, states, actions, rewards, end):
-    """Kalman filter over scalar z with observations (s_t, r_{t-1}) and, at T, r_end. Standardised variables."""
+    """Run the Kalman filter over scalar z with observations (s_t, r_{t-1}) and, at T, r_end. Standardised variables."""
     mean, variance, total = 0.0, 1.0, 0.0
 
     def update(mean, variance, slope, std, value):
@@ -77,7 +79,7 @@ def exact_log_likelihood(a, reward_slope, states, actions, rewards, end):
 
 
 def bound(net, states, actions, rewards, end, samples=20_000):
-    """Mean and standard error of the one-sample bound, over many copies of one session."""
+    """Compute the mean and standard error of the one-sample bound, over many copies of one session."""
     steps = len(actions)
 
     def wide(values):

@@ -1,4 +1,4 @@
-"""Members are held against how beta moves with the dose within random sessions, and those that move it the other way are left out."""
+"""Members are checked against how beta moves with the dose within random sessions, and those that move it the other way are excluded."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ UNLEARNT = DlsmConfig(**TINY, residual=True, reward_terms=False, discard=True)
 
 
 def held_doses(slope: float, n: int = 8, controller: str = "random", steps: int = 240, noise: float = 0.1) -> ReplayBuffer:
-    """Sessions whose doses are held 30 s and answered by beta within a few steps: from no stimulation to cDBS it changes by `slope`."""
+    """Simulate sessions whose doses last 30 s and are answered by beta within a few steps: from no stimulation to cDBS it changes by
+    `slope`.
+    """
     rng, sessions = np.random.default_rng(4), []
     for k in range(n):
         a = np.repeat(rng.uniform(0.3, 1.0, steps // 15), 15)

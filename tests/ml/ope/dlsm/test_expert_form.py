@@ -1,4 +1,4 @@
-"""What the DLSM has beyond the paper's form: a linear part, the known reward, free bits, free runs from posterior states, resampling."""
+"""Additions of the DLSM to the paper's form: a linear part, the known reward, free bits, free runs from posterior states, resampling."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def part(small_buffer: ReplayBuffer) -> LinearPart:
 
 
 def terms_of(config: DlsmConfig, buffer: ReplayBuffer, seed: int = 1) -> tuple[DlsmNetworks, Any, Any]:
-    """A double-precision model with its batch and noise."""
+    """Build a double-precision model with its batch and noise."""
     torch.manual_seed(0)
     batch = make_batch(buffer, learn_scale(buffer), torch.float64)
     net = DlsmNetworks(10, config).double()
@@ -157,7 +157,7 @@ def test_a_resampled_member_learns_from_as_many_sessions_as_there_are_and_never_
         assert set(learnt) | set(held) == set(range(n))
         assert not set(learnt) & set(held)
         assert len(held) >= 2
-    # a session is left out with probability (1 - 1/n)^n
+    # a session is excluded with probability (1 - 1/n)^n
     assert np.mean([len(held) / n for _, held in drawn]) == pytest.approx((1 - 1 / n) ** n, abs=0.05)
     fitted = Dlsm(replace(PLAIN, bootstrap=True)).fit(small_buffer)
     assert [sorted(m.check.sessions) for m in fitted.members] == [resampled(small_buffer, k)[1] for k in (0, 1)]

@@ -151,7 +151,7 @@ def test_without_any_qoc_the_estimate_is_the_step_return_and_says_so(small_buffe
 
 @pytest.mark.parametrize("measured", [True, False])
 def test_where_no_qoc_counts_r_end_is_zero_and_judges_no_model(small_buffer, measured):
-    # r_end is then the same for all: its error as a share of that of a constant, 0, was in the tens of thousands and stood in a flag.
+    # r_end is then the same for all. Its error as a share of that of a constant, 0, was in the tens of thousands and was in a flag.
     settings = replace(small_buffer.settings, c2=0.0, c3=0.0, c4=0.0)
     sessions = tuple(s if measured else replace(s, qoc=type(s.qoc)()) for s in small_buffer.sessions)
     fitted = Dlsm(TINY).fit(ReplayBuffer(settings, sessions, "uV", "table"))

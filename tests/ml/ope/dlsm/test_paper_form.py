@@ -27,7 +27,7 @@ PAPER = replace(DlsmConfig.paper("demo"), **TINY)
 def test_the_settings_are_those_of_the_papers_section_5_and_algorithm_1() -> None:
     c = DlsmConfig.paper("full", 3)
     assert c.objective == "posterior"  # the bound of theorem 5.1, nothing weighed
-    assert (c.state_terms, c.decode_all_window) == ("window", True)  # p(s_t | z_t) of the whole state, drawn anew
+    assert (c.state_terms, c.decode_all_window) == ("window", True)  # p(s_t | z_t) of the whole state, drawn again
     assert (c.action_emission, c.skip) == (False, False)  # s_t and r_{t-1} given z_t alone, z_t given h_t alone
     assert (c.end_features, c.end_source, c.qoc_terms) == ("final", "latent", False)  # r_end given z_T
     assert (c.start, c.reward_source, c.keep) == ("prior", "head", "last")

@@ -11,7 +11,7 @@ from ml.ope.dlsm.recurrence import LOG_STD_BOUNDS, LatentWeights, bounded, lstm,
 
 
 def tensors(steps, batch, latent, hidden, inputs=3, seed=0):
-    """x, z0, eps and the weights in the order of `LatentWeights`; all but the noise want a gradient."""
+    """Draw x, z0, eps and the weights in the order of `LatentWeights`; all but the noise want a gradient."""
     g = torch.Generator().manual_seed(seed)
 
     def draw(*shape):
@@ -26,7 +26,7 @@ def tensors(steps, batch, latent, hidden, inputs=3, seed=0):
 
 
 def both(inputs):
-    """Values and gradients of the fused recurrence and of the loop."""
+    """Compute values and gradients of the fused recurrence and of the loop."""
     results = []
     wanted = [t for t in inputs if t.requires_grad]
     for way in (stochastic_lstm, stochastic_lstm_loop):

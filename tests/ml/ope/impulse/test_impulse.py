@@ -30,7 +30,7 @@ WINDOW, STEPS = 10, 300
 
 
 def session(i: int, visit: int, rng: np.random.Generator, hold: int, gains: np.ndarray, shape: str) -> SessionTrajectory:
-    """A random session of log beta with a known impulse response to f(a), a level of its own and an autoregression of order 1."""
+    """Simulate a random session of log beta with a known impulse response to f(a), a level of its own and an autoregression of order 1."""
     draws = rng.uniform(0.3, 1.0, STEPS // hold + 1)
     a = np.repeat(draws, hold)[:STEPS]
     f = dose(shape, np.concatenate([np.full(len(gains), a[0]), a]))
@@ -103,7 +103,7 @@ def test_the_evidence_prefers_the_dose_shape_that_made_the_data() -> None:
 
 
 def test_amplitudes_that_never_stay_leave_the_slow_answer_open() -> None:
-    """What the data cannot tell stays wide: the interval of a sustained dose is wider where draws change at every step."""
+    """Intervals stay wide for what the data leave open: that of a sustained dose is wider where draws change at every step."""
     gains = -0.8 * (1 - 0.97) * 0.97 ** np.arange(160)
 
     def width(hold: int) -> float:

@@ -156,7 +156,7 @@ def test_a_stopped_session_lowers_the_estimate_and_the_flag_says_what_it_would_b
     flag = next(f for f in after.flags if f.code == "stopped_sessions")
     assert flag.value == 1
     assert flag.fact("counted") == pytest.approx(after.end_reward)
-    assert flag.fact("measured") == pytest.approx(before.end_reward, abs=0.5)  # visits are weighted anew
+    assert flag.fact("measured") == pytest.approx(before.end_reward, abs=0.5)  # visits are weighted again
     assert "stopped_sessions" not in {f.code for f in before.flags}
 
 

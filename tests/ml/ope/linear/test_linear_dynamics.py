@@ -21,7 +21,7 @@ SETTINGS = MdpSettings(xi_beta=2.0, c2=0.0, c3=0.0, c4=0.0)
 
 
 def known_system(seed, n=16, steps=400, phi=(0.5, 0.2), fall=0.8, day=0.3, session=0.2):
-    """beta = 3 + day + session - fall x dose + AR(2); the dose is the average over about 20 steps. Random sessions, and cDBS."""
+    """Simulate beta = 3 + day + session - fall x dose + AR(2); the dose is the average over about 20 steps. Random sessions, and cDBS."""
     rng = np.random.default_rng(seed)
     days, sessions, levels = day * rng.standard_normal(4), [], []
     for i in range(n):
@@ -46,7 +46,7 @@ def fitted(buffer, draws=20):
 
 
 def linear_scale(buffer):
-    """The scale without the logarithm, so that the known constants can be read off."""
+    """Return the scale without the logarithm, so that the known constants can be read off."""
     return replace(learn_scale(buffer), log=False, beta_mean=0.0, beta_std=1.0)
 
 
@@ -132,7 +132,7 @@ def test_the_answer_has_as_many_columns_as_the_model_says():
 
 
 def walking(seed, n=14, steps=200):
-    """Sessions whose level is their own and hardly moves, so that a one-step regression finds a root near one."""
+    """Simulate sessions whose level is their own and hardly moves, so that a one-step regression finds a root near one."""
     rng = np.random.default_rng(seed)
     sessions = []
     for i in range(n):
@@ -161,7 +161,7 @@ def test_a_root_near_one_is_kept_away_from_it_and_the_fall_of_beta_with_amplitud
 
 
 def test_the_reward_is_that_of_sampled_beta_never_of_its_mean(linear_simulator):
-    # Mean beta at 0.65 lies under the threshold; the share of steps above it does not vanish, and the step return must say so.
+    # Mean beta at 0.65 is under the threshold; the share of steps above it does not vanish, and the step return must say so.
     buffer = linear_simulator.buffer(seed=1)
     quiet = tuple(replace(s, qoc=type(s.qoc)()) for s in buffer.sessions)
     fitted = LinearModel(LinearConfig(draws=20)).fit(replace(buffer, sessions=quiet))

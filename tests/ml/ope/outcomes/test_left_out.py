@@ -18,7 +18,7 @@ STEPS, PER_VISIT, VISITS = 300, 4, 5
 
 
 def simulated(rng, visits, *, of_days=1.0):
-    """Doses, grasp, rating and tremor (%) of the sessions of visits [visits, PER_VISIT]; days move all three."""
+    """Simulate doses, grasp, rating and tremor (%) of the sessions of visits [visits, PER_VISIT]; days move all three."""
     dose = rng.uniform(0.2, 1.0, (visits, PER_VISIT))
     day = of_days * rng.standard_normal((3, visits, 1))
     noise = rng.standard_normal((2, *dose.shape))
@@ -38,7 +38,9 @@ def outcomes(grasp, rating, tremor):
 
 
 def squared_errors(seed):
-    """Mean squared errors [4] of left-out sessions, of left-out visits, and of new visits predicted from as many visits as are left."""
+    """Compute mean squared errors [4] of held-out sessions, of held-out visits, and of new visits predicted from the same number of
+    visits.
+    """
     rng = np.random.default_rng([seed, 0x1EF7])
     data, new = simulated(rng, VISITS), simulated(rng, 30)
     model, before = fitted(*data), fitted(*(v[:-1] for v in data))
@@ -82,7 +84,7 @@ def test_of_a_single_visit_no_day_to_come_can_be_judged():
 
 
 def test_the_rating_of_a_left_out_visit_does_not_know_the_tremor_of_its_sessions():
-    # ratings follow the tremor alone, which follows nothing: who has not seen the tremor cannot tell the rating
+    # ratings follow the tremor alone, which follows nothing: without the tremor the rating cannot be predicted
     rng = np.random.default_rng(5)
     dose, tremor = rng.uniform(0.2, 1.0, 32), 10.0 * rng.integers(0, 11, 32)
     rating = np.clip(np.round(9.0 - 0.06 * tremor), 1, 10)

@@ -20,7 +20,7 @@ def told(buffer, hours):
 
 
 def visit_by_visit(rng, worn_grasp=-0.4):
-    """Four visits of six sessions; low doses come late, when medication has worn off. [24] each: doses, grasps, visits, hours."""
+    """Simulate four visits of six sessions; low doses come late, when medication has worn off. [24] each: doses, grasps, visits, hours."""
     hours = np.tile([0.5, 1.0, 1.5, 2.5, 3.0, 3.5], 4)
     doses = np.tile([1.0, 0.7, 0.9, 0.5, 0.8, 0.3], 4) + 0.05 * rng.standard_normal(24)
     grasps = 1.5 + 0.5 * doses + worn_grasp / (1 + np.exp(-(hours - 2.0) / WIDTH_H)) + 0.05 * rng.standard_normal(24)

@@ -20,7 +20,7 @@ ALL = replace(SETTINGS, c2=10.0, c3=5.0, c4=20.0)
 
 
 def buffer_of(doses, grasps, visits, tremors=None, settings=SETTINGS, ratings=None, steps=T):
-    """Sessions of constant (or given) amplitudes; a missing value is NaN."""
+    """Build sessions of constant (or given) amplitudes; a missing value is NaN."""
     sessions = []
     for i, (dose, visit) in enumerate(zip(doses, visits, strict=True)):
         known = {"grasp_hz": grasps[i]}

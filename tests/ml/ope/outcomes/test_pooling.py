@@ -23,7 +23,7 @@ def certain(shapes):
 
 
 def exact_prior(log_evidence):
-    """E[p | data] by the sum over every assignment of shapes: Dirichlet-multinomial times evidences."""
+    """Compute E[p | data] by the sum over every assignment of shapes: Dirichlet-multinomial times evidences."""
     n, k = log_evidence.shape
     logs, means = [], []
     for shapes in product(range(k), repeat=n):
@@ -38,7 +38,7 @@ def exact_prior(log_evidence):
 
 
 def participant(rng, shape, sessions=48, noise=0.03):
-    """Sessions whose grasp answers to the dose along one of `SHAPES`, by an amount of the participant's own."""
+    """Simulate sessions whose grasp answers to the dose along one of `SHAPES`, by an amount of the participant's own."""
     doses = rng.uniform(0.05, 1.0, sessions)
     answer = by_minute(np.ones((sessions, 60)), doses[:, None] * np.ones(60), SETTINGS).means[:, DOSE + shape]
     grasps = rng.uniform(1.0, 2.0) + rng.uniform(0.8, 1.4) * answer + noise * rng.standard_normal(sessions)
@@ -79,7 +79,7 @@ def test_a_constant_in_the_evidence_of_a_participant_changes_nothing():
 
 @pytest.mark.parametrize("n", [4, 5, 12])
 def test_one_shape_for_all_gains_what_the_closed_form_says(n):
-    # the others' n - 1 count beside one of each shape: (c + n - 1) / (K c + n - 1) instead of 1 / K
+    # the others' n - 1 count besides one of each shape: (c + n - 1) / (K c + n - 1) instead of 1 / K
     expected = np.log(K * (CONCENTRATION + n - 1) / (K * CONCENTRATION + n - 1))
     found = prove(certain([3] * n))
     np.testing.assert_allclose(found.gains, expected, rtol=1e-9)

@@ -17,12 +17,12 @@ SUPPORT = {"near_sessions": 4, "near_visits": 2, "leverage": 0.1, "dose": 0.7, "
 
 
 def share(of_ones: float, good: float, bad: float) -> list[float]:
-    """Draws of which a share is `bad` and the rest `good`."""
+    """Build draws of which a share is `bad` and the rest `good`."""
     return [float(v) for v in np.where(of_ones > RANKS, bad, good)]
 
 
 def constructed(name: str = "rl", *, supported: bool = True, told: bool = True, value: float = 0.0, **changed: Any) -> Estimate:
-    """A posterior estimate: energy 0.6 of cDBS, grasp 2 Hz, rating 7, tremor 20 %, told by the data; `changed` replaces details."""
+    """Build a posterior estimate with skill: energy 0.6 of cDBS, grasp 2 Hz, rating 7, tremor 20 %; `changed` replaces details."""
     outcomes = {"energy": [0.6] * N, "grasp_hz": [2.0] * N, "rating": [7.0] * N, "tremor_percent": [20.0] * N}
     details: dict[str, Any] = {
         "draws": [value] * N,
@@ -37,6 +37,6 @@ def constructed(name: str = "rl", *, supported: bool = True, told: bool = True, 
 
 
 def cdbs(**changed: Any) -> Estimate:
-    """cDBS beside it: energy 1, the same outcomes."""
+    """Build cDBS for comparison: energy 1, the same outcomes."""
     same = {"energy": [1.0] * N} | changed.pop("outcome_draws", {})
     return constructed("cdbs", outcome_draws=same, behaviour={"closeness_to_cdbs": 0.0}, **changed)

@@ -33,7 +33,7 @@ class KnownSystem:
         return SessionTrajectory(i + 1, visit, controller, beta[:WINDOW], beta[WINDOW:], a, qoc)
 
     def buffer(self, seed: int = 0, visits: int = 3, hold: int = 20, weight: float = 10.0) -> ReplayBuffer:
-        """Visits of one cDBS session, four held random ones at levels of their own, and one without stimulation."""
+        """Simulate visits of one cDBS session, four random ones at sustained levels of their own, and one without stimulation."""
         rng = np.random.default_rng(seed)
         sessions: list[SessionTrajectory] = []
         for visit in range(1, visits + 1):

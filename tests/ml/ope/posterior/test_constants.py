@@ -1,4 +1,4 @@
-"""What is added for the error of the structures: in which unit, and as much as is stated."""
+"""Additions for the error of the structures: in which unit, and as much as is stated."""
 
 from __future__ import annotations
 
@@ -36,5 +36,5 @@ def test_draws_differ_by_the_error_that_is_stated() -> None:
     stated = ModelError(0.2, 0.4)
     s = BUFFER.settings
     unit = float(np.sum(s.gamma ** np.arange(40))) * abs(s.r_a - s.r_b)
-    # 400 draws tell a variance to some 14 % at two standard errors
+    # 400 draws give a variance to some 14 % at two standard errors
     assert spread({"steps": stated})[0] - without == pytest.approx((unit * stated.sd(leverage)) ** 2, rel=0.2)

@@ -1,4 +1,4 @@
-"""How many sessions would tell: against the closed form of a normal mean, and at its limits."""
+"""Number of sessions that would decide: against the closed form of a normal mean, and at its limits."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def plain_chances(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def normal_draws(mean: float, sd: float) -> np.ndarray:
-    """Draws without chance."""
+    """Compute draws without chance."""
     return np.asarray(norm.ppf(RANKS, mean, sd))
 
 
 def told_share(mean: float, sd: float, noise: float, n: int) -> float:
-    """Closed form: how often n sessions, up to four after one of cDBS, decide P(within) >= 0.8 or <= 0.2, one normal outcome.
+    """Compute in closed form how often n sessions, up to four after one of cDBS, decide P(within) >= 0.8 or <= 0.2, one normal outcome.
 
     The posterior given the data is normal with variance v = 1 / (1 / sd^2 + 1 / (noise^2 (1 / n + 1 / visits))); its mean is normal
     around `mean` with variance sd^2 - v; P(within) = Phi(posterior mean / sqrt(v)).
@@ -135,7 +135,7 @@ def test_exploring_holds_the_lowest_amplitude_that_a_whole_session_may_hold() ->
 
 
 def buffer_of(*rows: tuple[int, str, int | None]) -> ReplayBuffer:
-    """Sessions of visit, controller and rating."""
+    """Build sessions of visit, controller and rating."""
     beta = np.ones(5)
     sessions = [
         SessionTrajectory(i, visit, controller, np.ones(3), beta, beta, Qoc(rating=rating))

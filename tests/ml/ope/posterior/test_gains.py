@@ -1,4 +1,4 @@
-"""What sweeps go by: the energy that a constant amplitude saves is known, whatever beta does, and tested sessions move what acts alike."""
+"""Values that sweeps use: the energy saved by a constant amplitude is known, whatever beta does; tested sessions move what acts alike."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def test_draws_have_the_spread_and_the_correlation_they_were_asked_for() -> None
 
 
 def prior(draws: int = 40000) -> dict[str, np.ndarray]:
-    """Three policies, the last of them the reference; the first two alike."""
+    """Draw three policies, the last of them the reference; the first two alike."""
     rng = np.random.default_rng(1)
     covariance = np.array([[4.0, 3.0, 0.0], [3.0, 4.0, 0.0], [0.0, 0.0, 1.0]])
     return {"return": rng.multivariate_normal([10.0, 8.0, 9.0], covariance, draws).T}
@@ -50,7 +50,7 @@ def test_policies_of_one_visit_share_the_chance_of_its_cdbs_sessions() -> None:
     ]
     found = errors_of_tests([(t, "return") for t in tests], {"return": 1.0}, {})
     assert np.allclose(found, [[1 + 4 * 1.5, 2.0, 0.0], [2.0, 1 + 4 * 1.0, 0.0], [0.0, 0.0, 1 + 4 * 1.5]])
-    # so the difference between two policies of one visit is told as well as without cDBS between them
+    # so the difference between two policies of one visit is known as well as without cDBS between them
     assert found[0, 0] + found[1, 1] - 2 * found[0, 1] == pytest.approx(2 * 1.0 + sd**2 * (1 / 1 + 1 / 2))
 
 
@@ -87,7 +87,7 @@ def test_twins_of_one_visit_share_its_day() -> None:
 
 
 def test_a_lucky_rating_is_not_counted_again_in_the_return() -> None:
-    """Where the return is its rating's part alone, seeing both says no more than seeing the rating."""
+    """Returns that are only their rating's part: seeing both says no more than seeing the rating."""
     draws = prior()
     draws["rating"] = draws["return"] / 2.0
     names, weights = ["first", "second", "cdbs"], {"rating": 2.0}

@@ -28,7 +28,7 @@ from tests.ml.ope.posterior.known_system import KnownSystem
 
 
 def readable(a: np.ndarray, first: float) -> np.ndarray:
-    """Columns by their definition, one step after the other."""
+    """Compute columns by their definition, one step after the other."""
     rows = []
     passed = {(m, j): float(dose_functions(np.array(first))[j]) for m in range(len(TIMES)) for j in range(SHAPES)}
     sided, falls, last = [first] * len(ONE_SIDED), [0.0] * len(FALL_TIMES), first
@@ -61,7 +61,7 @@ def test_columns_are_those_of_the_definition_at_once_and_step_by_step(first: flo
 
 
 def sustained(buffer, before):
-    """Draws of the fall of standardised beta from no stimulation to lasting cDBS, in log beta."""
+    """Draw the fall of standardised beta from no stimulation to lasting cDBS, in log beta."""
     scale = learn_scale(buffer)
     tables = [ModeTable.of(s, scale, before) for s in buffer.sessions]
     drawn = fit_modes(buffer, tables, before).drawn(300, np.random.default_rng(0))

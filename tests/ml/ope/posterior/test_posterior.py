@@ -115,7 +115,7 @@ def test_without_outcomes_the_return_is_that_of_the_steps_and_says_so() -> None:
 
 
 def test_data_that_cannot_order_policies_say_so() -> None:
-    """Beta that answers to nothing, and outcomes that nobody took."""
+    """Beta that answers to nothing, and missing outcomes."""
     buffer = KnownSystem(depth=0.0).buffer(weight=0.0)
     noise = replace(buffer.settings, xi_beta=1.0)
     bare = replace(buffer, settings=noise, sessions=tuple(replace(s, qoc=Qoc()) for s in buffer.sessions))
@@ -159,7 +159,7 @@ def test_a_stopped_session_lowers_the_estimate_and_the_flag_says_what_it_would_b
 
 
 def test_where_structures_disagree_on_a_lasting_dose_the_interval_holds_both(known_buffer) -> None:
-    """The same fit with one structure's answer to the dose turned round: nothing says which is right, so both must be held possible."""
+    """The same fit with one structure's answer to the dose turned round: nothing says which is right, so both must stay possible."""
     fitted = SMALL.fit(known_buffer)
     linear = next(f for f in fitted.fits if f.key == "linear")
     turned = replace(linear, key="turned", drawn=replace(linear.drawn, beta=-linear.drawn.beta))

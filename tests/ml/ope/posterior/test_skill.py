@@ -1,4 +1,4 @@
-"""When the data give no reason to believe an order of policies."""
+"""Data that give no reason to believe an order of policies."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_few_sessions_tell_nothing() -> None:
 
 
 def of_visits_alone(seed: int) -> ReplayBuffer:
-    """Sessions that differ in the level of their visit, in beta and in outcomes, and answer to nothing."""
+    """Simulate sessions that differ in the level of their visit, in beta and in outcomes, and answer to nothing."""
     buffer, rng = KnownSystem(depth=0.0).buffer(seed=seed), np.random.default_rng([seed, 9])
     level, rating = np.exp(0.2 * rng.standard_normal(4)), rng.standard_normal(4)
     sessions = []
@@ -93,7 +93,7 @@ def test_outcomes_that_follow_the_dose_are_skill_where_beta_says_nothing() -> No
 
 
 def test_outcomes_are_asked_whether_or_not_they_count_in_the_reward_at_the_end() -> None:
-    """Verdicts rest on each of them, so that one that follows the dose is skill beside others that are noise."""
+    """Verdicts rest on each of them, so that one that follows the dose is skill among others that are noise."""
     unweighted = replace(BUFFER, settings=replace(BUFFER.settings, c2=0.0, c3=0.0, c4=0.0))
     assert skill(EQUAL, buffer=unweighted).told
     rng = np.random.default_rng(4)

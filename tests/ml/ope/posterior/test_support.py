@@ -14,14 +14,14 @@ from tests.ml.ope.posterior.known_system import STEPS, KnownSystem
 
 
 def buffer_of(*doses: tuple[int, str, float]) -> ReplayBuffer:
-    """One session of a constant dose for each (visit, controller, dose)."""
+    """Simulate one session of a constant dose for each (visit, controller, dose)."""
     system, rng = KnownSystem(), np.random.default_rng(0)
     sessions = [system.session(i, v, c, np.full(STEPS, a), rng) for i, (v, c, a) in enumerate(doses)]
     return replace(system.buffer(visits=1), sessions=tuple(sessions))
 
 
 def at(support: SessionSupport, dose: float, switching: float = 0.0):
-    """Support of a policy that holds a dose with the burden that the nearest session had."""
+    """Compute the support of a policy of constant dose with the burden that the nearest session had."""
     nearest = support.points[np.argmin(np.abs(support.points[:, 0] - dose))]
     return support.of(np.array([dose, dose, nearest[2], switching]))
 

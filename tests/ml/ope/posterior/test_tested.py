@@ -1,4 +1,4 @@
-"""Tested sessions as differences to the same visit's cDBS: means, standard errors and what is left out, by hand and by closed forms."""
+"""Tested sessions as differences to the same visit's cDBS: means, standard errors and exclusions, by hand and by closed forms."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def of(policy: str | None, visit: int, **values: float) -> TestSession:
 
 
 def widened(freedom: float) -> float:
-    """Half-width of the central 68.3 % of Student's t, as that of the standard normal is 1."""
+    """Compute the half-width of the central 68.3 % of Student's t, as that of the standard normal is 1."""
     return float(stats.t.ppf(stats.norm.cdf(1.0), freedom))
 
 

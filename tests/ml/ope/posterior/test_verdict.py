@@ -22,7 +22,7 @@ def plain_chances(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 
 
 def of(reference: Any = None, margins: Margins | None = None, levels: Levels | None = None, **changed: Any) -> Verdict:
-    """The verdict on a constructed candidate with the default margins and levels."""
+    """Return the verdict on a constructed candidate with the default margins and levels."""
     told = {name: changed.pop(name) for name in ("harms", "unchecked") if name in changed}
     return verdict(constructed(**changed), reference or cdbs(), margins or Margins(), levels or Levels(), **told)
 
@@ -43,7 +43,7 @@ def test_a_policy_within_all_margins_that_saves_energy_is_worth_a_test() -> None
 @pytest.mark.parametrize(("beyond", "code"), [(0.2, "test"), (0.201, "undecided"), (0.799, "undecided"), (0.8, "likely_worse")])
 @pytest.mark.parametrize(
     ("name", "good", "bad"),
-    # the bad value lies just beyond its margin of 10 %, 1 point, 10 percentage points, the good one just within
+    # the bad value is just beyond its margin of 10 %, 1 point, 10 percentage points, the good one just within
     [("grasp_hz", 1.801, 1.799), ("rating", 6.001, 5.999), ("tremor_percent", 29.999, 30.001)],
 )
 def test_each_outcome_has_its_margin_and_its_levels(name: str, good: float, bad: float, beyond: float, code: str) -> None:
@@ -96,7 +96,9 @@ def test_the_calibration_is_monotone_and_corrects_chances_that_are_too_low() -> 
 
 
 def test_draws_are_compared_with_those_of_cdbs_one_by_one() -> None:
-    """What the posterior gets wrong for both alike cancels: both trembling from 0 to 100 % of the time is no doubt about the difference."""
+    """Errors of the posterior that are the same for both cancel: both trembling from 0 to 100 % of the time is no doubt about the
+    difference.
+    """
     both = share(0.5, 0.0, 90.0)
     assert of(cdbs(outcome_draws={"tremor_percent": both}), outcome_draws={"tremor_percent": both}).code == "test"
     assert of(cdbs(outcome_draws={"tremor_percent": both[::-1]}), outcome_draws={"tremor_percent": both}).within == 0.5

@@ -1,4 +1,4 @@
-"""What policies ask for at which beta, against policies whose answers are known."""
+"""Amplitudes that policies request at which beta, against policies whose answers are known."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_curves_and_cloud_are_those_of_the_recorded_windows(buffer: ReplayBuffer
     assert {len(column) for column in found.tried} == {DOSES}
     assert {round(v, 9) for v in found.policies["held"].middle if v is not None} == {0.55}
     curve = found.policies["following"]
-    inner = range(1, COLUMNS - 1)  # the outermost columns hold what lies beyond them too
+    inner = range(1, COLUMNS - 1)  # the outermost columns hold what is beyond them too
     assert sum(curve.middle[k] is not None for k in inner) > 5
     for k in inner:
         if curve.middle[k] is not None:

@@ -1,4 +1,4 @@
-"""What the ranking says of a policy before a clinician ticks it."""
+"""Flags of a policy in the ranking before a clinician ticks it."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def session_starts(sessions):
 
 
 def amplitude_at(records, times):
-    """Delivered mA at PC times from the running merge of the delta records."""
+    """Compute delivered mA at PC times from the running merge of the delta records."""
     state, out, i = {}, [], 0
     for t in times:
         while i < len(records) and records[i]["RecordInfo"]["HostUnixTime"] <= t:

@@ -58,7 +58,7 @@ def test_normal_draws_have_mean_zero_and_unit_variance_and_streams_are_independe
 
 
 def one_period_in_plain_python(participant, counters, state, amplitude, sos):
-    """The equations with whole histories instead of delay lines; returns 500 LFP samples in uV."""
+    """Integrate the equations with whole histories instead of delay lines; returns 500 LFP samples in uV."""
     p = participant.brain
     weights = {"SG": (19.0, 20.0), "GS": (1.12, 10.7), "GG": (6.60, 12.3), "CS": (2.42, 9.2), "XG": (15.1, 139.4)}
     rate = lambda x, m, b: m / (1 + math.exp(-4 * x / m) * (m - b) / b)  # noqa: E731

@@ -1,4 +1,4 @@
-"""What every learning algorithm owes its callers, tested on each of the registry in the same way."""
+"""Contract of every learning algorithm, tested on each of the registry in the same way."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def stop_at(update, updates=300):
 
 
 def learner_of(name, buffer, count=1, **changes):
-    """A learner, its data and a batch of it."""
+    """Build a learner, its data and a batch of it."""
     configs = [small(name, seed=k, **changes) for k in range(count)]
     kind = algorithm(name).learner
     mean, std = buffer.beta_scale()
@@ -244,10 +244,10 @@ def test_a_training_that_diverges_says_so(name, buffer):
         train(buffer, small(name), initial=broken)
 
 
-# --- held near a constant amplitude -------------------------------------------------------------------------------------------------
+# --- kept near a constant amplitude -------------------------------------------------------------------------------------------------
 
 HELD = {"td3_bc": {"alpha": 1e30}, "rebrac": {"actor_penalty": 0.0}}
-"""Algorithms whose actor is held near an anchor, with a bond of no strength."""
+"""Algorithms whose actor is kept near an anchor, with a bond of no strength."""
 
 
 def test_every_algorithm_that_is_held_near_an_anchor_is_known_here():

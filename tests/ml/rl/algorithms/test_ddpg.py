@@ -69,7 +69,7 @@ class Net:
         return x[0], (inputs, outputs)
 
     def backward(self, memory, slope):
-        """Gradient of slope * output by each weight and bias, and by the action."""
+        """Compute the gradient of slope * output by each weight and bias, and by the action."""
         inputs, outputs = memory
         grad_w, grad_b, by_action, delta = [None] * len(self.w), [None] * len(self.w), 0.0, [slope]
         for i in reversed(range(len(self.w))):

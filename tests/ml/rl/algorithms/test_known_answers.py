@@ -21,7 +21,7 @@ SOLVERS = {
 
 
 def linear_quadratic(count=4000, gamma=0.9, keep=0.9, push=0.8, price=0.3, seed=0):
-    """x' = 0.9 x + 0.8 u + noise at cost x^2 + 0.3 u^2, u = a - 0.5: transitions, and the gain K of the optimal u = -K x."""
+    """Simulate x' = 0.9 x + 0.8 u + noise at cost x^2 + 0.3 u^2, u = a - 0.5: transitions, and the gain K of the optimal u = -K x."""
     rng = np.random.default_rng(seed)
     x, older, action = rng.uniform(-0.8, 0.8, count), rng.uniform(-0.8, 0.8, count), rng.uniform(0, 1, count)
     u = action - 0.5
@@ -98,7 +98,7 @@ def test_a_bond_between_lets_it_leave_the_constant_as_far_as_the_values_pay_for(
     anchor, strengths = 0.6, (1.0, 3.0)
 
     def slope(pi, strength):
-        """Of b (2 pi - 2 anchor)^2 - Q / |Q| with |Q| held fast, Q in deviations of the reward."""
+        """Compute the slope of b (2 pi - 2 anchor)^2 - Q / |Q| with constant |Q|, Q in deviations of the reward."""
         return 8 * strength * (pi - anchor) + 2 * (pi - 0.2) / abs(-((pi - 0.2) ** 2) - reward.mean())
 
     expected = [brentq(slope, 0.2, 0.55, strength) for strength in strengths]

@@ -14,7 +14,7 @@ from ml.rl.kernels.networks import Critic
 
 
 def trained_like(hidden, *, window=10, seed=3):
-    """A policy whose answers spread over [0, 1], as after training: the last layer's first weights are nearly 0."""
+    """Build a policy whose answers spread over [0, 1], as after training: the last layer's first weights are nearly 0."""
     policy = MlpPolicy(window, hidden, mean=120.0, std=35.0, seed=seed)
     with torch.no_grad():
         policy.layers[-1].weight.mul_(1000)
@@ -26,7 +26,7 @@ def windows(n, window=10, seed=0):
 
 
 def by_hand(policy, window):
-    """The network in plain loops, float64."""
+    """Compute the network in plain loops, float64."""
     x = [(b - float(policy.mean)) / float(policy.std) for b in window]
     for i, layer in enumerate(policy.layers):
         rows, bias = layer.weight.tolist(), layer.bias.tolist()

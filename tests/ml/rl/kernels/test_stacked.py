@@ -12,7 +12,7 @@ SIZES, BATCH = (16, 12), 8
 
 
 def grown(network, factor=100.0):
-    """Last layers as after some training: the first ones are nearly 0."""
+    """Scale last layers as after some training: the first ones are nearly 0."""
     with torch.no_grad():
         network.layers[-1].weight.mul_(factor)
     return network

@@ -168,7 +168,7 @@ SKEWED = np.array([0.1, 0.2, 0.3, 0.4, 3.0, 0.2])
 
 
 def of_contrasts(values, bounded, order=None):
-    """A study of visits with these contrasts, one session of either arm."""
+    """Build a study of visits with these contrasts, one session of either arm."""
     n = len(values)
     value, visit = np.c_[np.zeros(n), values].ravel(), np.repeat(np.arange(n), 2)
     return Measurements.of(value, visit, np.tile([False, True], n), order=order, bounded=bounded)

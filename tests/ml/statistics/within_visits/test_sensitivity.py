@@ -82,7 +82,7 @@ def test_all_of_them_answer_and_what_was_not_recorded_is_a_reason():
 
 
 def contrasts_of(values):
-    """A study of visits with these contrasts."""
+    """Build a study of visits with these contrasts."""
     n = len(values)
     return Measurements.of(np.c_[np.zeros(n), values].ravel(), np.repeat(np.arange(n), 2), np.tile([False, True], n))
 

@@ -19,7 +19,7 @@ from ml.statistics.within_visits.stratified import Method, aligned_rank_test, sh
 
 
 def shufflings(data, score):
-    """Statistic as observed, and of every way to share each visit's scores out between the arms."""
+    """Compute the statistic as observed, and of every way to share each visit's scores out between the arms."""
     observed, every = 0.0, []
     for v in np.unique(data.visit):
         rows = data.visit == v
