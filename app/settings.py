@@ -45,6 +45,9 @@ class Settings(BaseSettings):
     require_released_policies: bool = Field(
         False, description="Approve plans only of policies that a clinician has released, with a signature of its own."
     )
+    outcomes: Path | None = Field(
+        None, description="YAML file of the outcomes that this installation adds to those of the paper (docs/ingest/outcomes.md)."
+    )
     cookie_secure: bool = Field(
         False,
         description="Send the session cookie over HTTPS only; on with TLS, and where other machines reach the service unless set to false.",

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ml.outcomes import BY_FIELD, OUTCOMES, Outcome
+from ml.outcomes import BY_FIELD, OUTCOMES
+from ml.outcomes.records import Outcome
 
 PLAUSIBLE_INTERVAL_S = (0.08, 3.0)
 """Intervals between open fists: faster is sensor bounce, slower is a pause and no grasp."""

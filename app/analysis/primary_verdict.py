@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from app.analysis.facts import Facts, choose_each, of_controller
 from app.tables.sessions import Controller
-from ml.outcomes import KEYS, OUTCOMES, Outcome
+from ml.outcomes import JUDGED, KEYS
+from ml.outcomes.records import Outcome
 from ml.qoc import Margins, Qoc
 from ml.statistics.noninferiority import LEAST_VISITS, Assessment, assess
 from ml.statistics.noninferiority import Outcome as JudgedOutcome
@@ -192,7 +193,7 @@ def _judge(
     chosen = choose_each(sessions, ("energy", *KEYS), tested)
     energy = chosen["energy"]
     outcomes = [
-        judged_outcome(o, chosen[o.key].data, chosen[o.key].stopped, locked.margins.of(o), getattr(failed, o.field)) for o in OUTCOMES
+        judged_outcome(o, chosen[o.key].data, chosen[o.key].stopped, locked.margins.of(o), getattr(failed, o.field)) for o in JUDGED
     ]
     used = {s.visit for s in sessions}
     seen = {s.visit for s in sessions if tested(s)} & {s.visit for s in sessions if s.controller is Controller.CDBS}

@@ -9,7 +9,8 @@ from app.analysis.primary_results import Basis, Comparison, Disagreement, Tested
 from app.analysis.primary_verdict import LockedMargins, NoVerdict, VerdictResult
 from app.platform.numbers import counted, p_text
 from app.study.blinding import CONTROLLER_NAMES
-from ml.outcomes import ALL, BY_KEY, OUTCOMES, Outcome, enumerated
+from ml.outcomes import ALL_JUDGED, BY_KEY, JUDGED, OUTCOMES, enumerated
+from ml.outcomes.records import Outcome
 from ml.statistics.noninferiority import ENERGY, LEAST_VISITS, FailureRule, Inconclusive, Inferior, NonInferiorAndSaving, Verdict
 from ml.statistics.pooling import Summary
 from ml.statistics.power import MOST_VISITS
@@ -28,13 +29,13 @@ the share."""
 
 _MODELLED = {"ordinal": "ordered categories", "minutes": "minutes out of those watched (from the share and the length of the session)"}
 _EFFECTS = {"ordinal": "log odds of a higher one", "minutes": "log odds of a minute with it"}
-JUDGED = {o.key: o.the_noun for o in OUTCOMES} | {ENERGY: "the energy saved"}
+NAMES = {o.key: o.the_noun for o in JUDGED} | {ENERGY: "the energy saved"}
 """Names of what a verdict judges, within a sentence."""
 ORDINAL = enumerated([o.the_noun for o in OUTCOMES if o.scale == "ordinal"])
 BOUNDED = enumerated([o.noun for o in OUTCOMES if o.bounded]).capitalize()
 MODELS = " ".join(f"{o.the_noun.capitalize()} is taken as {_MODELLED[o.model]}." for o in OUTCOMES if o.model in _MODELLED)
 """How the mixed models take what is not measured on a scale."""
-_SHARED = enumerated([o.label.lower() for o in OUTCOMES if o.margin.kind == "share"], "or")
+_SHARED = enumerated([o.label.lower() for o in JUDGED if o.margin.kind == "share"] or ["outcome"], "or")
 
 FAMILY = (
     "Planned family: the five metrics of RL and of distilled RL, each against the same visit's cDBS; p-values are adjusted by Holm over "
@@ -154,14 +155,14 @@ def verdict_sentence(name: str, found: Verdict, visits: int, *, planned: bool) -
     over = f"over {counted(visits, 'visit')}"
     if isinstance(found, NonInferiorAndSaving):
         return (
-            f"{name} is non-inferior to cDBS on {ALL} and saves {found.percent:.0f} % of the stimulation energy "
+            f"{name} is non-inferior to cDBS on {ALL_JUDGED} and saves {found.percent:.0f} % of the stimulation energy "
             f"(95 % interval {found.low:.0f} to {found.high:.0f} %), {over}."
         )
     if isinstance(found, Inferior):
         return f"{name} is inferior to cDBS: {_listed(found.outcomes)} {_are(found.outcomes)} worse by more than the margin, {over}."
     open_ = f"{name} is not shown to be non-inferior on {_listed(found.open)}"
     if found.open == (ENERGY,):
-        open_ = f"{name} is non-inferior on {ALL}, but a saving of energy is not shown"
+        open_ = f"{name} is non-inferior on {ALL_JUDGED}, but a saving of energy is not shown"
     more = _more(found, planned=planned)
     if not visits and more:
         return f"Nothing can be said of {name} yet: {more}."
@@ -170,7 +171,7 @@ def verdict_sentence(name: str, found: Verdict, visits: int, *, planned: bool) -
 
 def _more(found: Inconclusive, *, planned: bool = True) -> str:
     short = [name for name, why in found.untested if why is Reason.TOO_FEW_VISITS]
-    with_ = "both arms" if {*short, ENERGY} >= JUDGED.keys() else f"{_listed(short)} in both arms" if short else ""
+    with_ = "both arms" if {*short, ENERGY} >= NAMES.keys() else f"{_listed(short)} in both arms" if short else ""
     few = f"nothing is concluded from fewer than {LEAST_VISITS} visits with {with_}" if short else ""
     if found.more_visits is not None:
         more = (
@@ -227,7 +228,7 @@ def effect_unit(metric: str, unit: str) -> str:
 
 def share_margins(locked: LockedMargins) -> str:
     """Describe which margins are shares, and of what."""
-    shares = [o for o in OUTCOMES if o.margin.kind == "share"]
+    shares = [o for o in JUDGED if o.margin.kind == "share"]
     return " ".join(f"The margin of {o.noun} is {100 * locked.margins.of(o):g} % of the mean under cDBS." for o in shares)
 
 
@@ -274,7 +275,7 @@ def _superseded(locked: LockedMargins) -> str:
 
 def margins(found: LockedMargins) -> str:
     """Write the margins in a line."""
-    return ", ".join(f"{o.noun} {margin(o, found.margins.of(o))}" for o in OUTCOMES)
+    return ", ".join(f"{o.noun} {margin(o, found.margins.of(o))}" for o in JUDGED)
 
 
 def margin(outcome: Outcome, value: float) -> str:
@@ -341,7 +342,7 @@ def no_population_claim(found: Summary) -> str:
 
 
 def _listed(names: Sequence[str]) -> str:
-    return enumerated([JUDGED.get(n, n) for n in names])
+    return enumerated([NAMES.get(n, n) for n in names])
 
 
 def _are(names: Sequence[str]) -> str:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from app.evaluation.schemas import EstimateSummary, FlagOut, ReasonOut
 from app.platform.numbers import counted, ma
 from ml.ope import Estimate, Flag, shown
-from ml.outcomes import ALL, ANY, OUTCOMES
+from ml.outcomes import ALL_PREDICTED, ANY_PREDICTED, OUTCOMES
 
 UNSUPPORTED = "not supported by the data"
 
@@ -222,7 +222,7 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "coverage_unchecked": lambda f: f"what the data cover could not be checked: {f.fact('text')}",
     "reference_missing": lambda f: "the cDBS reference, which it is held against, has no estimate",
     "reference_unsupported": lambda f: "the data do not support the cDBS reference, which it is held against",
-    "outcomes_unknown": lambda f: f"no session has {ANY}: whether it is worse than cDBS cannot be told",
+    "outcomes_unknown": lambda f: f"no session has {ANY_PREDICTED}: whether it is worse than cDBS cannot be told",
     "energy_unknown": lambda f: "its energy is not predicted",
     "no_ordering_skill": _no_ordering_skill,
     "undecided": lambda f: "neither likely enough to be within the margins nor likely enough to be beyond one",
@@ -230,18 +230,18 @@ _SENTENCES: dict[str, Callable[[Flag], str]] = {
     "stopped": lambda f: f"{count_stops(f)}, and no clinician has cleared {'it' if f.value == 1 else 'them'}",
     "nearly_off": lambda f: f"nearly off, below 20 % of the cDBS amplitude, {percent(f.value)} of the time (at most {percent(f.limit)})",
     "beyond_margin": lambda f: (
-        f"{chance(number(f))} likely beyond twice a margin of {ANY}, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
+        f"{chance(number(f))} likely beyond twice a margin of {ANY_PREDICTED}, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
         f"(unsafe from {percent(f.limit)})"
     ),
     "likely_beyond_margin": lambda f: (
-        f"{chance(number(f))} likely beyond a margin of {ANY}, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
+        f"{chance(number(f))} likely beyond a margin of {ANY_PREDICTED}, most often that of {OUTCOME_NAMES[f.fact('outcome')]} "
         f"(likely worse from {percent(f.limit)})"
     ),
     "extrapolates": lambda f: (
         f"it would hold {percent(f.value)} of the cDBS amplitude on average; the lowest that two sessions held is {percent(f.limit)}"
     ),
     "acts_like_cdbs": lambda f: f"acts like cDBS: {percent(f.value)} of its amplitude away from it on average",
-    "within_margins": lambda f: f"{chance(number(f))} likely within the margins of {ALL} (a test asks for {percent(f.limit)})",
+    "within_margins": lambda f: f"{chance(number(f))} likely within the margins of {ALL_PREDICTED} (a test asks for {percent(f.limit)})",
     "saves_energy": lambda f: f"{chance(number(f))} likely to use less energy (a test asks for {percent(f.limit)})",
     "visits_needed": lambda f: f"on {counted(int(number(f)), 'visit')}",
     "not_settled_by_sessions": lambda f: "more sessions held near what it does would not settle it",

@@ -18,7 +18,8 @@ from app.study import access, blinding
 from app.tables.learning import BufferGateDecision, GateChoice
 from app.tables.participants import Participant
 from app.tables.sessions import LEARNED, Controller, StudySession
-from ml.outcomes import OUTCOMES, Outcome
+from ml.outcomes import OUTCOMES
+from ml.outcomes.records import Outcome
 from ml.statistics.multiplicity import holm
 from ml.statistics.ranksum import p_greater
 

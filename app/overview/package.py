@@ -38,7 +38,8 @@ from app.tables.learning import Policy
 from app.tables.participants import Participant
 from app.tables.visits import Drug
 from ml.formats.studies.sheet import write_sheet
-from ml.outcomes import BY_KEY, OUTCOMES, Outcome
+from ml.outcomes import BY_KEY, OUTCOMES
+from ml.outcomes.records import Outcome
 from ml.qoc import Margins
 from ml.statistics.within_visits.contrasts import Average
 

@@ -25,7 +25,7 @@ from app.study.settings_types import Bound, published
 from app.tables.audit import Signature
 from app.tables.learning import Policy
 from app.tables.participants import DeclaredConfirmation, MarginsLock, MarginsVersion, Participant
-from ml.outcomes import OUTCOMES
+from ml.outcomes import JUDGED, OUTCOMES
 from ml.qoc import Margins
 
 # API types of margins and levels.
@@ -121,7 +121,7 @@ def signatures_of_locks(db: Session, participant: Participant) -> dict[int, tupl
 
 
 def signed_content(participant: Participant, lock: MarginsLock) -> dict[str, Any]:
-    """Build the signed content of a lock: whose margins, each value and level, who stated and who locked them, and why."""
+    """Build the signed content of a lock: each value and level, the outcomes judged, who stated and locked them, and why."""
     version = lock.margins
     return {
         "participant": participant.code,
@@ -129,6 +129,7 @@ def signed_content(participant: Participant, lock: MarginsLock) -> dict[str, Any
         "stated_by": version.created_by,
         "locked_by": lock.created_by,
         "lock_reason": lock.reason,
+        "judged": [o.key for o in JUDGED],
         **{name: getattr(version, name) for name in MarginsFields.model_fields},
     }
 

@@ -12,7 +12,8 @@ from pydantic import Field, create_model, model_validator
 from app.platform.errors import Invalid
 from app.platform.numbers import stated
 from app.platform.web.schemas import Int, Model, Number
-from ml.outcomes import BY_FIELD, OUTCOMES, Outcome
+from ml.outcomes import BY_FIELD, OUTCOMES
+from ml.outcomes.records import Outcome
 
 if TYPE_CHECKING:
     OutcomeField = str

@@ -19,9 +19,10 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
-from app.platform.database import ONE_STANDING, Base
+from app.platform.database import ONE_STANDING, Base, column_info
 from app.tables.participants import Hemisphere
-from ml.outcomes import OUTCOMES, Outcome
+from ml.outcomes import BUILT_IN, OUTCOMES
+from ml.outcomes.records import Outcome
 
 if TYPE_CHECKING:
     from app.tables.sessions import StudySession
@@ -44,7 +45,9 @@ class HasOutcomes:
 def add_value_columns(table: type[Base]) -> None:
     """Add a column per outcome to a table, null where not measured."""
     for o in OUTCOMES:
-        setattr(table, o.field, mapped_column(SmallInteger if o.whole else Double, nullable=True))
+        fixed = {"check": _range(o), "unit": o.unit, "higher_is_better": o.higher_is_better, "whole": o.whole}
+        kind = SmallInteger if o.whole else Double
+        setattr(table, o.field, mapped_column(kind, nullable=True, info=column_info(None if o in BUILT_IN else fixed)))
 
 
 def _range(o: Outcome) -> str:

@@ -20,10 +20,10 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
-from app.platform.database import Base
+from app.platform.database import Base, column_info
 from app.tables.accounts import Site
 from ml.designs import Bound
-from ml.outcomes import OUTCOMES
+from ml.outcomes import BUILT_IN, OUTCOMES
 
 if TYPE_CHECKING:
     from app.tables.visits import Visit
@@ -77,7 +77,11 @@ def margin_check() -> CheckConstraint:
 def add_margin_columns(table: type[Base]) -> None:
     """Add a column per margin to a table."""
     for o in OUTCOMES:
-        setattr(table, o.margin.field, mapped_column(Double, nullable=False))
+        m = o.margin
+        check = f"{m.field} > 0" + (f" and {m.field} < 1" if m.kind == "share" else "")
+        definition = None if o in BUILT_IN else {"check": check, "kind": m.kind, "unit": m.unit}
+        default = None if definition is None else str(m.default)  # of versions that were stated before the outcome was
+        setattr(table, m.field, mapped_column(Double, nullable=False, server_default=default, info=column_info(definition)))
 
 
 class MarginsVersion(Base):

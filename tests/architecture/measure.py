@@ -218,7 +218,7 @@ def measurements() -> Mapping[str, tuple[int, tuple[str, ...]]]:
         "files touched: device format, besides its package": of_record("ml/formats/rcs/", "rcs")[1:],
         "files touched: OPE method": of_record("ml/ope/dual_dice.py", "dual_dice"),
         "files touched: job kind": of_record("app/pipeline/distillation.py", "app.pipeline.distillation:run_distil"),
-        "files touched: outcome": of_record("ml/outcomes.py", "tremor"),
+        "files touched: outcome": of_record("ml/outcomes/", "tremor"),
         "files touched: ranking column": [p for p in (*product(), *templates()) if re.search(r"\bprobability_best\b", source(p))],
         "files that name the lower bound": [path for path in product() if "lower_bound" in source(path)],
         "mutual dependencies between features of a phase": mutual(),

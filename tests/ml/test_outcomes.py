@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from ml.mdp import MdpSettings
-from ml.outcomes import BY_KEY, OUTCOMES, Outcome
+from ml.outcomes import BY_KEY, OUTCOMES
+from ml.outcomes.records import Outcome
 from ml.qoc import Margins, Qoc, failed_qoc
 
 GRASP, RATING, TREMOR = (BY_KEY[key] for key in ("grasp", "rating", "tremor"))

@@ -29,7 +29,8 @@ from app.tables.participants import MarginsVersion, Participant, SettingsVersion
 from app.tables.sessions import Controller, StudySession
 from ml.designs import HOLD_SECONDS, LOW_AMPLITUDE, LOW_SECONDS
 from ml.mdp import MdpSettings
-from ml.outcomes import BY_FIELD, OUTCOMES, Outcome
+from ml.outcomes import BY_FIELD, OUTCOMES
+from ml.outcomes.records import Outcome
 from ml.qoc import Margins, Qoc
 from ml.trajectories import SessionTrajectory
 

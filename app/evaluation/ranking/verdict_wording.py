@@ -16,7 +16,8 @@ from app.platform.numbers import counted
 from app.platform.web.templates import render_part
 from app.study.margins import margins_of
 from ml.ope import NEARLY_OFF, RELIABILITY, Flag
-from ml.outcomes import ALL, ANY, OUTCOMES, Outcome
+from ml.outcomes import ALL_PREDICTED, ANY_PREDICTED, OUTCOMES
+from ml.outcomes.records import Outcome
 from ml.qoc import Margins
 
 # The words of a ranking's verdicts: what each is called, and its reasons in a line, in full and for a first look.
@@ -76,7 +77,7 @@ def likely(within: float) -> str:
     Args:
         within: that probability.
     """
-    return f"{chance(within)} chance that {ALL} all stay within the margins"
+    return f"{chance(within)} chance that {ALL_PREDICTED} all stay within the margins"
 
 
 def further_sessions(reasons: Sequence[Flag]) -> str:
@@ -197,10 +198,11 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "stopped": lambda f: f"{count_stops(f)}, not cleared by a clinician",
     "nearly_off": lambda f: f"nearly off {percent(f.value)} of the time",
     "beyond_margin": lambda f: (
-        f"{chance(number(f))} likely that {ANY} is worse by more than twice its margin, most often {OUTCOME_NAMES[f.fact('outcome')]}"
+        f"{chance(number(f))} likely that {ANY_PREDICTED} is worse by more than twice its margin, most often "
+        f"{OUTCOME_NAMES[f.fact('outcome')]}"
     ),
     "likely_beyond_margin": lambda f: (
-        f"{chance(number(f))} likely that {ANY} is worse by more than its margin, most often {OUTCOME_NAMES[f.fact('outcome')]}"
+        f"{chance(number(f))} likely that {ANY_PREDICTED} is worse by more than its margin, most often {OUTCOME_NAMES[f.fact('outcome')]}"
     ),
     "all_below_zero": lambda f: "its whole expected gain lies below that of cDBS",
     "few_near_sessions": lambda f: "hardly any session came near what it does",
@@ -214,7 +216,7 @@ _PLAINLY: dict[str, Callable[[Flag], str]] = {
     "coverage_unchecked": lambda f: "what the recordings cover could not be checked",
     "reference_missing": lambda f: "nothing is known of cDBS to hold it against",
     "reference_unsupported": lambda f: "too few sessions of cDBS to hold it against",
-    "outcomes_unknown": lambda f: f"no session has {ANY}",
+    "outcomes_unknown": lambda f: f"no session has {ANY_PREDICTED}",
     "energy_unknown": lambda f: "whether it uses less energy is not known",
     "undecided": lambda f: _undecided((f,)),
     "acts_like_cdbs": lambda f: f"{percent(f.value)} of the cDBS amplitude away from it on average",

@@ -44,6 +44,16 @@ class Base(DeclarativeBase):
 
 ONE_STANDING: dict[str, Any] = {"unique": True, "postgresql_where": text("removed_at is null")}
 """Of an index: of the rows that were not marked as removed, one alone may have these values."""
+DEFINED = "defined"
+
+
+def column_info(definition: dict[str, Any] | None) -> dict[str, Any]:
+    """Return the information of a column that an installation defines, which `migrate` adds; of none where it is built in.
+
+    Args:
+        definition: what may not change once there are values, with `check`, an SQL condition.
+    """
+    return {} if definition is None else {DEFINED: definition}
 
 
 def now() -> datetime:

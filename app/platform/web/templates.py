@@ -19,7 +19,8 @@ from app.platform.jobs.titles import state_in_words
 from app.platform.numbers import counted, fixed, ma, minutes, number, p_text, place, rate, size, stated, time_left, typed, when, whole
 from app.platform.web.charts import written
 from app.settings import get_settings
-from ml.outcomes import ALL, ANY, OUTCOMES, Outcome
+from ml.outcomes import ALL, ALL_PREDICTED, ALL_WEIGHED, ANY, ANY_PREDICTED, OUTCOMES
+from ml.outcomes.records import Outcome
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -116,7 +117,10 @@ _environment.globals.update(
     sign_on_name=sign_on_name,
     OUTCOMES=OUTCOMES,
     ALL_OUTCOMES=ALL,
+    ALL_PREDICTED=ALL_PREDICTED,
+    ALL_WEIGHED=ALL_WEIGHED,
     ANY_OUTCOME=ANY,
+    ANY_PREDICTED=ANY_PREDICTED,
     outcome_columns=outcome_columns,
 )
 

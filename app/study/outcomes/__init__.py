@@ -1,1 +1,1 @@
-"""QoCs from uploaded files: minutes of tremor and grasp tests."""
+"""QoCs from uploaded files."""

@@ -36,7 +36,7 @@ from app.tables.participants import SettingsVersion
 from app.tables.recordings import Recording, Trace
 from app.tables.sessions import CountedTime, SessionConditions, SessionSegment, StudySession
 from app.tables.visits import CdbsAmplitude, Dose, Visit
-from ml.outcomes import Outcome
+from ml.outcomes.records import Outcome
 
 
 def fingerprints(db: Session, participant_ids: Collection[int]) -> dict[int, str]:

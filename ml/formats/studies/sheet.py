@@ -35,7 +35,7 @@ ROLES: dict[str, tuple[str, ...]] = {
     "last_dose": ("last_dose", "last_dose_at", "medication_time", "last_medication"),
     **{name: (name,) for name in STATED_FIELDS},
     "note": ("note", "notes", "comment", "comments", "remarks"),
-    **{o.field: (o.field, o.field.rsplit("_", 1)[0], o.column, column_name(o.label)[0]) for o in OUTCOMES},
+    **{o.field: (o.field, o.key, o.column, column_name(o.label)[0]) for o in OUTCOMES},
 }
 """Names of columns by role, as `column_name` normalises them."""
 

@@ -102,8 +102,8 @@ def test_an_outcome_of_two_visits_is_told_from_a_study_of_two_visits() -> None:
     found = open_verdict(some)
     assert found.untested == (("tremor", Reason.TOO_FEW_VISITS),)
     sentence, short = primary_words.verdict(judged(some)), primary_words.verdict(judged(varied(2)))
-    assert primary_words.JUDGED["tremor"] in sentence.split(";", 1)[1]
-    assert primary_words.JUDGED["tremor"] not in short.split(";", 1)[1]
+    assert primary_words.NAMES["tremor"] in sentence.split(";", 1)[1]
+    assert primary_words.NAMES["tremor"] not in short.split(";", 1)[1]
 
 
 def test_no_grasp_frequency_to_take_a_share_of_gives_no_verdict() -> None:
