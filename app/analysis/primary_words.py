@@ -67,7 +67,7 @@ MISSING = {
     Missing.NOT_ENTERED: "nobody entered it",
     Missing.NO_TRACE: "its recordings hold no such trace",
     Missing.MOSTLY_UNKNOWN: "more than half of its steps are not known",
-    Missing.NO_CDBS_AMPLITUDE: "the cDBS amplitude is not stated, so that no fraction follows",
+    Missing.NO_CDBS_AMPLITUDE: "no cDBS amplitude is stated for its side and program, so that no fraction follows",
     Missing.OTHER_BETA: "its beta is of another unit or source",
 }
 

@@ -182,7 +182,7 @@ def _course(c: Course) -> str:
         case Pattern.VARIES:
             return f"the amplitude varies between {ma(c.low)} and {ma(c.high)} {c.unit}: say which controller it was"
         case Pattern.CONSTANT_WITHOUT_CDBS:
-            return f"the amplitude is constant at {level}, but no cDBS amplitude is stated to hold it against"
+            return f"the amplitude is constant at {level}, but no cDBS amplitude was stated for it when it was read"
         case Pattern.CONSTANT:
             return f"the amplitude is constant at {level}, {c.share:.0f} % of the cDBS amplitude: say which controller it was"
 

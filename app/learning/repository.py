@@ -106,6 +106,12 @@ def candidates(db: Session, participant_id: int) -> Sequence[Policy]:
     return db.scalars(select(Policy).where(*_ranked(participant_id)).order_by(Policy.id).options(defer(Policy.metrics))).all()
 
 
+def no_candidate(db: Session, participant_id: int) -> str:
+    """Say why a participant has no candidate: no policy was made yet, or each was retired."""
+    retired = count(db, select(Policy).where(Policy.participant_id == participant_id, Policy.kind != "baseline"))
+    return f"No policy is in use: {retired} {'policy' if retired == 1 else 'policies'} retired." if retired else "There is no policy yet."
+
+
 def candidate_names(db: Session, participant_id: int) -> dict[int, str]:
     """Map the same policies' numbers to their names, oldest first."""
     query = select(Policy.id, Policy.name).where(*_ranked(participant_id)).order_by(Policy.id)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from app.platform import files
+from app.study import cdbs_amplitude
 from app.study.blinding import Arm
 from app.study.sessions.designs import drawn
 from app.study.sessions.usable_steps import qoc_of
-from app.study.traces import StepTable
+from app.study.traces import StepTable, amplitude_program
 from app.tables.participants import SettingsVersion
 from app.tables.sessions import Controller, StudySession
 from ml.qoc import Qoc
@@ -66,7 +67,11 @@ def own_reason(session: StudySession, table: StepTable) -> str | None:
     if table.amplitude_trace is None:
         return "no amplitude trace in its recordings"
     if np.isnan(table.fraction).all():
-        return "the cDBS amplitude is not known, so that milliamperes give no fraction" if table.cdbs_ma is None else "no valid amplitude"
+        if table.cdbs_ma is not None:
+            return "no valid amplitude"
+        program = amplitude_program(table.amplitude_trace)
+        why = cdbs_amplitude.lacking(session.visit, session.hemisphere, session.visit.participant.current_settings, program)
+        return f"{why}, so that milliamperes give no fraction"
     if not (table.t_s > 0).any():
         return "shorter than one step"
     return None

@@ -9,7 +9,7 @@ from app.evaluation.schemas import EvaluateParams
 from app.learning.schemas import DistilParams, TrainParams
 from app.learning.snapshots import collect
 from app.pipeline.distillation import teachers
-from app.pipeline.next_generation import tested_policies
+from app.pipeline.next_generation import policies_that_ran
 from app.pipeline.params import NEXT_GENERATION, NextGenerationParams, PipelineParams
 from app.pipeline.training import training_starts
 from app.platform.errors import Invalid
@@ -39,7 +39,14 @@ def starts_of_the_training(db: Session, participant_id: int, params: PipelinePar
 def something_tested(db: Session, participant_id: int, params: object) -> None:
     """Raise where no policy that could be trained further has run in a session."""
     participant = db.get_one(Participant, participant_id)
-    if not tested_policies(db, participant):
+    ran = policies_that_ran(db, participant)
+    if ran and all(t.obstacle for t in ran):
+        raise Invalid(
+            f"No policy of participant {participant.code} that ran in a session can be trained further: "
+            + " ".join(f"'{t.policy.name}': {t.obstacle}" for t in ran),
+            "Clear what blocks one of them, or start a job of kind 'pipeline'.",
+        )
+    if not ran:
         raise Invalid(
             f"No policy of participant {participant.code} that could be trained further has been tested in a session yet.",
             "Confirm the sessions of the visit first; before the first visit with policies start a job of kind 'pipeline'.",

@@ -35,18 +35,27 @@ TRAINABLE = ("trained", "distilled")
 
 @dataclass(frozen=True)
 class Tested:
-    """A policy that may be trained further, with the number of its sessions that count and the last visit that tested it."""
+    """A policy that ran, with the number of its sessions that count and the last visit that tested it.
+
+    Attributes:
+        obstacle: what keeps it from being trained further, as a sentence; empty where it may be.
+    """
 
     policy: Policy
     sessions: int
     last_visit: int
+    obstacle: str = ""
 
 
 def tested_policies(db: Session, participant: Participant) -> list[Tested]:
-    """List policies that can be trained further and ran in a confirmed session that is not excluded, oldest first.
+    """List policies that can be trained further and ran in a confirmed session that is not excluded, oldest first."""
+    return [t for t in policies_that_ran(db, participant) if not t.obstacle]
 
-    Retired ones are excluded, and those of another window than the current settings. So are those under which a serious adverse event
-    happened that no clinician has cleared.
+
+def policies_that_ran(db: Session, participant: Participant) -> list[Tested]:
+    """List policies that ran in a confirmed session that is not excluded, each with what keeps it from being trained further.
+
+    These are retirement, another window than the current settings, and a serious event or stop that no clinician has cleared.
     """
     visits: dict[int, list[int]] = {}
     for session in study.sessions_of_participant(db, participant.id):
@@ -58,8 +67,21 @@ def tested_policies(db: Session, participant: Participant) -> list[Tested]:
             visits.setdefault(policy_id, []).append(session.visit.number)
     harmful = blocked_policies(events_of_participant(db, participant.id), SYSTEM)
     window = participant.current_settings.window
-    usable = [p for p in learning.candidates(db, participant.id) if p.kind in TRAINABLE and p.id in visits and p.id not in harmful]
-    return [Tested(p, len(visits[p.id]), max(visits[p.id])) for p in usable if window_of(p) == window]
+    ran = learning.policies_named(db, participant.id, sorted(visits))
+    return [Tested(p, len(visits[p.id]), max(visits[p.id]), _obstacle(p, p.id in harmful, window)) for p in ran]
+
+
+def _obstacle(policy: Policy, harmful: bool, window: int) -> str:
+    """Say what keeps a policy from being trained further, with the way on; empty where nothing does."""
+    if policy.kind not in TRAINABLE:
+        return "It was made elsewhere, and cannot be trained further here."
+    if policy.retired_reason:
+        return f"It was retired ({policy.retired_reason}). Take it back on its page."
+    if harmful:
+        return "A serious event or stop under it is not cleared. A clinician clears it on the page of adverse events."
+    if (own := window_of(policy)) != window:
+        return f"It takes windows of {own} beta amplitudes, the settings say {window}. Set the window back, or train new policies."
+    return ""
 
 
 def posterior_of(found: Evaluation | None) -> dict[int, float]:
@@ -95,6 +117,7 @@ class Outlook:
 
     Attributes:
         tested: what it may go on from, the best by the newest ranking first. posterior: its estimated returns by policy.
+        blocked: policies that ran and cannot be trained further.
         ranking: the newest one; None without any. current: whether it knows everything that was recorded.
         live: the job at work. done: the job that trained the generation of the data as they are now; None where something came since.
     """
@@ -105,6 +128,7 @@ class Outlook:
     current: bool
     live: Job | None
     done: Job | None
+    blocked: list[Tested]
 
     def parents(self, most: int) -> list[int]:
         """List the policies that it continues from, the best first; empty where the job assesses the tested ones with the new sessions
@@ -120,8 +144,9 @@ def outlook(db: Session, participant: Participant, caller: Caller) -> Outlook:
     rows, _ = jobs.find(db, participant.id, NEXT_GENERATION, jobs.LIVE, limit=1)
     done = _made_on(db, participant.id, newest.snapshot_id) if newest is not None and current else None
     posterior = posterior_of(newest)
-    tested = sorted(tested_policies(db, participant), key=lambda t: (-posterior.get(t.policy.id, -math.inf), t.policy.id))
-    return Outlook(tested, posterior, newest, current, rows[0] if rows else None, done)
+    ran = policies_that_ran(db, participant)
+    tested = sorted((t for t in ran if not t.obstacle), key=lambda t: (-posterior.get(t.policy.id, -math.inf), t.policy.id))
+    return Outlook(tested, posterior, newest, current, rows[0] if rows else None, done, [t for t in ran if t.obstacle])
 
 
 def _made_on(db: Session, participant_id: int, snapshot_id: int) -> Job | None:

@@ -72,6 +72,21 @@ def of_session(session: StudySession, settings: SettingsVersion, program: int = 
     return in_force(session.visit, session.hemisphere, settings, program, alone)
 
 
+def lacking(visit: Visit, hemisphere: Hemisphere | None, settings: SettingsVersion, program: int = 0) -> str:
+    """Say why no cDBS amplitude is in force for a hemisphere and program of a visit, naming those that are stated.
+
+    Args:
+        settings: the participant's present ones.
+    """
+    if visit.cdbs_amplitudes:
+        stated = "; ".join(f"{a.hemisphere}, program {a.program}" for a in visit.cdbs_amplitudes)
+        wanted = f"{f'the {hemisphere}' if hemisphere else 'an unnamed'} hemisphere, program {program}"
+        return f"visit {visit.number} states the cDBS amplitude of {stated}, and none of {wanted}"
+    if visit.locked and settings.cdbs_amplitude_ma is not None:
+        return f"the cDBS amplitude was stated after visit {visit.number} was locked"
+    return "nobody has stated the cDBS amplitude"
+
+
 def in_force_now(participant: Participant, hemisphere: Hemisphere | None) -> float:
     """Return the cDBS amplitude of the newest visit that states one (of this hemisphere), mA, else the settings' shorthand.
 
@@ -86,7 +101,8 @@ def in_force_now(participant: Participant, hemisphere: Hemisphere | None) -> flo
             return stated
     shorthand = plausible(participant.current_settings.cdbs_amplitude_ma, "The participant's settings state")
     if shorthand is None:
-        raise Invalid("The cDBS amplitude is not known.", "Set cdbs_amplitude_ma in the participant's settings or at a visit.")
+        side = f" of the {hemisphere} hemisphere" if hemisphere else ""
+        raise Invalid(f"The cDBS amplitude{side} is not known.", "Set cdbs_amplitude_ma in the participant's settings or at a visit.")
     return shorthand
 
 

@@ -38,7 +38,10 @@ def policies_to_rank(db: Session, participant_id: int, params: EvaluateParams, *
     if not params.policies:
         found = list(learning.candidates(db, participant_id))
         if not found and least:
-            raise Invalid("There is no policy to rank.", "Train policies, or upload one made elsewhere as an ONNX file.")
+            raise Invalid(
+                learning.no_candidate(db, participant_id),
+                "Take a retired one back, train policies, or upload one made elsewhere as an ONNX file.",
+            )
         fitting = [p for p in found if window_of(p) == window]
         if not fitting and least:
             raise Invalid(

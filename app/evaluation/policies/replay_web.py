@@ -166,6 +166,7 @@ def compare(
         participant=participant,
         sessions=[(s.id, _label(db, s, caller)) for s in sessions],
         policies=available,
+        no_policy="" if available else learning.no_candidate(db, participant.id),
         session=chosen,
         wanted=wanted,
         slots=MOST,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from app.platform.errors import Invalid
 from app.platform.numbers import ma
-from app.study.cdbs_amplitude import held_settings, plausible
+from app.study.cdbs_amplitude import held_settings, lacking, plausible
 from app.tables.participants import SettingsVersion
 from app.tables.plans import PlanItem
 from app.tables.visits import Visit
@@ -190,7 +190,7 @@ def bounds_of(visit: Visit, settings: SettingsVersion, bound: Bound) -> tuple[Si
     sides: list[tuple[str | None, float]] = list(stated) or ([(None, usual)] if usual is not None else [])
     if not sides:
         raise Invalid(
-            "The plan has random sessions with a lower bound, and the cDBS amplitude that it is a fraction of is not known.",
+            f"The plan has random sessions with a lower bound, a fraction of cDBS, but {lacking(visit, None, settings)}.",
             "State the cDBS amplitude at the visit or in the participant's settings; then approve the plan.",
         )
     return tuple(SideBound(side, ma, rounded_up(bound * ma), rounded_up(LOW_AMPLITUDE * ma)) for side, ma in sides)

@@ -100,6 +100,7 @@ def shown_of(db: Session, visit: Visit, caller: Caller, full: PlanView | None, v
         "ranking": found,
         "typed": values or {},
         "choices": choices,
+        "no_choice": "" if choices else learning.no_candidate(db, participant.id),
         "suggestions": [(s.policy, wording.suggestion(s.why, first=k == 0)) for k, s in enumerate(suggestions)],
         "held_rows": held_rows(values, held_in(found, slots - len(suggestions), place), place.bound, cdbs_amplitude_now(participant)),
         "holding": wording.holding,

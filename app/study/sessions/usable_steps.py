@@ -10,9 +10,19 @@ from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from app.platform.errors import Invalid
-from app.study import repository
+from app.study import cdbs_amplitude, repository
 from app.study.settings import mismatch
-from app.study.traces import AMPLITUDE_STREAM, StepTable, TracesOf, beta_of_part, driving, laid_out, shown_table, step_table
+from app.study.traces import (
+    AMPLITUDE_STREAM,
+    StepTable,
+    TracesOf,
+    amplitude_program,
+    beta_of_part,
+    driving,
+    laid_out,
+    shown_table,
+    step_table,
+)
 from app.tables.participants import SettingsVersion
 from app.tables.recordings import Trace
 from app.tables.sessions import StudySession
@@ -181,7 +191,7 @@ def _of_channel(
     trajectory = _trajectory(session.id, session.visit.number, table.beta, table.fraction, settings)
     at = frozenset(np.flatnonzero(trajectory.usable()).tolist())
     valid = int(np.sum(~np.isnan(trajectory.beta)))
-    return UsableSteps(*named, steps, valid, len(at), None if at else _reason(trajectory, table, settings, valid), at)
+    return UsableSteps(*named, steps, valid, len(at), None if at else _reason(session, trajectory, table, settings, valid), at)
 
 
 def _trajectory(
@@ -199,7 +209,7 @@ def _trajectory(
     )
 
 
-def _reason(s: SessionTrajectory, table: StepTable, settings: SettingsVersion, valid: int) -> str:
+def _reason(session: StudySession, s: SessionTrajectory, table: StepTable, settings: SettingsVersion, valid: int) -> str:
     """Explain why a channel has no usable step, by the first thing that would have to change."""
     if valid == 0:
         return f"none of its steps has a valid beta: measured samples cover less than {100 * settings.min_valid_fraction:g} % of each"
@@ -213,6 +223,7 @@ def _reason(s: SessionTrajectory, table: StepTable, settings: SettingsVersion, v
         return whole + "no amplitude was recorded"
     if np.isnan(s.amplitude).all():
         if table.cdbs_ma is None and not np.isnan(table.amplitude_ma).all():
-            return whole + "nobody has stated the cDBS amplitude, which the amplitude is a fraction of"
+            side, program = table.amplitude_trace.recording.hemisphere or session.hemisphere, amplitude_program(table.amplitude_trace)
+            return f"{whole}{cdbs_amplitude.lacking(session.visit, side, settings, program)}, which the amplitude is a fraction of"
         return whole + "the amplitude is not known in any of them"
     return whole + "each of them lacks an amplitude from 0 to the cDBS amplitude"

@@ -86,7 +86,7 @@ def test_a_first_answer_tells_of_fixed_amplitudes_until_the_policies_of_its_job_
     page = client.get(PAGE).text
     text = above_fold(page)
     assert "First answer, until the new policies are trained" in text
-    assert "No policy has been trained yet." in text
+    assert "This ranking has fixed amplitudes alone: no policy could be ranked when it was made." in text
     assert "For comparison, 1.2 mA all the time, the best fixed amplitude" in text
     assert "no policy is barred" not in text, "there is none"
     assert "No candidate yet." in text

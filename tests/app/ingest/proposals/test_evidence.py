@@ -53,7 +53,7 @@ def test_the_controller_is_guessed_from_the_amplitude_or_left_open(amplitude_ma:
 def test_without_a_stated_cdbs_amplitude_a_constant_one_proves_nothing_but_zero_does() -> None:
     found, evidence = guess_controller([side(steps([2.4, 2.4], cdbs_ma=None))])
     assert found is None
-    assert wording.reason(evidence) == "the amplitude is constant at 2.4 mA, but no cDBS amplitude is stated to hold it against"
+    assert wording.reason(evidence) == "the amplitude is constant at 2.4 mA, but no cDBS amplitude was stated for it when it was read"
     assert guess_controller([side(steps([0, 0], cdbs_ma=None))])[0] is Controller.NO_DBS
 
 

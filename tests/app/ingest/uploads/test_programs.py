@@ -125,4 +125,4 @@ def test_what_is_stated_of_another_program_makes_no_fraction(send: Any, client: 
     (proposal,) = send(("right.zip", with_a_second_program(device_zip(("random",), "P1"))), visit=2).json()["proposals"]
     control = next(u for u in proposal["usable_steps"] if u["is_control"])
     assert control["usable"] == 0
-    assert "nobody has stated the cDBS amplitude" in control["reason"]
+    assert "visit 2 states the cDBS amplitude of right, program 0, and none of the right hemisphere, program 1" in control["reason"]

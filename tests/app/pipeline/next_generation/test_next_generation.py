@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from html import unescape
 from typing import Any
 
 import pytest
@@ -22,11 +23,13 @@ from app.tables.jobs import Job
 from app.tables.learning import Policy
 from ml.rl.algorithms.rebrac import RebracConfig
 from tests.app.evaluations import judged
+from tests.app.words import flat
 
 Upload = Callable[..., int]
 Judge = Callable[..., int]
 HOME = "/participants/P1"
-JOBS = f"/api/v1{HOME}/jobs"
+API = f"/api/v1{HOME}"
+JOBS = f"{API}/jobs"
 FORM = {"preset": "quick", "parents": "2", "tuned": "2", "count": "6"}
 
 
@@ -98,6 +101,50 @@ def test_nothing_starts_before_a_policy_was_tested(client: TestClient) -> None:
     assert (answer.status_code, client.get(JOBS).json()["total"]) == (422, 0)
     assert "has been tested in a session yet" in answer.json()["detail"]
     assert "next-generation" not in client.get(f"{HOME}/ranking").text
+
+
+BLOCKED = {
+    "a serious event or stop": ("A serious event or stop under it is not cleared.", "stop"),
+    "retirement": ("It was retired (tremor came back). Take it back on its page.", "retired"),
+    "another window": ("beta amplitudes, the settings say 5. Set the window back, or train new policies.", "window"),
+    "a foreign policy": ("It was made elsewhere, and cannot be trained further here.", "external"),
+}
+
+
+@pytest.mark.parametrize("cause", BLOCKED)
+def test_a_policy_that_ran_and_is_blocked_is_named_with_its_cause_and_the_way_on(
+    cause: str, client: TestClient, db: Session, policies: list[int], policies_tested: list[int], upload: Upload
+) -> None:
+    words, act = BLOCKED[cause]
+    for policy_id in policies_tested[:2]:
+        if act == "stop":
+            session = upload("rl", visit=2, policy=str(policy_id))
+            change = {"stopped_reason": "dizzy", "reason": "notes"}
+            assert client.patch(f"/api/v1/sessions/{session}", json=change).status_code == 200
+        elif act == "retired":
+            assert client.patch(f"/api/v1/policies/{policy_id}", json={"retired_reason": "tremor came back"}).status_code == 200
+        elif act == "external":
+            db.execute(update(Policy).where(Policy.id == policy_id).values(kind="external"))
+            db.commit()
+    if act == "window":
+        assert client.put(f"{API}/settings", json={"settings": {"window": 5}}).status_code == 200
+    page = unescape(flat(client.get(f"{HOME}/next-generation").text))
+    assert page.count(words) == 2, page[-2500:]
+    assert "has run in a confirmed session" not in page
+    assert f'href="{HOME}/adverse-events"' in client.get(f"{HOME}/next-generation").text
+    answer = client.post(JOBS, json={"kind": "next_generation"})
+    assert (answer.status_code, words in answer.json()["detail"]) == (422, True)
+
+
+def test_a_participant_whose_policies_are_retired_is_not_without_policies(client: TestClient, policies: list[int]) -> None:
+    visit = client.post(f"{API}/visits", json={"number": 2, "date": "2099-11-22"}).json()["id"]
+    for policy_id in policies:
+        assert client.patch(f"/api/v1/policies/{policy_id}", json={"retired_reason": "old"}).status_code == 200
+    words = "No policy is in use: 3 policies retired."
+    for path in (f"/visits/{visit}/plan", f"{HOME}/compare"):
+        assert words in unescape(flat(client.get(path, headers={"Accept": "text/html"}).text)), path
+    answer = client.post(JOBS, json={"kind": "evaluate", "methods": ["linear"]})
+    assert (answer.status_code, words in answer.json()["detail"]) == (422, True)
 
 
 def test_pressed_twice_there_is_one_job_which_the_page_follows(client: TestClient, policies_tested: list[int]) -> None:
