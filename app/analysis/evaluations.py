@@ -64,9 +64,9 @@ class BySeed:
     """The snapshot with most seeds under one horizon, settings version and preset, newest first among equals.
 
     Attributes:
-        snapshot_id: None without an evaluation. seeds: that were run on it. rows: where later sessions have returns. policies: estimated
-            under every seed, with a return after the snapshot (the errors are of these). sessions: ids of the sessions after the snapshot
-            that those returns are of.
+        snapshot_id: None without an evaluation. seeds: that were run on it. rows: where later sessions have returns.
+        policies: estimated under every seed, with a return after the snapshot (the errors are of these).
+        sessions: ids of the sessions after the snapshot that those returns are of.
     """
 
     participant: str

@@ -87,8 +87,9 @@ class Facts:
 
     Attributes:
         values: by metric, absent where not measured. missing: why, by metric. steps: shares of usable beta and amplitude are taken of them.
-        stopped: it was stopped for the patient's sake, for the reason given. late_stop: so, but known only after its visit was locked; it
-            counts as measured. medication_h: hours since the last dose, where known.
+        stopped: it was stopped for the patient's sake, for the reason given.
+        late_stop: so, but known only after its visit was locked; it counts as measured. medication_h: hours since the last dose, where
+            known.
         created_at: when the record of the session came into being. visit_date: of its visit, where stated.
         policy_share: of its decisions that followed policy or schedule; None without a log.
     """

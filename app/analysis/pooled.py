@@ -123,7 +123,8 @@ class Saved:
 
     Attributes:
         share: 1 less the mean of a^2 over the sessions' minutes; below 0 where they spent more. a is the fraction of the cDBS amplitude on
-            the controlled side. minutes, sessions: of theirs with a known energy.
+            the controlled side.
+        minutes, sessions: of theirs with a known energy.
     """
 
     participant: str

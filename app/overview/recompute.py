@@ -137,8 +137,8 @@ class Contrasts:
 class Average(NamedTuple):
     """Average over visits, its standard error, the number of visits, and the skewness of their contrasts.
 
-    For a metric with a floor or a ceiling, p is the larger of two: of Student's ratio, and of the same freed from skewness (Hall 1992). The
-    interval covers both. For others the skewness is 0.
+    For a metric with a floor or a ceiling, p is the larger of two. They are of Student's ratio, and of the same freed from skewness (Hall
+    1992). The interval covers both. For others the skewness is 0.
     """
 
     estimate: float

@@ -1,9 +1,9 @@
 """FastAPI dependencies: the participant, visit or session that a path names, if the caller may read it; and records of views.
 
-Every route that shows outcomes by controller, or opens controllers to blinded assessors once a visit is locked, depends on one of
-`ResultsViewed`, `VisitViewed` and `SessionViewed`. They write the trail before the response is sent. Where there was nothing to see they
-write nothing: wrong addresses would fill it. Looks at one thing within a quarter of an hour are one row; each table or figure that is taken
-is its own.
+Routes that show outcomes by controller depend on one of `ResultsViewed`, `VisitViewed` and `SessionViewed`. So do those that open
+controllers to blinded assessors once a visit is locked. They write the trail before the response is sent. Where there was nothing to see
+they write nothing: wrong addresses would fill it. Looks at one thing within a quarter of an hour are one row; each table or figure that is
+taken is its own.
 """
 
 from __future__ import annotations

@@ -179,7 +179,7 @@ def lock_margins(
 
     Raises:
         Invalid: no reason. Forbidden: the caller approves no plans of this participant. Forbidden, TooMany: as `app.accounts.sign_on`.
-            Conflict: newer margins are there, or these are locked already.
+        Conflict: newer margins are there, or these are locked already.
     """
     access.require(caller, can.SET_MARGINS, participant)
     current = participant.current_margins

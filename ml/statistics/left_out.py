@@ -26,7 +26,7 @@ def left_out_draws(
 
     Args:
         model: of the sums. sums: of n sessions. ratios: lambda of every estimated group, those of visits and sessions last.
-        held: held-out sessions, m, at least one. draws: D of each.
+        `held`: held-out sessions, m, at least one. draws: D of each.
 
     Returns:
         Coefficients of the columns, [m, D, q], and the visit's plus the session's level, [m, D].

@@ -193,7 +193,7 @@ def test_what_stood_beside_something_too_large_stands_in_the_form_again(tab: Wat
     page.eval_on_selector("[name=note]", "note => { note.removeAttribute('maxlength'); note.value = 'x'.repeat(2 << 20); }")
     page.click("main form[method=post] button.primary")
     page.wait_for_selector("h1:text('Too large to take')")
-    assert "The other entries stand in the form that you came from" in page.inner_text("main")
+    assert "The other entries are in the form that you came from" in page.inner_text("main")
     page.go_back()
     page.wait_for_selector("[name=number]")
     assert (page.input_value("[name=number]"), page.input_value("[name=cdbs_left]")) == ("7", "2.5")

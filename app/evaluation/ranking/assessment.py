@@ -79,7 +79,8 @@ class Assessed:
         estimate: by the ranking's method; None where it has none. estimates: of every method.
         rank: 1 is best; None for references, and where the data cannot order policies. probability_best: likewise.
         decided: the verdict; None for references. planned: the same for candidates, and for references the verdict that a plan uses; None
-            for cDBS. coverage: None where nothing was checked. tested: None where it never ran.
+            for cDBS.
+        coverage: None where nothing was checked. tested: None where it never ran.
     """
 
     policy: PolicyHead

@@ -173,8 +173,8 @@ class RandomSessions:
 
     Attributes:
         sessions, visits: how many, at how many visits. minutes: median length.
-        lowest, highest: B and the amplitude of cDBS, in `unit`. low: only the last `low_minutes` of a session may be below it; None where
-            no amplitude is that low, or the design has no such rule.
+        lowest, highest: B and the amplitude of cDBS, in `unit`.
+        low: only the last `low_minutes` of a session may be below it; None where no amplitude is that low, or the design has no such rule.
         hold_s: shortest and longest time for which an amplitude lasts, s.
         differences: random less cDBS of the same visit, averaged over visits with both, by outcome. worst: of a single session, by outcome.
         beyond: outcomes that were worse than under cDBS by more than the margin, on average.

@@ -36,8 +36,8 @@ def release(
     Raises:
         Forbidden: a caller who imported the policy or one of its teachers, or approves no plans; a wrong password.
         TooMany: too many wrong ones.
-        Conflict: a retired policy, or as `bundles.refuse_after_events`. Invalid: limits that contradict each other or leave the
-            stimulator's own; a damaged file; no stated cDBS amplitude or unit of beta.
+        Conflict: a retired policy, or as `bundles.refuse_after_events`.
+        Invalid: limits that contradict each other or leave the stimulator's own; a damaged file; no stated cDBS amplitude or unit of beta.
     """
     access.require(caller, can.RELEASE, participant)
     access.require_own(participant, policy, f"policy {policy.id}")

@@ -140,8 +140,8 @@ def near_sessions(
 
     Args:
         levels: fraction of cDBS of each session. settings: B and period. code: the participant's. visit_number, minutes: of the visit, and
-            of each session. bound: below which nothing is drawn, fraction of cDBS. cdbs_ma: the cDBS amplitude, for words; None where it
-            is not known.
+            of each session.
+        bound: below which nothing is drawn, fraction of cDBS. cdbs_ma: the cDBS amplitude, for words; None where it is not known.
 
     Raises:
         Invalid: a level below B or the bound, or cDBS itself.

@@ -119,8 +119,8 @@ class Choice:
     """A policy that may be planned, and what the ranking says of it.
 
     Attributes:
-        row: its own; None without a ranking of it. harmful: uncleared serious adverse events and stops under it, in words. twins: policies
-            that do the same by the ranking.
+        row: its own; None without a ranking of it. harmful: uncleared serious adverse events and stops under it, in words.
+        twins: policies that do the same by the ranking.
     """
 
     policy: Policy

@@ -135,7 +135,7 @@ def slot_limits(
 def lowest_draw(db: Session, visit: Visit, stated: StatedLimits, hemisphere: Hemisphere | None) -> float:
     """Return B of a visit's random sessions, fraction of cDBS: the participant's, or the plan's lowest amplitude where that is higher.
 
-    Draws below a limit would be cut by the tablet: the sheet would name amplitudes that are not given, and a density that is not theirs.
+    Draws below a limit would be cut by the tablet. The sheet would name amplitudes that are not given, and a density that is not theirs.
     Where the cDBS amplitude is unknown it is the participant's, because the plan has no limits then.
 
     Raises:

@@ -66,7 +66,7 @@ def refuse_approval(found: Grounds, planned: Sequence[tuple[Policy, Safeguard]])
     """Check a draft against the present verdicts: margins and later findings may have changed them since it was drafted.
 
     Raises:
-        Conflict: a policy that is unsafe now and has no clinician's reason; two tests with care; or a test with care without a lowest
+        Conflict: a policy that is unsafe now and has no clinician's reason; two tests with care. Also a test with care without a lowest
             amplitude or with one below the verdict's.
     """
     careful = []

@@ -164,9 +164,9 @@ class PlannedSession:
 def schedule(candidates: Sequence[Candidate], rules: Rules, seed: int) -> list[PlannedSession]:
     """Lay out a visit day: the policies in the order of the rules, a cDBS session between any two of their sessions.
 
-    A single policy gets its cDBS session first, so that it too has a control, and so does a day of random sessions alone, an early visit
-    that only fills the replay buffer. Random sessions, and those near an amplitude, have drawn places; the no-DBS session is at the end.
-    The same arguments give the same day.
+    A single policy gets its cDBS session first, so that it too has a control. So does a day of random sessions alone, an early visit that
+    only fills the replay buffer. Random sessions, and those near an amplitude, have drawn places; the no-DBS session is at the end. The
+    same arguments give the same day.
 
     Raises:
         Invalid: neither a policy nor a random session, a policy twice, more than four, or a day longer than `rules.total_minutes`. The

@@ -37,7 +37,7 @@ class MemberTraining:
 
     Args:
         buffer: the sessions. batch: all of them as tensors. scale: their standardisation.
-        held: indices of the held-out sessions, which decide when to stop.
+        `held`: indices of the held-out sessions, which decide when to stop.
         config: settings. seed: of initial weights, noise and batches.
         fingerprint: names buffer and settings; a checkpoint of another one is refused.
         learnt: indices of those that are learnt from, which may repeat; all others where it is not given.

@@ -1,4 +1,4 @@
-"""Response of beta to the amplitude: an impulse response behind a dose shape, averaged over shapes and time scales by their evidence.
+"""Response of beta to the amplitude: an impulse response behind a dose shape, averaged over shapes and time scales.
 
     y_t = mu + visit + session + sum over k of g_k f(a_{t-k}) + eta_t,    eta_t = sum over l <= W of phi_l eta_{t-l} + e_t
 

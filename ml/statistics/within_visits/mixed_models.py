@@ -2,7 +2,7 @@
 controller.
 
 They use every session at once and say how far visits and policies differ. All are tested on t with one degree of freedom fewer than visits
-with both arms, never as a normal deviate: the spread between visits is what they know least. Where Satterthwaite's approximation has fewer
+with both arms, never as a normal deviate. The spread between visits is what they know least. Where Satterthwaite's approximation has fewer
 degrees (policies that differ, and few of them), the linear model takes those. Metrics that are measured on a scale follow the linear model;
 a scale without equal steps follows ordered categories. Minutes are counts of those watched, with a level of each session because the
 minutes of one session resemble each other.
@@ -50,8 +50,8 @@ class MixedComparison:
     Attributes:
         effect: of the controller, in the metric's unit (linear) or in log odds (of a higher category, or of a counted minute).
         visit_sd: standard deviation of visits' levels. slope_sd: of the effect between visits. policy_sd: between policies; None where
-            fewer than two policies were tested. session_sd: of sessions within a visit and arm; None for ordered categories: the odds hold
-            it.
+            fewer than two policies were tested.
+        session_sd: of sessions within a visit and arm; None for ordered categories: the odds hold it.
         policies: effects of single policies.
     """
 

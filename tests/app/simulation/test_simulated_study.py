@@ -111,7 +111,7 @@ def test_a_simulated_study_that_is_killed_goes_on_with_nothing_lost_and_nothing_
             (signature,) = signatures_of(db, "plan", one.id)
             assert (signature.signer, one.created_by) == (SIGNER, ACCOUNT)
         slots = [item.id for item in (*first.items, *plan.items)]
-        assert [s.plan_item_id for s in held] == slots, "each session stands in its slot"
+        assert [s.plan_item_id for s in held] == slots, "each session is in its slot"
         with_bundle = {item.id for item in (*first.items, *plan.items) if item.controller != "no_dbs"}
         assert set(db.scalars(select(BundleRelease.plan_item_id))) == with_bundle
         assert plan.evaluation_id == db.scalar(select(func.max(Evaluation.id)))

@@ -156,7 +156,7 @@ def test_the_page_offers_the_stimulators_limits(client: TestClient, policy: int,
 
 def test_the_page_gives_the_bundle_and_keeps_what_was_typed_where_it_cannot(client: TestClient, policy: int) -> None:
     page = f"/participants/P1/policies/{policy}/bundle"
-    assert "Nobody has taken a bundle" in client.get(page).text
+    assert "No bundle of this policy has been taken" in client.get(page).text
     typed = {"min_ma": "0.5", "max_ma": "3", "ramp_ma_per_s": "0.25"}
     given = client.post(page, data=typed)
     assert given.headers["content-type"] == "application/zip"
