@@ -3,7 +3,7 @@
     python benchmarks/audit_chain.py [--quick]
 
 One row per transaction, and a thousand in one, on an embedded PostgreSQL of this run with fsync on, with the trigger of the chain on and
-off in turns; milliseconds of wall time per write, median over rounds.
+off in turns. Times are milliseconds of wall time per write, median over rounds.
 """
 
 from __future__ import annotations

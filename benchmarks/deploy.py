@@ -5,11 +5,11 @@
 
 Full (400x300) and distilled (20x10) policies, by torch, onnxruntime, the numpy network and the whole Python controller (window update and
 safety envelope with it), and the C header (-O3; a whole decision too; float32 and whole numbers). `wall` is the time that passed, with the
-slices in which the machine did something else; `CPU` is the thread's own time. The timer's own cost, measured the same way, stands first
-and is not taken off. C is timed inside C over blocks of 1000 decisions, since one is shorter than the timer's steps.
+slices in which the machine did something else; `CPU` is the thread's own time. The timer's own cost, measured the same way, is printed
+first and not taken off. C is timed inside C over blocks of 1000 decisions, since one is shorter than the timer's steps.
 
 `--energy` trains one full policy per synthetic participant on three visits (ReBRAC, 5000 updates), distils it, and runs both as bundles,
-within the safety envelope and in closed loop, beside the random controller. Battery life is a multiple of that under cDBS, under the
+within the safety envelope and in closed loop, next to the random controller. Battery life is a multiple of that under cDBS, under the
 assumption that `ml.deploy.appraisal` states: the paper measured the runtime of tablet and link instead.
 """
 

@@ -102,7 +102,7 @@ class Soak:
 
     def _kill_process(self, name: str, healthy: Callable[[], bool], what: str) -> float:
         process = self.installed.processes[name]
-        # the postmaster is a child by birth of whoever started it, and goes on
+        # the postmaster is a child by birth of the process that started it, and goes on
         below = [p for p in psutil.Process(process.pid).children(recursive=True) if not _is_postgres(p)]
         killed = time.monotonic()
         os.kill(process.pid, signal.SIGKILL)

@@ -7,11 +7,10 @@
 A question is one controller of one participant in one study: is it non-inferior to cDBS on grasp, rating and tremor, and does it save
 energy? A visit is the day that the service plans (`app.planning.protocol.schedule`) with as many sessions of the controller as fit into its
 minutes, a cDBS session between any two of them: of 5 minutes, the protocol's shortest, six against five, of 10 minutes, the service's
-default, four against three.
-Studies whose first seeds lie apart by the number of seeds have nothing in common. The verdict is the
-service's own (`app.analysis.primary_verdict`); the truth is a large sample over other days at the same hours. Beside it, `bound` is what
-would be concluded from the same averages by somebody who knows the standard deviation of every outcome: no test of these averages at
-these levels can conclude much more. The participants are synthetic and not fitted to patients. CPU seconds of one thread.
+default, four against three. Studies whose first seeds lie apart by the number of seeds have nothing in common. The verdict is the service's
+own (`app.analysis.primary_verdict`); the truth is a large sample over other days at the same hours. Besides, `bound` is what would be
+concluded from the same averages by an analyst who knows the standard deviation of every outcome: no test of these averages at these levels
+can conclude much more. The participants are synthetic and not fitted to patients. CPU seconds of one thread.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@
     python -m benchmarks.evaluation.ideal_observer --every 6 --out FOLDER
 
 Of each world the observer knows mechanism, trait, threshold and the distribution of all constants; the constants, the days and the noise it
-must tell apart from the same sessions that a method has (`support/observer.py`). No method may know so much, so what it misses a method
-will miss. It is a regression over simulated patients: the best possible may be somewhat better still. Each world is judged beside further
-patients of its kind, because one world's rank correlation is one draw. Finished worlds are kept in FOLDER. CPU seconds of one thread.
+must infer from the same sessions that a method has (`support/observer.py`). No method may know so much, so what it misses a method will
+miss. It is a regression over simulated patients: the best possible may be somewhat better still. Each world is judged with further patients
+of its kind, because one world's rank correlation is one draw. Finished worlds are kept in FOLDER. CPU seconds of one thread.
 """
 
 from __future__ import annotations

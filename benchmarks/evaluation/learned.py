@@ -7,13 +7,13 @@
     python -m benchmarks.evaluation.learned --designs stratified,paper           data by both designs
     python -m benchmarks.evaluation.learned --part B                             to report on; each run is counted
 
-A policy succeeds where all three QoCs are truly within the default margins of cDBS and it saves a fifth of the energy. Told over
+A policy succeeds where all three QoCs are truly within the default margins of cDBS and it saves a fifth of the energy. Reported over
 responders, patients in whom some constant or proportional controller does, and others are not trained: the share in which the policy that
 the posterior puts first succeeds, and in which any of the six does; energy and true gain of both; between arms the difference of the same
 patients with its standard error. First is as in the ranking: what no session supports, or what probably leaves the margins, comes last.
-`first_by_saving` is the one with the largest saving times the probability of keeping the margins instead of the largest return.
-Training is the service's: learning rates, left-out sessions and the choice of a state are those of a sweep of the preset `quick`. True
-returns only measure. CPU seconds of one thread.
+`first_by_saving` is the one with the largest saving times the probability of keeping the margins instead of the largest return. Training is
+the service's: learning rates, left-out sessions and the choice of a state are those of a sweep of the preset `quick`. True returns only
+measure. CPU seconds of one thread.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=12)
     parser.add_argument("--every", type=int, default=EVERY, help="take every so manyth world")
     parser.add_argument("--designs", default="stratified", help="with commas: stratified, paper")
-    parser.add_argument("--untrained", action="store_true", help="the dose alone that policies would be held near")
+    parser.add_argument("--untrained", action="store_true", help="the dose alone that policies would be kept near")
     parser.add_argument("--updates", type=int, help="of every training; those of the preset by default")
     parser.add_argument("--minutes", type=float, default=1e9, help="start no further training after so many minutes")
     parser.add_argument("--out", type=Path, help="folder of the finished worlds; a temporary one by default")

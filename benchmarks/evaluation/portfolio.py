@@ -4,20 +4,20 @@
     python -m benchmarks.evaluation.portfolio --worlds 40 --out FOLDER   40 worlds; resumable
     python -m benchmarks.evaluation.portfolio --part B ...               patients to report on; each run is counted
     python -m benchmarks.evaluation.portfolio --dlsm ...                 the order of the paper's DLSM too
-    python -m benchmarks.evaluation.portfolio --named --worlds 30        whether as many sessions as a verdict names do tell
+    python -m benchmarks.evaluation.portfolio --named --worlds 30        whether as many sessions as a verdict names do decide
 
 Every virtual patient has three visits of data by the stratified design. Three more visits test up to four policies each: 60 minutes, two
 cDBS sessions and four others of ten minutes. `portfolio` is what the plan's page suggests: verdicts are respected, and tested sessions move
-the posterior before the next visit. `and held` spends the slots that no policy takes as that page says too: sessions held near the
-amplitudes that would tell soonest, or that explore where the data cannot order policies; with the visit's cDBS sessions they join the data,
-to which everything is fitted anew. `any verdict` is the same choice among all candidates without a hazard. `linear`, `dlsm_paper`, `random`
-test the next four of their order. Told after each visit: the true gain over cDBS of the best policy tested so far, as a share of what the
-best candidate gains (`tested`), and of the policy that would be kept by what was seen (`kept`). Nothing is chosen by true returns.
-Patients whose best candidate gains less than two standard errors of the truth are left out. CPU seconds of one thread.
+the posterior before the next visit. `and held` spends the slots that no policy takes as that page suggests: sessions near the amplitudes
+that would decide soonest, or that explore where the data cannot order policies; with the visit's cDBS sessions they join the data, to which
+everything is fitted again. `any verdict` is the same choice among all candidates without a hazard. `linear`, `dlsm_paper`, `random` test
+the next four of their order. Reported after each visit: the true gain over cDBS of the best policy tested so far, as a share of what the
+best candidate gains (`tested`), and of the policy that would be kept by what was seen (`kept`). Nothing is chosen by true returns. Patients
+whose best candidate gains less than two standard errors of the truth are excluded. CPU seconds of one thread.
 
-`--named` takes each policy of which a number of sessions is said to tell after the three early visits, holds so many near the amplitude
-named, at most four a visit after one of cDBS as a plan lays them out, fits everything anew and asks for the verdict again: `told` is the
-share that is no *cannot tell* then, which the number promises for four of five, `told_without` the same after those visits with their cDBS
+`--named` takes each policy of which a number of sessions would decide after the three early visits. It runs so many near the amplitude
+named, at most four a visit after one of cDBS as a plan lays them out, fits everything again and asks for the verdict again: `told` is the
+share that has a verdict then, which the number promises for four of five, `told_without` the same after those visits with their cDBS
 sessions alone.
 """
 
@@ -69,7 +69,7 @@ CDBS_PLACES, TEST_PLACES = (0, 3), (1, 2, 4, 5)
 TESTED = 1 << 43
 """First session number of the tests, which no other data of a world have."""
 HELD = {f"held at {amplitude:g}": ConstantPolicy(amplitude) for amplitude in (0.85, 0.7, 0.55, 0.4)}
-"""Constants beside the candidates, by which it is known what held sessions would show, as the service has them."""
+"""Constants besides the candidates, which show what sessions at them would show, as the service has them."""
 SHARE = 0.9
 QUICK_WORLDS, TRUTH, QUICK_TRUTH = 2, 200, 80
 RESAMPLES = 1000
@@ -98,7 +98,7 @@ class Clinic:
             rows.append((place, "random", session.amplitudes, session.holds))
         found = []
         for place, controller, amplitudes, holds in rows:
-            # the first sessions of cDBS are those that the tests are held against
+            # the first sessions of cDBS are those that the tests are compared with
             first = TESTED + 1000 * number + (10 * list(self.policies).index(CDBS) if controller == "cdbs" else 500) + place
             run = self.world.run(amplitudes[None], self._day(number, place), first)
             bound = s.bound if controller == "random" else None
@@ -146,7 +146,7 @@ class Found:
     """Policies tested at each visit, and the one to be kept after it (cDBS where none is better).
 
     Attributes:
-        held: sessions held near an amplitude, by visit. ordered: whether the data could order policies, before the first visit and after
+        `held`: sessions near an amplitude, by visit. ordered: whether the data could order policies, before the first visit and after
             the last one.
     """
 
@@ -350,7 +350,7 @@ def main() -> None:
     parser.add_argument("--dlsm", action="store_true", help="the order of the paper's DLSM as well")
     parser.add_argument("--minutes", type=float, default=1e9, help="start no further world after so many minutes")
     parser.add_argument("--out", type=Path, help="folder of the finished worlds and of portfolio.svg; a temporary one by default")
-    parser.add_argument("--named", action="store_true", help="whether as many sessions as a verdict names do tell")
+    parser.add_argument("--named", action="store_true", help="whether as many sessions as a verdict names do decide")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     look(chosen.part, " ".join(["portfolio", *sys.argv[1:]]), None)

@@ -77,8 +77,8 @@ def _panel(
 def _axis(metric: str, means: Sequence[float]) -> tuple[float, float, float]:
     """Compute the ends of a panel's axis and the step of its ticks.
 
-    A method that is off by several ranges would flatten all others: the axis ends at twice the median where a mean lies beyond that and
-    120 %, such a bar is cut, and its number stands on it.
+    A method that is off by several ranges would flatten all others: the axis ends at twice the median where a mean is beyond that and
+    120 %, such a bar is cut, and its number is written on it.
     """
     top = min(max([*means, 1e-9]), max(120.0, 2 * float(np.median(means)))) if "%" in metric else max([1.0, *means])
     bottom = min([0.0, *means])

@@ -1,4 +1,4 @@
-"""An observer that knows how a virtual patient came about and must tell its constants from the data: what could be told at best.
+"""An observer that knows how a virtual patient came about and must infer its constants from the data: the best possible inference.
 
 The observer knows the mechanism, the trait, the distribution of the constants, the threshold, the candidates and the visits' plan; not the
 constants, the days and the noise. The mean of the true returns given the data is approximated by a regression over many patients of that

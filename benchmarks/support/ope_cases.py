@@ -23,7 +23,7 @@ class Case:
 
     Attributes:
         name: its name. candidates: what is ranked. probes: besides, cDBS, and a constant at the mean amplitude of `follows`.
-        low, follows: candidates that stand for a lower sustained dose, and for following beta. truth: JSON-able, see `virtual_case`.
+        low, follows: candidates that represent a lower sustained dose, and for following beta. truth: JSON-able, see `virtual_case`.
         data: design -> buffer.
     """
 

@@ -39,7 +39,7 @@ def complete(signer: TestClient, drafter: TestClient, code: str, password: str, 
         policies: two that the plan tests.
 
     Returns:
-        What stands in the paths of pages: `signal`, `upload`, `proposal`, `file`, `planned`.
+        Values in the paths of pages: `signal`, `upload`, `proposal`, `file`, `planned`.
     """
     rng = np.random.default_rng(visit + sum(code.encode()))
     drawn = _upload(signer, code, ("lfp.csv", _samples(rng)), visit=str(visit), controller="other")

@@ -1,7 +1,7 @@
 """Time until the service has drawn a session of many raw samples, and each stretch that a reader zooms to.
 
 The session is uploaded as a table. The first request of its chart decodes the file in a child, which writes extremes per bin of time (a
-min-max pyramid) and the spectrogram; every later one reads what stands in its window.
+min-max pyramid) and the spectrogram; every later one reads what is in its window.
 """
 
 from __future__ import annotations
