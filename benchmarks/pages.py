@@ -92,6 +92,7 @@ PAGES = {
     "policies": "/participants/{code}/policies",
     "policy": "/participants/{code}/policies/{policy}",
     "bundle": "/participants/{code}/policies/{policy}/bundle",
+    "threshold rule": "/participants/{code}/policies/{policy}/threshold-rule",
     "buffer gate": "/participants/{code}/buffer-gate",
     "snapshot": "/snapshots/{snapshot}",
     "sweep": "/sweeps/{sweep}",

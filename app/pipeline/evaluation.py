@@ -14,10 +14,13 @@ from app.evaluation import repository
 from app.evaluation.estimates import compute, dose_shapes, service
 from app.evaluation.policies.tested import replayable, tested
 from app.evaluation.schemas import EvaluateParams
+from app.learning import repository as learning
 from app.learning.policies import ensure_baselines
 from app.learning.trajectories import read_buffer
-from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, acting, participant_of, plan_on_snapshot
+from app.pipeline.params import STEPS_MA, ThresholdRuleParams, rule_amplitudes
+from app.pipeline.stages import PLAN, STORE_WEIGHT, ComputeStep, acting, participant_of, plan_on_snapshot, policy_facts
 from app.platform import files
+from app.platform.errors import Invalid
 from app.platform.jobs import JobContext
 from app.study.repository import settings_version
 from app.tables.learning import BufferSnapshot
@@ -206,3 +209,49 @@ def _fitted(params: EvaluateParams) -> list[str]:
 
 def _members(params: EvaluateParams) -> int:
     return compute.dlsm_members(params.preset, params.seed) if "dlsm" in params.methods else 0
+
+
+# The kind `threshold_rule`: the settings of an implant on the market that come closest to a policy.
+
+FIND_RULE = "find-rule"
+
+
+def run_threshold_rule(job: JobContext) -> dict[str, Any]:
+    """Find the closest rule on a fresh snapshot."""
+    params = ThresholdRuleParams.model_validate(job.params)
+    job.step(PLAN, "Pin the sessions to learn from", weight=STORE_WEIGHT)
+    job.step(FIND_RULE, "Find the closest rule and estimate its return", weight=1.0)
+
+    def facts(db: Session, snapshot: BufferSnapshot) -> dict[str, Any]:
+        cdbs_ma, limits = rule_amplitudes(participant_of(db, job), params)
+        (policy,) = policy_facts(learning.policies_named(db, snapshot.participant_id, [params.policy_id]))
+        settings = settings_version(db, snapshot.settings_version_id)
+        return {
+            "policy": policy,
+            "cdbs_ma": cdbs_ma,
+            "min_ma": limits.low_ma,
+            "max_ma": limits.high_ma,
+            "beta": {"unit": snapshot.beta_unit, "source": snapshot.beta_source, "low_hz": settings.beta_low_hz,
+                     "high_hz": settings.beta_high_hz, "period_s": settings.period_s},
+            "horizon_steps": snapshot.median_steps,
+        }  # fmt: skip
+
+    planned = plan_on_snapshot(job, facts)
+    snapshot = planned["snapshot"]
+    margins = dict(snapshot["margins"])
+    levels = {name: margins.pop(name) for name in ("test_within", "unsafe_beyond")}
+    asked = {name: planned[name] for name in ("cdbs_ma", "min_ma", "max_ma", "horizon_steps")} | {
+        "snapshot_sha256": snapshot["sha256"],
+        "policy_sha256": planned["policy"]["sha256"],
+        "preset": params.preset,
+        "seed": params.seed,
+        "step_ma": STEPS_MA[params.device],
+        "margins": margins,
+        "levels": levels,
+    }
+    found = job.compute_all([(FIND_RULE, "find_rule", asked)])[0]
+    if "failed" in found:
+        raise Invalid(f"No rule was found: {found['failed']}.", "Check the participant's sessions and limits.")
+    about = {name: planned[name] for name in ("policy", "cdbs_ma", "min_ma", "max_ma", "beta")}
+    counted = {"snapshot_id": snapshot["id"], "sessions": snapshot["sessions"], "steps": snapshot["steps"]}
+    return found | about | counted | {"hemisphere": params.hemisphere, "device": params.device}

@@ -10,7 +10,14 @@ from app.learning.schemas import DistilParams, TrainParams
 from app.learning.snapshots import collect
 from app.pipeline.distillation import teachers
 from app.pipeline.next_generation import policies_that_ran
-from app.pipeline.params import NEXT_GENERATION, NextGenerationParams, PipelineParams
+from app.pipeline.params import (
+    NEXT_GENERATION,
+    THRESHOLD_RULE,
+    NextGenerationParams,
+    PipelineParams,
+    ThresholdRuleParams,
+    rule_within_reach,
+)
 from app.pipeline.training import training_starts
 from app.platform.errors import Invalid
 from app.platform.jobs import JobKind, Priority, register
@@ -105,5 +112,16 @@ register(
         orchestration="app.pipeline.distillation:run_distil",
         compute=_DISTILLATION,
         requires=(usable_sessions, teachers),
+    )
+)
+register(
+    JobKind(
+        name=THRESHOLD_RULE,
+        title="Closest settings of an implant on the market",
+        params=ThresholdRuleParams,
+        orchestration="app.pipeline.evaluation:run_threshold_rule",
+        compute={"find_rule": "app.evaluation.estimates.compute:find_rule"},
+        requires=(usable_sessions, rule_within_reach),
+        priority=Priority.INTERACTIVE,
     )
 )

@@ -178,7 +178,7 @@ def _jobs(
         total=total,
         limit=limit,
         offset=offset,
-        kinds=list(_titles().items()),
+        kinds=[(k.name, k.title) for k in registry.kinds().values() if not k.needs],
         titles=_titles(),
         codes=None,
         stoppable={participant.id} if may(caller, can.RUN_JOBS, participant) else set(),

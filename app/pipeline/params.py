@@ -1,15 +1,22 @@
-"""Params of the jobs `pipeline` and `next_generation`; the phases define those of the other kinds."""
+"""Params of the jobs `pipeline`, `next_generation` and `threshold_rule`; the phases define those of the other kinds."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
+from sqlalchemy.orm import Session
 
 from app.evaluation.methods import Methods
 from app.evaluation.schemas import EvaluateParams
-from app.learning.schemas import DEFAULT_SWEEP, Aim, AlgorithmName, Anchor, DistilParams, PolicyIds, SweepParams, TrainParams
-from app.platform.web.schemas import Int, Number
+from app.learning import repository
+from app.learning.schemas import DEFAULT_SWEEP, Aim, AlgorithmName, Anchor, DistilParams, PolicyIds, Preset, SweepParams, TrainParams
+from app.platform.errors import Invalid
+from app.platform.web.schemas import Int, Model, Number
+from app.study import cdbs_amplitude
+from app.tables.participants import Hemisphere, Participant
+from ml.policies.closest_rule import AmplitudeRange
+from ml.policies.threshold_rule import RuleError
 
 NEXT_GENERATION = "next_generation"
 """The kind that goes on from what did best."""
@@ -60,3 +67,56 @@ class NextGenerationParams(PipelineParams):
     count: Int = Field(6, ge=1, le=24, description="Policies to train from scratch in addition.")
     actor_lr_low: Number | None = Field(None, gt=0, le=1, description="Lowest learning rate of the policies from scratch.")
     actor_lr_high: Number | None = Field(None, gt=0, le=1, description="Highest; in between they are spread evenly in the logarithm.")
+
+
+THRESHOLD_RULE = "threshold_rule"
+Device = Literal["percept_pc", "percept_rc"]
+STEPS_MA: dict[Device, float] = {"percept_pc": 0.1, "percept_rc": 0.01}
+
+
+class ThresholdRuleParams(Model):
+    """Params of `threshold_rule`."""
+
+    policy_id: Int = Field(ge=1, description="Policy to which the closest rule is found.")
+    hemisphere: Hemisphere | None = Field(None, description="Side of the cDBS amplitude; needed where a visit states both.")
+    min_ma: Number = Field(0.0, ge=0, le=25.5, description="Least amplitude that a rule may use, mA.")
+    max_ma: Number | None = Field(None, ge=0, le=25.5, description="Most, mA; the cDBS amplitude where not given, and never above it.")
+    device: Device = Field("percept_pc", description="Its amplitudes are multiples of 0.1 mA, those of a `percept_rc` of 0.01 mA.")
+    preset: Preset = Field("full", description="`full`: sizes for a study; `quick`: for a first look.")
+    seed: Int = Field(0, ge=0, le=10**6)
+
+
+def rule_within_reach(db: Session, participant_id: int, params: ThresholdRuleParams) -> None:
+    """Raise where the policy takes no windows of now, or no amplitude may be used.
+
+    Raises:
+        NotFound: no such policy. Invalid: limits that cross, that are above cDBS, or that hold no step of the device.
+    """
+    repository.policies_named(db, participant_id, [params.policy_id])
+    rule_amplitudes(db.get_one(Participant, participant_id), params)
+
+
+def rule_amplitudes(participant: Participant, params: ThresholdRuleParams) -> tuple[float, AmplitudeRange]:
+    """Return the cDBS amplitude in force, mA, and the amplitudes that a rule may use.
+
+    Raises:
+        Invalid: the cDBS amplitude is not known, or the limits cannot be used.
+    """
+    cdbs_ma = cdbs_amplitude.in_force_now(participant, params.hemisphere)
+    max_ma = cdbs_ma if params.max_ma is None else params.max_ma
+    if max_ma > cdbs_ma + 1e-6:
+        raise Invalid(
+            f"A highest amplitude of {max_ma:g} mA is above the cDBS amplitude of {cdbs_ma:g} mA.",
+            "Lower it: no controller of this study gives more than cDBS.",
+            field="max_ma",
+        )
+    if params.min_ma > max_ma + 1e-6:
+        raise Invalid(
+            f"The lowest amplitude, {params.min_ma:g} mA, is above the highest one, {max_ma:g} mA.", "Exchange them.", field="min_ma"
+        )
+    limits = AmplitudeRange(params.min_ma, max_ma, STEPS_MA[params.device])
+    try:
+        limits.usable  # noqa: B018  (raises)
+    except RuleError as error:
+        raise Invalid(f"{str(error)[:1].upper()}{str(error)[1:]}.", "Widen the limits, or take the finer step.", field="max_ma") from error
+    return cdbs_ma, limits

@@ -16,9 +16,11 @@ from app.learning.policies import constant_onnx
 from app.main import DESCRIPTION
 from app.platform.database import transaction
 from app.tables.accounts import Role
+from app.tables.learning import Policy
 from tests.app.filled_study import FilledStudy
 from tests.app.ingest.test_clocks import report as percept_report
 from tests.app.planning.bundles.port_answers import port_answers
+from tests.app.planning.found_rule import add_found_rule
 
 MAPPING = {
     "name": "two columns",
@@ -108,6 +110,8 @@ class World:
         small = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "distilled")
         retired = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "trained")
         elsewhere = next(p["id"] for p in self.read("/participants/P4/policies")["items"] if p["kind"] == "external")
+        with transaction("test") as db:
+            add_found_rule(db, db.get_one(Policy, small), 1)
         visit = self.read("/participants/P4/visits")["items"][0]["id"]
         session, graspless = (s["id"] for s in self.read(f"/visits/{visit}/sessions")["items"][:2])
         derived = self.upload("d.csv", TABLE, visit="2", controller="other", more=[("g.csv", GRASPS)])["sessions"][0]["id"]

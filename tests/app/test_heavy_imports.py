@@ -47,7 +47,7 @@ def test_the_table_of_algorithms_is_read_without_torch() -> None:
     assert "torch" not in modules
 
 
-@pytest.mark.parametrize("kind", ["pipeline", "next_generation", "evaluate", "train", "distill"])
+@pytest.mark.parametrize("kind", ["pipeline", "next_generation", "evaluate", "train", "distill", "threshold_rule"])
 def test_every_function_that_a_kind_names_is_there(kind: str) -> None:
     from app.platform.jobs import registry
 

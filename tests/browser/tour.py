@@ -66,6 +66,7 @@ PAGES = {
     "/visits/{visit_id}/slots": "plan/slots",
     "/visits/{visit_id}/bundles": "plan/bundles",
     "/participants/{code}/policies/{policy_id}/bundle": "plan/bundle",
+    "/participants/{code}/policies/{policy_id}/threshold-rule": "plan/threshold-rule",
     "/visit-day/{visit_id}": "plan/clinic-day",
     "/participants/{code}/analyses": "analyse/analyses",
     "/participants/{code}/analyses/visits/{key}": "analyse/visit-by-visit",

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
 
 from app.evaluation.estimates import dose_shapes
 from app.learning.trajectories import read_buffer
@@ -28,10 +31,17 @@ from ml.ope import (
     not_counted_tests,
     quick_estimators,
 )
+from ml.ope.compare.gain import gain_over
 from ml.ope.dlsm.config import DlsmConfig
+from ml.ope.estimate import Estimate
 from ml.ope.posterior.further_sessions import session_noise
+from ml.ope.posterior.verdict import Levels, verdict
+from ml.outcomes import PREDICTED
+from ml.policies.closest_rule import CLOSE, AmplitudeRange, closest_rule
 from ml.policies.onnx_policy import OnnxPolicy
-from ml.policies.policy import Policy
+from ml.policies.policy import ConstantPolicy, Policy
+from ml.policies.threshold_rule import ThresholdPolicy
+from ml.qoc import Margins
 from ml.trajectories import ReplayBuffer
 
 if TYPE_CHECKING:
@@ -221,3 +231,64 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def find_rule(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Find the closest rule to a policy and estimate rule, policy and cDBS.
+
+    Args:
+        params: `snapshot_sha256`, `policy_sha256`, `preset`, `seed`, `horizon_steps`, `cdbs_ma`, `min_ma`, `max_ma`, `step_ma`, `margins`
+            and `levels`.
+        workdir: not used. report: progress.
+
+    Returns:
+        `rule`; `closeness` to the policy; `close`, whether that is close enough; `tried`, the number of rules. `below_threshold`: shares of
+        the participant's beta below both thresholds. `estimates` of `rule`, `policy` and `cdbs`; `to_policy` and `to_cdbs`, differences of
+        the rule's return; `verdict` on the rule. Or `failed` with the reason where these data give no rule.
+    """
+    buffer = read_buffer(params["snapshot_sha256"])
+    policy = OnnxPolicy(files.read(params["policy_sha256"]), buffer.settings.window)
+    limits = AmplitudeRange(params["min_ma"], params["max_ma"], params["step_ma"])
+    try:
+        found = closest_rule(policy, buffer, params["cdbs_ma"], limits, report.curves(1.0))
+        as_policy = ThresholdPolicy(found.rule, params["cdbs_ma"], buffer.settings.period_s)
+        report.progress(0.7, "estimating the return")
+        panel: dict[str, Policy] = {"rule": as_policy, "policy": policy, "cdbs": ConstantPolicy(1.0)}
+        estimates = build(POSTERIOR, params["seed"], _size(params)).fit(buffer).evaluate(panel, params["horizon_steps"])
+    except ValueError as error:
+        return {"failed": said_of(error, report.log)}
+    rule, cdbs = estimates["rule"], estimates["cdbs"]
+    judged = verdict(rule, cdbs, Margins(**params["margins"]), Levels(**params["levels"]))
+    return {
+        "rule": found.rule.to_json(),
+        "closeness": asdict(found.closeness),
+        "close": found.closeness.rms_ma <= CLOSE * params["cdbs_ma"],
+        "tried": found.tried,
+        "below_threshold": [_share_below(buffer, t) for t in (found.rule.lower_threshold, found.rule.upper_threshold)],
+        "estimates": {name: _rule_numbers(estimate) for name, estimate in estimates.items()},
+        "to_policy": _difference(rule, estimates["policy"]),
+        "to_cdbs": _difference(rule, cdbs),
+        "verdict": {"code": judged.code, "within": judged.within},
+        "horizon_steps": params["horizon_steps"],
+    }
+
+
+def _share_below(buffer: ReplayBuffer, threshold: float) -> float:
+    beta = np.concatenate([s.measured_beta for s in buffer.sessions])
+    return float(np.mean(beta[np.isfinite(beta)] <= threshold))
+
+
+def _rule_numbers(estimate: Estimate) -> dict[str, Any]:
+    named = {"energy", "mean_amplitude", *(o.field for o, _ in PREDICTED)}
+    return {
+        "value": estimate.value,
+        "low": estimate.low,
+        "high": estimate.high,
+        "supported": estimate.supported,
+        "predicted": {name: value for name, value in estimate.predicted.items() if name in named and np.isfinite(value)},
+    }
+
+
+def _difference(own: Estimate, other: Estimate) -> dict[str, float]:
+    gain = gain_over(own, other)
+    return {"value": gain.value, "low": gain.low, "high": gain.high}

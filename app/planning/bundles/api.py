@@ -11,15 +11,16 @@ from pydantic import Field
 from sqlalchemy.orm import Session
 
 from app.accounts.deps import CurrentCaller
-from app.learning.deps import CurrentPolicy
+from app.learning.deps import CurrentOwnPolicy, CurrentPolicy
 from app.planning.bundles import ports, slots
 from app.planning.bundles import service as bundles
+from app.planning.bundles import threshold_rule as rules
 from app.planning.bundles.repository import releases_of_slots
 from app.planning.plans.view import PlanView, read_plan, standings_of
 from app.platform.audit import record
 from app.platform.database import Db, now
 from app.platform.web.schemas import Model, RowId, Text, problems
-from app.study.deps import CurrentVisit
+from app.study.deps import CurrentParticipant, CurrentVisit, ResultsViewed
 from app.tables.participants import Hemisphere, Participant
 from app.tables.plans import PortCheck
 from ml.deploy.ports.answers import MAX_BYTES
@@ -194,3 +195,26 @@ def _bundles(db: Session, view: PlanView) -> dict[int, str]:
     """Find the newest bundle that was taken for each session, by the number of its plan item."""
     newest_last = reversed(releases_of_slots(db, [line.item.id for line in view.lines]))
     return {row.plan_item_id: row.sha256 for row in newest_last if row.plan_item_id is not None}
+
+
+# The threshold rule that comes closest to a policy: another way for it to leave.
+
+
+@of_plans.get("/participants/{code}/policies/{policy_id}/threshold-rule", dependencies=[ResultsViewed])
+def read_threshold_rule(participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db) -> rules.RuleSheetOut:
+    """Return the settings of an implant that come closest to a policy, what is lost by them, and whether they may be programmed.
+
+    A job of kind `threshold_rule` finds them: `POST /participants/{code}/jobs`.
+    """
+    return rules.rule_sheet(db, participant, policy)
+
+
+@of_plans.get(
+    "/participants/{code}/policies/{policy_id}/threshold-rule/sheet",
+    dependencies=[ResultsViewed],
+    response_class=Response,
+    responses=problems(409) | {200: {"content": {"application/pdf": {}}, "description": "One A4 page."}},
+)
+def read_threshold_rule_sheet(participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> Response:
+    """Return the same as one A4 page, to be typed into the programmer. None leaves that may not be programmed now."""
+    return rules.pdf_response(db, participant, policy, caller)

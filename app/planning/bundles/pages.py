@@ -15,21 +15,25 @@ from app.accounts import permissions as can
 from app.accounts.deps import CurrentCaller
 from app.accounts.permissions import Caller
 from app.learning.deps import CurrentOwnPolicy
+from app.pipeline import service as jobs
+from app.pipeline.params import THRESHOLD_RULE, ThresholdRuleParams
 from app.planning import releases
 from app.planning.bundles import ports, release, repository, slots
 from app.planning.bundles import service as bundles
+from app.planning.bundles import threshold_rule as rules
 from app.planning.plans import wording
 from app.planning.plans.limits import device_limits
 from app.planning.plans.sign_off import common_limits
 from app.planning.plans.view import read_plan
 from app.platform import numbers
 from app.platform.database import Db
-from app.platform.errors import BetaloopError, Conflict, Invalid
+from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
 from app.platform.web.forms import FormValues, field_notes, parse
 from app.platform.web.templates import render
 from app.settings import get_settings
 from app.study.access import may
 from app.study.deps import CurrentParticipant, CurrentVisit, ResultsViewed
+from app.tables.jobs import JobStatus
 from app.tables.learning import Policy
 from app.tables.participants import Hemisphere, Participant
 from ml.deploy.ports.answers import MAX_BYTES
@@ -195,5 +199,92 @@ def _page(
         ports=[(row, ports.line_of(row), check) for row, check in ports.checks_of(db, policy)],
         problem=error.problem(request.url.path) if error else None,
         **facts,
+    )
+    return HTMLResponse(page, error.status if error else 200)
+
+
+# The threshold rule that comes closest to a policy: another way for it to leave.
+
+RULE_LABELS = {
+    "min_ma": "Lowest amplitude", "max_ma": "Highest amplitude", "hemisphere": "Hemisphere", "device": "Device", "preset": "Size",
+}  # fmt: skip
+
+
+@router.get("/participants/{code}/policies/{policy_id}/threshold-rule", dependencies=[ResultsViewed])
+def threshold_rule_page(
+    request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller
+) -> HTMLResponse:
+    """Show the newest rule of a policy, and the form to find it."""
+    return _rule_page(request, participant, policy, db, caller)
+
+
+@router.post("/participants/{code}/policies/{policy_id}/threshold-rule")
+def find_threshold_rule(
+    request: Request, participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller, values: FormValues
+) -> Response:
+    """Start the job that finds the rule."""
+    given: dict[str, Any] = {name: str(values.get(name, "")) for name in RULE_LABELS if str(values.get(name, "")).strip()}
+    try:
+        asked = parse(ThresholdRuleParams, given | {"policy_id": str(policy.id)}, RULE_LABELS)
+        within = rules.bounds_in_force(db, participant, asked.hemisphere)
+        if asked.min_ma < within.min_ma - 1e-6:
+            raise Invalid(
+                f"A lowest amplitude of {asked.min_ma:g} mA is below {within.min_ma:g} mA, the least by {within.source}.", "Raise it.",
+                field="min_ma",
+            )  # fmt: skip
+        started = jobs.start_job(db, participant, THRESHOLD_RULE, asked.model_dump(mode="json"), caller)
+    except BetaloopError as error:
+        db.rollback()
+        return _rule_page(request, participant, policy, db, caller, error, given)
+    return RedirectResponse(f"/jobs/{started.job.id}?done={'started' if started.new else 'same'}", 303)
+
+
+@router.get("/participants/{code}/policies/{policy_id}/threshold-rule.pdf", dependencies=[ResultsViewed])
+def print_threshold_rule(participant: CurrentParticipant, policy: CurrentOwnPolicy, db: Db, caller: CurrentCaller) -> Response:
+    """Return the sheet as one A4 page."""
+    return rules.pdf_response(db, participant, policy, caller)
+
+
+def _rule_page(
+    request: Request,
+    participant: Participant,
+    policy: Policy,
+    db: Session,
+    caller: Caller,
+    error: BetaloopError | None = None,
+    entries: dict[str, Any] | None = None,
+) -> HTMLResponse:
+    sides = sorted({Hemisphere(a.hemisphere) for visit in participant.visits for a in visit.cdbs_amplitudes})
+    wished = (entries or {}).get("hemisphere")
+    side = next((s for s in sides if s == wished), sides[0] if sides else None)
+    try:
+        bounds, unmade = rules.bounds_in_force(db, participant, side), None
+    except Invalid as reason:
+        bounds, unmade = None, reason.problem(request.url.path)
+    try:
+        sheet = rules.rule_sheet(db, participant, policy)
+    except NotFound:
+        sheet = None
+    newest = rules.newest_job(db, participant, policy)
+    shown = {"device": "percept_pc", "preset": "full", "hemisphere": side or "", "min_ma": "", "max_ma": ""}
+    if bounds:
+        shown |= {"min_ma": numbers.typed(bounds.min_ma, 6), "max_ma": numbers.typed(bounds.max_ma, 6)}
+    page = render(
+        request,
+        "planning/threshold_rule.html",
+        participant=participant,
+        policy=policy,
+        sheet=sheet,
+        promises=rules.promise_rows(sheet) if sheet else [],
+        sources=rules.SOURCES,
+        bounds=bounds,
+        unmade=unmade,
+        at_work=newest if newest is not None and not JobStatus(newest.status).ended else None,
+        sides=sides,
+        shown=shown | (entries or {}),
+        remarks=field_notes(error, entries or {}),
+        may_run=may(caller, can.RUN_JOBS, participant),
+        may_print=may(caller, can.TAKE_BUNDLES, participant),
+        problem=error.problem(request.url.path) if error else None,
     )
     return HTMLResponse(page, error.status if error else 200)

@@ -24,7 +24,7 @@ from app.planning.plans.limits import require_limits
 from app.planning.plans.sign_off import CommonLimits, common_limits, sealed, signature_of
 from app.planning.plans.visits import today
 from app.planning.plans.wording import ANSWER_EVENT, happened
-from app.planning.protocol.medication import due_before
+from app.planning.protocol.schedule import due_before
 from app.platform.audit.signatures import SignatureState
 from app.platform.errors import BetaloopError, Conflict, Invalid, NotFound
 from app.platform.web.templates import Part, make_part

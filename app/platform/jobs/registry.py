@@ -81,6 +81,11 @@ class JobKind:
             if not _REFERENCE.fullmatch(reference):
                 raise ValueError(f"{reference!r} in job kind {self.name!r} names no function: write module:function")
 
+    @property
+    def needs(self) -> list[str]:
+        """Params without a default: such a job is started where they are known, not from the form for all kinds."""
+        return [name for name, field in self.params.model_fields.items() if field.is_required()]
+
     def run(self, job: JobContext) -> dict[str, Any]:
         """Import the orchestration and run it."""
         orchestration: Orchestration = _load(self.orchestration)

@@ -145,6 +145,7 @@ def _of_learning(world: World) -> dict[str, Call]:
     return {
         "/participants/{code}/policies": {"data": {"name": "y"}, "files": {"file": ("y.onnx", constant_onnx(0.6, 10))}},
         f"{policy}/bundle": {"data": LIMITS},
+        f"{policy}/threshold-rule": {"data": {"min_ma": "0", "preset": "quick", "device": "percept_pc"}},
         f"{policy}/ports": of_api(world, "post", "/policies/{policy_id}/port-checks")
         | {name: world.forms["post", "/policies/{policy_id}/port-checks"][name] for name in ("data", "files")},
         f"{policy}/release": {"data": LIMITS | {"password": PASSWORD}},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import time
 
-from app.planning.protocol.medication import due_before
+from app.planning.protocol.schedule import due_before
 from app.study.characteristics import PlannedDose
 from app.tables.visits import Drug
 
