@@ -216,7 +216,7 @@ def test_a_form_that_nobody_touched_changes_nothing_however_a_browser_writes_its
     db.rollback()
     assert db.scalar(written) == before, answers[0].text[:400]
     assert [a.status_code for a in answers] != [409, 409]
-    assert "Somebody else changed" not in answers[1].text
+    assert "Another person changed" not in answers[1].text
     assert "after this form was opened" not in answers[1].text
 
 

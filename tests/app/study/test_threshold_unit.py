@@ -36,7 +36,7 @@ def test_without_a_stated_unit_and_source_no_threshold_is_drawn_and_no_share_is_
     settings.change_settings(db, study_session.visit.participant, SettingsIn(**left_open), "unknown", SYSTEM)
     data = session_data(db, study_session)
     assert data.threshold is None
-    said = f"Nobody has stated {named} the threshold of 1; this trace is in uV from table."
+    said = f"No person has stated {named} the threshold of 1; this trace is in uV from table."
     assert data.threshold_mismatch == f"{said} State unit and source in the participant's settings."
     assert summarise(data).below_threshold is None
     assert not any("threshold" in str(t.get("name")) for t in control_chart(data).figure["data"])

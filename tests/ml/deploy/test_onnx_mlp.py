@@ -200,7 +200,7 @@ def squared():
         (residual(), "branches|one path"),
         (squared(), "one path"),
         (Graph().add("Gemm", np.ones((W, 4)), np.zeros(4)).add("LeakyRelu").add("Gemm", np.ones((4, 1)), [0.0]).file(), "LeakyRelu"),
-        (Graph().add("Clip", np.float32(0), np.float32(1)).add("Gemm", np.ones((W, 1)), [0.0]).add("Sigmoid").file(), "behind a clip"),
+        (Graph().add("Clip", np.float32(0), np.float32(1)).add("Gemm", np.ones((W, 1)), [0.0]).add("Sigmoid").file(), "follows a clip"),
         (Graph().add("Cast", to=TensorProto.INT32).add("Cast", to=TensorProto.FLOAT).add("Gemm", np.ones((W, 1)), [0.0]).file(), "Cast"),
         (Graph().add("Gemm", np.ones((W, 3)), np.zeros(3)).add("Softmax").add("Gemm", np.ones((3, 1)), [0.0]).file(), "Softmax"),
         (Graph().add("Reciprocal").add("Gemm", np.ones((W, 1)), [0.0]).file(), "Reciprocal"),

@@ -78,5 +78,5 @@ def test_to_ask_what_is_kept_for_its_draws_is_an_error(db: Session, policies: li
     assert own is not None
     assert own.details["behaviour"]
     for ask in (own.details.get, own.details.__getitem__):
-        with pytest.raises(RuntimeError, match="ask the assessment with draws"):
+        with pytest.raises(RuntimeError, match="use the assessment with draws"):
             ask("draws")

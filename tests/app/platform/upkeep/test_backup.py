@@ -219,7 +219,7 @@ def test_a_key_beside_what_it_protects_is_refused(place: Path, filled: dict[str,
     inside = get_settings().data_dir / "backup.key"
     backups.make_key(inside)
     try:
-        with pytest.raises(BackupError, match="beside what it protects"):
+        with pytest.raises(BackupError, match="next to what it protects"):
             backups.backup(place / "backup", inside)
     finally:
         inside.unlink()
