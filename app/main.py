@@ -24,9 +24,10 @@ from app.analysis.standing import outlook, standing_sentences
 from app.planning.plans.suggested import suggested_visit
 from app.planning.slots.web import facts as slots_of_visit
 from app.platform import logs
+from app.platform.bucket import prune_copies_beside
 from app.platform.database import Db, check_connection
 from app.platform.errors import DatabaseAway
-from app.platform.files import prune_copies_beside, remove_abandoned
+from app.platform.files import remove_abandoned
 from app.platform.upkeep.migrate import newest_revision, revision
 from app.platform.web import middleware as web
 from app.platform.web import templates

@@ -74,6 +74,12 @@ def device(db: Session, participant_id: int, pseudonym: str) -> Device | None:
     return db.scalar(select(Device).where(Device.participant_id == participant_id, Device.pseudonym == pseudonym))
 
 
+def next_upload(db: Session) -> int:
+    """Draw the number of a new upload, before there is a row."""
+    number: int = db.scalars(select(func.nextval("upload_id_seq"))).one()
+    return number
+
+
 def upload(db: Session, upload_id: int, caller: Caller) -> tuple[Upload, Participant]:
     """Find an upload and its participant. Raises NotFound."""
     row = db.execute(

@@ -21,7 +21,7 @@ from app.learning import foreign, repository
 from app.learning.training_configs import POLICY
 from app.learning.trajectories import read_buffer
 from app.platform import files
-from app.platform.database import set_reason
+from app.platform.database import end_reading, set_reason
 from app.platform.errors import Conflict, Invalid, TooLarge
 from app.platform.jobs.service import code_version
 from app.study import access
@@ -208,6 +208,7 @@ def add_external(db: Session, participant: Participant, name: str, content: byte
         ) from error
     if repository.policy_by_name(db, participant.id, name):
         raise Conflict(f"Participant {participant.code} already has a policy '{name}'.", "Choose another name.", field="name")
+    end_reading(db)
     row = Policy(
         participant_id=participant.id,
         name=name,

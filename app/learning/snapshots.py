@@ -20,6 +20,7 @@ from app.learning import repository
 from app.learning.gate import Gate, gate, gate_grounds
 from app.learning.trajectories import trajectory_of
 from app.platform import files
+from app.platform.database import end_reading
 from app.platform.errors import Invalid
 from app.platform.kept import kept
 from app.study import access, blinding
@@ -204,6 +205,7 @@ def take_snapshot(db: Session, participant: Participant, caller: Caller) -> Buff
     if known is not None:
         _mend(db, known, found)
         return known
+    end_reading(db)
     stored = files.store(db, to_parquet(found.buffer))
     row_id = repository.add_snapshot(
         db,

@@ -6,8 +6,10 @@ each key in `secrets/`. Machines with other keys would encrypt what no other mac
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,6 +27,7 @@ log = structlog.get_logger()
 T = TypeVar("T")
 CHUNK = 1 << 20
 SLOW_S = 5.0
+_LATELY_S = 3600.0
 SHARED_KEYS = ("quarantine", "pseudonyms", "second-factor", "sign-on", "bundle-signing", "audit-seals", "visit-day")
 """Keys that every machine of an installation must have alike."""
 _FINGERPRINT = b"betaloop key fingerprint 1\0"
@@ -171,3 +174,46 @@ class Bucket:
             raise StoreAway("The store of files does not answer.", "Nothing is lost. Try again in a while.") from error
         finally:
             del self._asked[call]
+
+
+def prune_copies() -> int:
+    """Remove copies of a bucket's files that were used longest ago, beyond the room for them; how many.
+
+    Those of the last hour stay. So do those that the bucket does not have: files that are older than the bucket are no copies.
+    """
+    settings, store = get_settings(), bucket()
+    if store is None or not settings.files_dir.is_dir():
+        return 0
+    copies: list[tuple[float, int, Path]] = []
+    for path in settings.files_dir.glob("??/*"):
+        with contextlib.suppress(FileNotFoundError):  # other processes of this machine make room too
+            found = path.stat()
+            copies.append((found.st_mtime, found.st_size, path))
+    beyond, removed = sum(size for _, size, _ in copies) - settings.files_cache_gib * (1 << 30), 0
+    for used, size, path in sorted(copies):
+        if beyond <= 0 or used > time.time() - _LATELY_S:
+            break
+        try:
+            if store.size(path.name) != size or path.stat().st_mtime != used:
+                continue
+        except FileNotFoundError:
+            continue
+        except StoreAway:
+            break
+        path.unlink(missing_ok=True)
+        beyond, removed = beyond - size, removed + 1
+    return removed
+
+
+def prune_copies_beside() -> None:
+    """Prune in a thread of its own, one at a time, so that a bucket that hangs delays no request."""
+    if not get_settings().files_url:
+        return
+    with _pruning_guard:
+        if not any(thread.is_alive() for thread in _pruning):
+            _pruning[:] = [threading.Thread(target=prune_copies, name="prune-copies", daemon=True)]
+            _pruning[0].start()
+
+
+_pruning: list[threading.Thread] = []
+_pruning_guard = threading.Lock()

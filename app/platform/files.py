@@ -5,16 +5,15 @@ With a bucket (`app.platform.bucket`) that holds the files, and the folder this 
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import hashlib
 import os
 import secrets
 import shutil
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -22,7 +21,7 @@ import structlog
 from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.orm import Session
 
-from app.platform.bucket import Bucket, StoreAway, bucket
+from app.platform.bucket import Bucket, bucket
 from app.platform.errors import BetaloopError
 from app.settings import get_settings, private_folder
 from app.tables.uploads import StoredFile
@@ -32,7 +31,6 @@ log = structlog.get_logger()
 CHUNK = 1 << 20
 _LOCK = ".lock"
 _OPEN_FILES = Path("/proc")
-_LATELY_S = 3600.0
 
 
 class MissingFile(BetaloopError):
@@ -112,48 +110,6 @@ def is_whole(sha256: str, size: int | None = None, hashes: bool = True) -> bool:
         return False
     return not hashes or whole_at(path, sha256)
 
-
-def prune_copies() -> int:
-    """Remove copies of a bucket's files that were used longest ago, beyond the room for them; how many.
-
-    Those of the last hour stay. So do those that the bucket does not have: files that are older than the bucket are no copies.
-    """
-    settings, store = get_settings(), bucket()
-    if store is None or not settings.files_dir.is_dir():
-        return 0
-    copies: list[tuple[float, int, Path]] = []
-    for path in settings.files_dir.glob("??/*"):
-        with contextlib.suppress(FileNotFoundError):  # other processes of this machine make room too
-            found = path.stat()
-            copies.append((found.st_mtime, found.st_size, path))
-    beyond, removed = sum(size for _, size, _ in copies) - settings.files_cache_gib * (1 << 30), 0
-    for used, size, path in sorted(copies):
-        if beyond <= 0 or used > time.time() - _LATELY_S:
-            break
-        try:
-            if store.size(path.name) != size or path.stat().st_mtime != used:
-                continue
-        except FileNotFoundError:
-            continue
-        except StoreAway:
-            break
-        path.unlink(missing_ok=True)
-        beyond, removed = beyond - size, removed + 1
-    return removed
-
-
-def prune_copies_beside() -> None:
-    """Prune in a thread of its own, one at a time, so that a bucket that hangs delays no request."""
-    if not get_settings().files_url:
-        return
-    with _pruning_guard:
-        if not any(thread.is_alive() for thread in _pruning):
-            _pruning[:] = [threading.Thread(target=prune_copies, name="prune-copies", daemon=True)]
-            _pruning[0].start()
-
-
-_pruning: list[threading.Thread] = []
-_pruning_guard = threading.Lock()
 
 _own_folder: list[tuple[Path, int]] = []
 """This process's folder of drafts, once it has one, and the descriptor that holds its lock until the process ends."""
@@ -280,6 +236,43 @@ def _path_of_open(file: BinaryIO) -> Path:
     return _OPEN_FILES / str(os.getpid()) / "fd" / str(file.fileno())
 
 
+@dataclass(frozen=True)
+class KeptBytes:
+    """Bytes that are on disk or in the bucket, before a row says so; size in bytes."""
+
+    sha256: str
+    size: int
+
+
+@dataclass
+class Unsent:
+    """Files that a transaction has stored on this machine and that are to reach the bucket before it commits.
+
+    Attributes:
+        arrived: hashes that are in the bucket. waiting: those that are not, in the present transaction.
+    """
+
+    arrived: set[str] = field(default_factory=set)
+    waiting: set[str] = field(default_factory=set)
+
+    def send(self) -> None:
+        """Put what waits into the bucket; what has arrived is not sent again. Raises StoreAway."""
+        store = bucket()
+        for sha256 in sorted(self.waiting):
+            if store is not None:
+                store.put(_place(sha256), sha256)
+            self.arrived.add(sha256)
+            self.waiting.discard(sha256)
+
+
+_UNSENT = "unsent files"
+
+
+def send_later(db: Session, unsent: Unsent) -> None:
+    """Let `store` put nothing into the bucket in this session: the caller sends it after a rollback, and begins again."""
+    db.info[_UNSENT] = unsent
+
+
 def store(db: Session, content: bytes | Path, *, copy: bool = True) -> StoredFile:
     """Keep bytes (or a draft file, which is moved) and return their row; the same bytes twice are one file.
 
@@ -288,30 +281,44 @@ def store(db: Session, content: bytes | Path, *, copy: bool = True) -> StoredFil
     Args:
         copy: as of `keep`.
     """
+    unsent: Unsent | None = db.info.get(_UNSENT)
+    return record(db, keep_bytes(content, copy=copy, unsent=unsent if copy and bucket() is not None else None))
+
+
+def keep_bytes(content: bytes | Path, *, copy: bool = True, unsent: Unsent | None = None) -> KeptBytes:
+    """Keep bytes (or a draft file, which is moved) without a row. Arguments as of `keep`."""
     draft = content if isinstance(content, Path) else draft_path()
     try:
         if isinstance(content, bytes):
             draft.write_bytes(content)
         size = draft.stat().st_size
-        sha256 = keep(draft, copy=copy)
+        return KeptBytes(keep(draft, copy=copy, unsent=unsent), size)
     finally:
         # also where the disk is full: what cannot be stored must not keep it full
         draft.unlink(missing_ok=True)
-    db.execute(insert(StoredFile).values(sha256=sha256, size=size).on_conflict_do_nothing())
-    return db.get_one(StoredFile, sha256)
 
 
-def keep(draft: Path, *, copy: bool = True) -> str:
+def record(db: Session, file: KeptBytes) -> StoredFile:
+    """Return the row of bytes that were kept, and make it if it is not there."""
+    db.execute(insert(StoredFile).values(sha256=file.sha256, size=file.size).on_conflict_do_nothing())
+    return db.get_one(StoredFile, file.sha256)
+
+
+def keep(draft: Path, *, copy: bool = True, unsent: Unsent | None = None) -> str:
     """Move a draft to where its bytes live, on disk or in the bucket when this returns, and give their hash.
 
     What is there already stays, unless it was damaged since: then these bytes take its place.
 
     Args:
         copy: whether this machine keeps a copy of what is in the bucket; not of what is to be removed for good one day.
+        unsent: takes the place of the bucket for now.
     """
     sha256, _ = hash_file(draft)
     target = _place(sha256)
-    if (store := bucket()) is not None:
+    store = bucket()
+    if unsent is not None:
+        unsent.waiting |= {sha256} - unsent.arrived
+    elif store is not None:
         store.put(draft, sha256)
     if whole_at(target, sha256) or (store is not None and not copy):
         draft.unlink()

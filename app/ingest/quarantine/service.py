@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 from cryptography.fernet import InvalidToken
@@ -25,7 +26,7 @@ from app.ingest.uploads.reports import ASIDE
 from app.ingest.uploads.service import UploadOutcome
 from app.platform import files
 from app.platform.audit import record
-from app.platform.database import now, set_reason
+from app.platform.database import end_reading, now, set_reason
 from app.platform.errors import Conflict, Invalid
 from app.platform.raw_bytes import RawFile, raw_file
 from app.study import access
@@ -87,7 +88,7 @@ def read_held(db: Session, file: UploadFile, participant: Participant, reason: s
                 raise
             raise Invalid(f"It still cannot be read: {error.stored_what} ({error.stored_where}).", error.hint) from error
     kind, redaction, sealed = found.kind, found.redaction, file.quarantine_sha256
-    stored = files.store(db, clean).sha256
+    stored = _keep(db, file, clean)
     file.kind, file.stored_sha256, file.redactor_version = kind, stored, REDACTOR_VERSION
     file.column_mapping = known_mappings[found.mapping] if found.mapping is not None else None
     _decide(db, file, reason, caller)
@@ -122,7 +123,7 @@ def release_as_is(db: Session, file_id: int, reason: str, caller: Caller) -> Upl
         try:
             with original.open() as source, draft.open("wb") as out:
                 shutil.copyfileobj(source, out, files.CHUNK)
-            file.released_sha256 = files.store(db, draft).sha256
+            file.released_sha256 = _keep(db, file, draft)
         finally:
             draft.unlink(missing_ok=True)
     file.status = "released" if file.status == "failed" else file.status
@@ -148,6 +149,17 @@ def _held(db: Session, file_id: int, caller: Caller) -> tuple[UploadFile, Partic
         done = f": {file.decided_by} decided on it" if file.decided_by else ""
         raise Conflict(f"File {file.id} is not in quarantine{done}.", "Load the page again.")
     return file, participant
+
+
+def _keep(db: Session, file: UploadFile, draft: Path) -> str:
+    """Store what was made of a file, with no transaction open while it travels. Raises Conflict: it was decided on meanwhile."""
+    before = (file.status, file.quarantine_sha256)
+    end_reading(db)
+    kept = files.keep_bytes(draft)
+    db.refresh(file, with_for_update=True)
+    if (file.status, file.quarantine_sha256) != before:
+        raise Conflict(f"File {file.id} was decided on meanwhile.", "Load the page again.")
+    return files.record(db, kept).sha256
 
 
 def _decide(db: Session, file: UploadFile, reason: str, caller: Caller) -> None:

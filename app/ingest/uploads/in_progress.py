@@ -24,7 +24,7 @@ LOCKS = 0x75706C64
 
 
 AT_ONCE = 8
-"""Uploads that one process receives at once. Each needs two connections of the database and a thread, which pages need too."""
+"""Uploads that one process receives at once. Each needs a thread and one or two connections of the database, which pages need too."""
 _places = threading.BoundedSemaphore(AT_ONCE)
 _NOTICED = ", ".join(
     f"set_config('tcp_keepalives_{name}', '{seconds}', false)" for name, seconds in (("idle", 10), ("interval", 5), ("count", 3))

@@ -23,6 +23,7 @@ from app.ingest.uploads.incoming import Incoming
 from app.ingest.uploads.reading import ReaderEnded, ReaderFault, twice
 from app.ingest.uploads.reports import ASIDE, BEGUN, add_redaction, known_recordings, lasting, store_reports, stored_reports
 from app.platform import files, raw_bytes
+from app.platform.database import end_reading
 from app.platform.errors import TooLarge, passing
 from app.platform.jobs.children import child
 from app.platform.raw_bytes import RawFile
@@ -115,7 +116,9 @@ class Receiver:
         try:
             with raw_bytes.received(one.stream, limit_mb * 1024 * 1024) as (raw, sha256, size):
                 if known := self._known(name, sha256):
-                    return self._keep_outcome(self._mended(raw, known))
+                    mended = self._mended(raw, known)
+                    self.db.add(self.upload)
+                    return self._keep_outcome(mended)
                 content = self._store(raw) if size else StoredContent("unreadable", None, None, Redaction(), EMPTY)
         except OverflowError as error:
             raise TooLarge(f"'{name}' is larger than {limit_mb} MiB.", "Split it, or have BETALOOP_UPLOAD_LIMIT_MB raised.") from error
@@ -132,7 +135,7 @@ class Receiver:
             column_mapping_id=content.column_mapping_id,
             report={BEGUN: 1} | ({PREVIEW: content.preview} if content.preview else {}),
         )
-        self.db.add(row)
+        self.db.add_all((self.upload, row))
         self.db.commit()  # the bytes are safe from here on, whatever the decoder does with them
         self.kept.append(row.id)
         return self.decode(name, row, content)
@@ -149,6 +152,7 @@ class Receiver:
     def _mended(self, raw: RawFile, known: FileOutcome) -> FileOutcome:
         """Build the outcome for bytes that came before; where their stored form is missing or damaged, they replace it."""
         row = known.row
+        end_reading(self.db)  # the bucket may take its time
         if row.stored_sha256 is None or files.is_whole(row.stored_sha256):
             return known
         content = self._store(raw)
@@ -191,14 +195,18 @@ class Receiver:
         if not sealed and row.report.get(BEGUN, 0) >= LETHAL:
             return self._keep_outcome(self._put_aside(row, self._content(row), ENDED_THE_SERVICE))
         # committed before the file is read, so that it is known whom to blame when that ends the process
-        row.report = {**lasting(row), BEGUN: row.report.get(BEGUN, 0) + 1}
-        self.db.commit()
+        self._count_begin(row, row.report.get(BEGUN, 0))
         with not_counted(self.db, lambda: _forget_begin(row)):
             outcome = self.decode(row.name, row, replace(self._content(row), problem=CUT_SHORT if sealed else None))
         if not outcome.same_bytes:
             outcome.reports[0].understood.append(RESUMED)
             store_reports(row, outcome.reports, known_recordings(row))
         return outcome
+
+    def _count_begin(self, row: UploadFile, times: int) -> None:
+        """Record that a file is read once more than so often. Commits."""
+        row.report = {**lasting(row), BEGUN: times + 1}
+        self.db.commit()
 
     @staticmethod
     def _content(row: UploadFile) -> StoredContent:
@@ -228,11 +236,13 @@ class Receiver:
     def _store(self, raw: RawFile) -> StoredContent:
         """Store a file without identity; what could not be parsed, and so not be cleaned, is kept encrypted.
 
-        A table is cleaned by reading it with the participant's options: one that cannot be decoded is kept encrypted too.
+        A table is cleaned by reading it with the participant's options: one that cannot be decoded is kept encrypted too. Nothing is
+        written before, and no connection is kept while the file is cleaned and travels.
         """
         clean = files.draft_path()
         known = mappings.present(self.db, self.participant.site.study_id)
         ways = [m.as_mapping for m in known]
+        end_reading(self.db)
         try:
             found = twice(lambda: reading.clean(raw, clean, self.options, str(self.upload.id), self._told, ways))
         except ReaderEnded as ended:
@@ -250,9 +260,11 @@ class Receiver:
             raise
         if found.problem is not None:
             return self._quarantined(raw, clean, found.problem, found.redaction, found.preview)
-        sealed = self._seal(raw) if found.redaction.unreadable else None
+        sealed = files.keep_bytes(encryption.encrypt(raw), copy=False) if found.redaction.unreadable else None
+        stored = files.record(self.db, files.keep_bytes(clean)).sha256
         by = known[found.mapping].id if found.mapping is not None else None
-        return StoredContent(found.kind, files.store(self.db, clean).sha256, sealed, found.redaction, None, by)
+        original = files.record(self.db, sealed).sha256 if sealed else None
+        return StoredContent(found.kind, stored, original, found.redaction, None, by)
 
     def _quarantined(
         self,
@@ -343,8 +355,7 @@ class Receiver:
         def again() -> bool:
             begun = row.report.get(BEGUN, 1)
             if begun < LETHAL:
-                row.report = {**lasting(row), BEGUN: begun + 1}
-                self.db.commit()
+                self._count_begin(row, begun)
             return bool(begun < LETHAL)
 
         return twice(read, again)

@@ -174,11 +174,9 @@ def receive(
     if not incoming:
         raise Invalid("The upload holds no file.", "Choose at least one file.", field="file")
     beta = beta or BetaStated()
-    upload = Upload(participant_id=participant.id, created_by=caller.label, stated=_said(stated, beta))
-    db.add(upload)
-    db.flush()
-    number = upload.id  # known whatever becomes of the database
-    with place(), in_progress(number):
+    with place(), in_progress(number := repository.next_upload(db)):
+        # written with its first file: until then no transaction is open while a file travels to the bucket
+        upload = Upload(id=number, participant_id=participant.id, created_by=caller.label, stated=_said(stated, beta))
         arranged = arrange(incoming)
         receiver = Receiver(db, participant, upload, decode_options(db, participant, beta), beta)
         outcome = UploadOutcome(upload, participant, [], alike_together(arranged.asides))

@@ -12,6 +12,7 @@ from app.learning import foreign
 from app.learning.policies import FOREIGN
 from app.planning.bundles import repository
 from app.platform import files
+from app.platform.database import end_reading
 from app.platform.errors import Conflict, Invalid, NotFound, TooLarge
 from app.study import access
 from app.tables.learning import Policy
@@ -50,6 +51,7 @@ def add_check(
         raise TooLarge("The table of answers is too large.", "Send the rows of the port vectors alone.", field="file")
     sha256, content = _bundle_of(db, policy, bundle_sha256)
     found = _check(policy, content, table)
+    end_reading(db)
     row = PortCheckRow(
         policy_id=policy.id,
         bundle_sha256=sha256,

@@ -27,7 +27,7 @@ from app.planning.grounds import events_against, unanswered
 from app.planning.plans import wording
 from app.planning.plans.limits import DeviceLimits, device_limits
 from app.platform import files
-from app.platform.database import set_reason
+from app.platform.database import end_reading, set_reason
 from app.platform.errors import Conflict, Invalid
 from app.settings import get_settings
 from app.study import access, cdbs_amplitude
@@ -159,13 +159,20 @@ def take(
     The release is recorded either way. Bytes that were kept and have been lost or damaged are made again; the doctor names them.
     """
     set_reason(db, wording.release_reason(manifest))
-    repository.lock_content(db, content_sha256)
     sha256 = repository.kept(db, participant.id, content_sha256)
-    if sha256 is not None and files.is_whole(sha256):
+    made: bytes | None = None
+    if sha256 is None or not files.is_whole(sha256):
+        made = make()
+        end_reading(db)
+        new = files.store(db, made).sha256
+    repository.lock_content(db, content_sha256)
+    # asked again under the lock: another caller may have taken it in between, and then the bytes are those
+    sha256 = repository.kept(db, participant.id, content_sha256)
+    if made is None or (sha256 is not None and files.is_whole(sha256)):
+        assert sha256 is not None
         signed = files.read(sha256)
     else:
-        signed = make()
-        sha256 = files.store(db, signed).sha256
+        signed, sha256 = made, new
     release = BundleRelease(
         participant_id=participant.id,
         policy_id=manifest.policy_id,

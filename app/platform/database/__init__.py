@@ -205,7 +205,7 @@ def request_session(db: Annotated[Session, Depends(get_db)]) -> Iterator[Session
         SQLAlchemyError: the commit failed. The sender gets an error, and never the answer of the endpoint.
     """
     yield db
-    wrote = db.info.get(_MAY_HAVE_WRITTEN) or db.new or db.dirty or db.deleted
+    wrote = may_have_written(db)
     try:
         db.commit()
     except DBAPIError as error:
@@ -213,6 +213,24 @@ def request_session(db: Annotated[Session, Depends(get_db)]) -> Iterator[Session
             raise
         # after reading alone the answer is right
         log.warning("the database went away before a request that only read had ended: %s", type(error.orig).__name__)
+
+
+def may_have_written(db: Session) -> bool:
+    """Decide whether the present transaction has, or may have, something to commit."""
+    return bool(db.info.get(_MAY_HAVE_WRITTEN) or db.new or db.dirty or db.deleted)
+
+
+def end_reading(db: Session) -> None:
+    """End a transaction that has only read, with its locks and its connection, because what follows takes long. The session goes on.
+
+    One that has written, or that a job's step keeps together, stays open.
+    """
+    if not (may_have_written(db) or db.info.get(KEPT_TOGETHER)):
+        db.commit()
+
+
+KEPT_TOGETHER = "kept together"
+"""Key in a session's `info`: all that it does is one transaction."""
 
 
 _MAY_HAVE_WRITTEN = "may have written"

@@ -10,7 +10,7 @@ import logging
 import random
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -19,8 +19,9 @@ from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
+from app.platform import files
 from app.platform.bucket import StoreAway
-from app.platform.database import now, set_actor, transaction
+from app.platform.database import KEPT_TOGETHER, now, set_actor, transaction
 from app.platform.jobs import repository
 from app.platform.jobs.children.supervisor import ChildMessages
 from app.platform.jobs.context import JobCancelled, StepOutcome
@@ -43,6 +44,13 @@ _MOST_ACTOR = 254
 def acting_for(person: str) -> str:
     """Name a worker in the audit trail, with the person whose job it runs. That person wrote none of the rows."""
     return f"worker for {person}"[:_MOST_ACTOR]
+
+
+_MOST_SENDINGS = 3
+
+
+class _FilesFirst(Exception):
+    """Files of a transaction are not in the bucket yet: it is rolled back."""
 
 
 @dataclass(frozen=True)
@@ -130,14 +138,29 @@ class Ledger:
         self._persist(write)
 
     def commit_step(self, key: str, fn: Callable[[Session], dict[str, Any]]) -> dict[str, Any]:
-        """Run `fn(db)` and mark the step as succeeded with its result, in one transaction; a step that has its result gives that."""
+        """Run `fn(db)` and mark the step as succeeded with its result, in one transaction; a step that has its result gives that.
+
+        The files that `fn` stores reach the bucket between two runs of it: while they travel, there is no transaction.
+        """
+        unsent = files.Unsent()
 
         def write() -> dict[str, Any]:
+            for _ in range(_MOST_SENDINGS):
+                unsent.send()
+                with suppress(_FilesFirst):
+                    return attempt(unsent)
+            return attempt(None)  # its files are others each time
+
+        def attempt(unsent: files.Unsent | None) -> dict[str, Any]:
             with self._locked() as (db, job):
+                if unsent is not None:
+                    files.send_later(db, unsent)
                 step = repository.step(db, job.id, key)
                 if step.status == JobStatus.SUCCEEDED and step.result is not None:
                     return step.result
                 step.result = fn(db)
+                if unsent is not None and unsent.waiting:
+                    raise _FilesFirst
                 step.status, step.progress, step.message, step.finished_at = JobStatus.SUCCEEDED, 1.0, "", now()
                 self._step_event(db, job, step)
                 return step.result
@@ -176,6 +199,7 @@ class Ledger:
     def _locked(self, live_only: bool = True) -> Iterator[tuple[Session, Job]]:
         with transaction(acting_for(self.created_by)) as db:
             set_actor(db, acting_for(self.created_by), request_id=self.job_id)
+            db.info[KEPT_TOGETHER] = True
             job = repository.locked(db, self.job_id)
             if live_only and (JobStatus(job.status).ended or job.cancel_requested_at is not None):
                 raise JobCancelled

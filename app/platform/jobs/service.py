@@ -19,7 +19,7 @@ from app.platform.jobs import engine, registry, repository
 from app.platform.jobs.repository import events_after as events_after
 from app.tables.jobs import Job, JobEvent, JobStatus
 
-STALE_S = 60.0
+STALE_S = 20.0
 """A worker that is silent for longer is taken for dead."""
 
 NEWER_WORKER = (

@@ -18,8 +18,8 @@ from sqlalchemy import Connection, text
 from sqlalchemy.exc import DBAPIError
 
 from app.platform import kept
+from app.platform.bucket import prune_copies_beside
 from app.platform.database import database_url, get_engine, new_session, set_actor, transaction
-from app.platform.files import prune_copies_beside
 from app.platform.jobs import engine, repository, service
 from app.platform.jobs.steps import JobRunner
 from app.settings import get_settings
@@ -41,7 +41,7 @@ class Pace:
     """Intervals of a worker's tasks, seconds; tests run faster."""
 
     beat_s: float = 5.0
-    stale_s: float = 60.0
+    stale_s: float = 20.0
     housekeeping_s: float = 3600.0
 
 

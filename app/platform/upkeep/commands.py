@@ -33,9 +33,13 @@ def migrate() -> None:
 @app.command(epilog="Example: betaloop where")
 def where(as_json: AsJson = False) -> None:
     """Show the places of the database, the stored files and the keys of this installation; nothing is started."""
-    data_dir = get_settings().data_dir.resolve()
-    result = {"data_folder": str(data_dir), "database": database_place()}
-    result |= {"files": str(data_dir / "files"), "keys": str(data_dir / "secrets")}
+    settings = get_settings()
+    data_dir = settings.data_dir.resolve()
+    result = {"data_folder": str(data_dir), "database": database_place(), "files": str(data_dir / "files")}
+    if settings.files_url:
+        at = f" at {settings.files_endpoint}" if settings.files_endpoint else ""
+        result |= {"files": f"{settings.files_url}{at}", "copies_of_files": str(data_dir / "files")}
+    result |= {"keys": str(data_dir / "secrets")}
     show(result, as_json, "\n".join(f"{name.replace('_', ' ')}: {value}" for name, value in result.items()))
 
 

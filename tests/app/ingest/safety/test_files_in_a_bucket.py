@@ -219,10 +219,10 @@ def test_copies_that_were_used_longest_ago_make_room(shared: str, db: Session, m
         os.utime(files.path_of(sha256), (time.time() - 7200 * age,) * 2)
     monkeypatch.setenv("BETALOOP_FILES_CACHE_GIB", str(1500 / (1 << 30)))
     get_settings.cache_clear()
-    assert files.prune_copies() == 3
+    assert buckets.prune_copies() == 3
     assert [p.name for p in on_this_machine()] == kept[:1]
     assert all(files.read(sha256) == bytes([k]) * 1000 for k, sha256 in enumerate(kept)), "they are in the bucket"
-    assert files.prune_copies() == 0, "used within the last hour"
+    assert buckets.prune_copies() == 0, "used within the last hour"
 
 
 def test_files_of_before_there_was_a_bucket_are_no_copies(shared: str, db: Session, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -233,7 +233,7 @@ def test_files_of_before_there_was_a_bucket_are_no_copies(shared: str, db: Sessi
     store.remove(sha256)
     monkeypatch.setenv("BETALOOP_FILES_CACHE_GIB", str(1 / (1 << 30)))
     get_settings.cache_clear()
-    assert files.prune_copies() == 0
+    assert buckets.prune_copies() == 0
     assert [p.name for p in on_this_machine()] == [sha256]
 
 

@@ -9,9 +9,11 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import text
 
 from app.ingest.uploads import in_progress
 from app.platform import bucket as buckets
+from app.platform.database import new_session
 from app.settings import get_settings
 from tests.app.ingest.conftest import steady
 from tests.network import Line
@@ -47,6 +49,9 @@ def test_uploads_that_wait_for_the_bucket_hold_no_more_than_their_places(
         assert time.monotonic() < until
         time.sleep(0.02)
 
+    with new_session() as db:  # the harness's own connection is this one
+        held = text("select count(*) from pg_stat_activity where datname = current_database() and state like 'idle in%'")
+        assert db.scalar(held) == 0, "a transaction waits for the bucket"
     refused = send(("u.csv", steady(2)), visit=1, controller="random")
     assert (refused.status_code, refused.json()["title"]) == (503, "The store of files is not available")
     assert int(refused.headers["retry-after"]) > 0

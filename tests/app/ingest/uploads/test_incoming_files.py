@@ -104,7 +104,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
 source = sys.argv[1]
 big = bytes(5 << 20)
 for action in (
-    lambda: files.store(None, big),
+    lambda: files.keep_bytes(big),
     lambda: encryption.encrypt(__import__("pathlib").Path(source)),
     lambda: raw_bytes.received(io.BytesIO(big), 1 << 30).__enter__(),
 ):

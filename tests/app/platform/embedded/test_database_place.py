@@ -163,9 +163,14 @@ def test_where_tells_the_place(folder: Path, monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setenv("BETALOOP_DATABASE_URL", "postgresql://betaloop:very-secret@db.example/betaloop")
         get_settings.cache_clear()
         own = CliRunner().invoke(command_line, ["where", "--json"]).output
+        monkeypatch.setenv("BETALOOP_FILES_URL", "s3://clinic/study")
+        monkeypatch.setenv("BETALOOP_FILES_ENDPOINT", "https://s3.example")
+        get_settings.cache_clear()
+        in_a_bucket = CliRunner().invoke(command_line, ["where"]).output
     finally:
         get_settings.cache_clear()
     assert f"database: {outside}\n" in said
     assert f"keys: {folder / 'secrets'}" in said
     assert "db.example" in own
+    assert "files: s3://clinic/study at https://s3.example\n" in in_a_bucket
     assert "very-secret" not in own

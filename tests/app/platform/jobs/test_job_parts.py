@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from rich.console import Console
 from sqlalchemy import text
 
-from app.platform import files
+from app.platform import bucket
 from app.platform.database import new_session, transaction
 from app.platform.errors import NotFound
 from app.platform.jobs import JobContext, StepFailed, StepReport, registry, repository, stream, write_atomically
@@ -346,7 +346,7 @@ def test_a_bucket_that_hangs_does_not_make_a_worker_silent(jobs, monkeypatch):
         begun.append(threading.current_thread())
         answers.wait(60)
 
-    monkeypatch.setattr(files, "prune_copies", hangs)
+    monkeypatch.setattr(bucket, "prune_copies", hangs)
     monkeypatch.setattr(get_settings(), "files_url", "s3://clinic")
     identity, runner = Identity(), JobRunner("w", 1)
     identity.claim()

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import text
+from sqlalchemy.orm import Session
 
 from app.platform import files
+from app.platform.bucket import Bucket, StoreAway
 from app.platform.database import transaction
 from app.platform.jobs import repository, service
+from app.platform.jobs.ledger import Ledger
 from app.settings import get_settings
 from tests.network import Line
 from tests.s3_server import NAME, Server
 
 CONTENT = b"a snapshot"
+OPEN = "select count(*) from pg_stat_activity where datname = current_database() and state like 'idle in%'"
+"""Counts the transactions that wait for something."""
 
 
 @pytest.fixture
@@ -81,3 +88,35 @@ def test_a_job_that_is_repeated_takes_over_the_steps_that_had_succeeded(jobs, tm
     assert job.result["pid"] == first.steps[1].result["pid"], "the child did not run again"
     anew = jobs.ended(jobs.submit("files", **params))
     assert anew.result["pid"] != job.result["pid"], "only a repetition takes over"
+
+
+def test_a_step_puts_its_files_into_the_bucket_while_no_transaction_is_open(jobs, in_bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    ledger = Ledger(jobs.submit("files", sha256=in_bucket, content=""), "test", "worker", lambda: None)
+    ledger.open()
+    ledger.declare("write", "Write", 1.0)
+    real, asked = Bucket.put, []
+
+    def put(store: Bucket, path: Path, sha256: str) -> None:
+        with transaction("test") as db:
+            asked.append(
+                db.scalar(text("select count(*) from pg_stat_activity where datname = current_database() and state like 'idle in%'"))
+            )
+        if len(asked) == 1:
+            raise StoreAway("The store of files does not answer.", "Try again.")
+        real(store, path, sha256)
+
+    monkeypatch.setattr(Bucket, "put", put)
+    runs: list[int] = []
+
+    def write(db: Session) -> dict[str, str]:
+        runs.append(1)
+        return {k: files.store(db, k.encode()).sha256 for k in ("a", "b")}
+
+    stored = ledger.commit_step("write", write)
+    assert asked == [0, 0, 0], "once in vain, then one for each file"
+    assert len(runs) == 2
+    assert all(files.is_whole(sha256) for sha256 in stored.values())
+
+    ledger.declare("draw", "Draw", 1.0)
+    drawn = ledger.commit_step("draw", lambda db: {"own": files.store(db, os.urandom(8)).sha256})
+    assert files.is_whole(drawn["own"]), "bytes that are others at each run are stored all the same"
