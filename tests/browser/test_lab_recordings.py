@@ -72,6 +72,7 @@ def test_a_lab_s_recordings_and_ratings_become_a_ranking(
     for number, (controller, hour) in zip(ids, SESSIONS, strict=True):
         lab.page.select_option(f"#visit-{number}", "1")
         lab.page.select_option(f"#controller-{number}", controller)
+        lab.page.click(f"summary:has-text('Details of session {number}:')")
         lab.page.fill(f"#from-{number}", f"2026-03-02T{10 + hour}:00:30")
     lab.page.click("button[value='confirm:all']")
     lab.page.wait_for_selector(".note.good:has-text('Confirmed.')")

@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 from app.accounts.permissions import Caller
 from app.ingest.proposals.visit_of_recording import VisitToAdd
 from app.ingest.schemas import PartIn, ProposalChange
+from app.ingest.wording import KIND_NAMES
 from app.platform.errors import Invalid
 from app.platform.numbers import counted
 from app.platform.web.charts import written
@@ -100,6 +101,17 @@ class ProposalForm:
     def control(self) -> SessionSegment:
         """The part of the recording that the controller saw."""
         return next(s for s in self.session.segments if s.is_control)
+
+    @property
+    def source(self) -> str:
+        """Names of its files in words that distinguish files of one name: their numbers, device, sides and control channel."""
+        recordings = [s.recording for s in self.session.segments]
+        files = sorted({r.upload_file_id for r in recordings if r.upload_file_id is not None})
+        kinds = dict.fromkeys(KIND_NAMES.get(r.device.kind, r.device.kind) for r in recordings)
+        sides = dict.fromkeys(r.hemisphere for r in recordings if r.hemisphere)
+        channel = f"{self.session.control_stream.replace('_', ' ')} {written(self.session.control_channel or '')}".strip()
+        named = [f"file{'s' if len(files) != 1 else ''} {', '.join(map(str, files))}"] if files else []
+        return ", ".join([*named, *kinds, " and ".join(sides), channel]).replace(", , ", ", ")
 
     @property
     def complete(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -86,7 +87,7 @@ def decide(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
     """Do what the pressed button says to its proposal; corrections typed into the others are saved too."""
     access.require(caller, can.WRITE_STUDY, participant)
     verb, _, which = str(values.get("do", "")).partition(":")
-    typed = {str(k): str(v) for k, v in values.items()}
+    typed = _with_common_visit({str(k): str(v) for k, v in values.items()})
     rows = study.proposals_of_participant(db, participant.id)
     behind = repository.proposals(db, [s.id for s in rows])
     refused: dict[int, BetaloopError] = {}
@@ -109,6 +110,12 @@ def decide(request: Request, participant: CurrentParticipant, db: Db, caller: Cu
     done = DONE.get(verb, "saved")
     listed = f"&confirmed={','.join(map(str, confirmed))}" if confirmed else ""
     return RedirectResponse(f"/participants/{participant.code}/proposals?done={done}{listed}", 303)
+
+
+def _with_common_visit(values: Mapping[str, str]) -> dict[str, str]:
+    """Fill the visit that the form states for every row without one into those rows."""
+    common = values.get("visit-all", "").strip()
+    return {k: common if re.fullmatch(r"visit-\d+", k) and not v.strip() else v for k, v in values.items()}
 
 
 @router.post("/uploaded-files/{file_id}/session")

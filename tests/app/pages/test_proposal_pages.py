@@ -58,6 +58,22 @@ def test_a_whole_visit_is_confirmed_in_one_go_and_what_is_open_stays(browser: Te
     assert f"Proposed session {half}" in after
 
 
+def test_a_row_per_file_tells_files_of_one_name_apart_and_one_visit_counts_for_all(
+    browser: TestClient, client: TestClient, propose: Any
+) -> None:
+    numbers = propose(*[("rcs.csv", steady(level)) for level in (0, 1, 0.5, 0.4)])
+    page = browser.get(URL).text
+    rows = re.findall(r'<tr id="proposal-\d+">.*?</tr>', page, re.S)
+    assert len(rows) == 4
+    assert len({flat(re.findall(r"<small.*?</small>", row, re.S)[0]) for row in rows}) == 4, "each names its own file"
+    assert all(f'name="{name}-{n}"' in row for n, row in zip(numbers, rows, strict=True) for name in ("visit", "controller"))
+    answer = press(browser, "confirm:all", visit_all="1")
+    assert answer.status_code == 303
+    assert confirmed(client) == set(numbers[:2]), "those whose controller is open wait"
+    fields = fields_of(browser.get(URL).text, URL)
+    assert [fields[f"visit-{n}"] for n in numbers[2:]] == ["1", "1"], "their visit is kept"
+
+
 def test_confirming_one_saves_what_was_typed_into_the_others(browser: TestClient, client: TestClient, propose: Any) -> None:
     first, second = propose(("a.csv", steady(1)), ("b.csv", steady(0.5)), visit="1")
     assert press(browser, f"confirm:{first}", **{f"controller_{second}": "random", f"to_{second}": "0:20"}).status_code == 303
@@ -185,7 +201,7 @@ def test_the_page_of_one_proposal_shows_its_traces_and_a_session_link_leads_ther
     assert (moved.status_code, moved.headers["location"]) == (303, f"/proposals/{number}")
     page = browser.get(f"/proposals/{number}").text
     assert "data-chart" in page
-    assert f"Confirm session {number}" in page
+    assert f"Confirm session {number}" in flat(page)
     press(browser, f"confirm:{number}", **{f"controller_{number}": "cdbs"})
     assert browser.get(f"/proposals/{number}").headers["location"] == f"/sessions/{number}"
 
