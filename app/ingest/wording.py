@@ -240,3 +240,8 @@ def beside(new: Recording, other: Recording) -> str:
         f"Recording {other.id} holds minutes of the same device that this one (recording {new.id}) holds too, and the two differ, or each "
         "holds what the other lacks: both are kept, and their minutes count once. If it is one session, upload its whole folder."
     )
+
+
+def count_parts(count: int) -> str:
+    """Return the sentence on a file that holds several."""
+    return f"It holds {count} recordings or tables, each of which was read as a file of its own."

@@ -17,6 +17,7 @@ from app.settings import stored_secret
 from ml import formats
 from ml.formats import OUTCOME_TABLES, ArchiveLimits, DecodeOptions, UndecodableFile, transfer
 from ml.formats.archive import reading_of_members
+from ml.formats.studies.parts import find_parts
 from ml.formats.tables.mapping import TableMapping, find_mapping, preview_of, redact_mapped
 from ml.formats.unpacking import is_packed, unpack
 
@@ -64,6 +65,25 @@ def clean(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str
         return {"problem": error.args_of(), "left_out": formats.left_out_of(source, options.archive), "preview": preview}
     redaction.repaired[:0], redaction.ignored[:0] = unpacked, ignored
     return {"kind": kind, "redaction": asdict(redaction), "mapping": mapping}
+
+
+def parts(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:
+    """Take a file apart that holds several.
+
+    Args:
+        params: `source` and an empty `room`, each as the two paths of a `RawFile`; `archive`, bounds of an archive.
+        workdir: not used.
+        report: takes the share that was read.
+
+    Returns:
+        `names` of the members of the zip in the room, and what was `ignored`; or the `problem` that keeps it from being taken apart.
+    """
+    source, room = (RawFile(Path(params[name][0]), Path(params[name][1])) for name in ("source", "room"))
+    try:
+        with reading_of_members(_told(report, "taking files apart")), room.open_for_writing() as sink:
+            return asdict(find_parts(source, sink, ArchiveLimits(**params["archive"])))
+    except UndecodableFile as error:
+        return {"problem": error.args_of()}
 
 
 def decode(params: dict[str, Any], workdir: Path, report: StepReport) -> dict[str, Any]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar, cast
 
 import structlog
 
@@ -17,11 +18,12 @@ from app.platform.jobs.children.limited import ChildEnded, run_limited
 from app.platform.raw_bytes import RawFile, raw_file
 from app.settings import get_settings
 from ml.formats import DecodedFile, DecodeOptions, Redaction, UndecodableFile, transfer
+from ml.formats.studies.parts import HEAD, may_have_parts
 from ml.formats.tables.mapping import TableMapping
 
 log = structlog.get_logger()
 
-CLEAN, DECODE = "app.ingest.uploads.compute:clean", "app.ingest.uploads.compute:decode"
+CLEAN, PARTS, DECODE = (f"app.ingest.uploads.compute:{name}" for name in ("clean", "parts", "decode"))
 """What the children run."""
 
 _Read = TypeVar("_Read")
@@ -96,6 +98,41 @@ def clean(
         problem = UndecodableFile(*found["problem"])
         return Cleaned("unreadable", Redaction(ignored=found["left_out"]), problem, preview=found["preview"])
     return Cleaned(found["kind"], Redaction(**found["redaction"]), mapping=found["mapping"])
+
+
+@dataclass(frozen=True)
+class FileParts:
+    """Parts of a file that holds several: name and bytes of each, and sentences on what is no part."""
+
+    parts: list[tuple[str, BinaryIO]]
+    ignored: list[str]
+
+
+def parts(source: RawFile, options: DecodeOptions, who: str = "", watch: Told = lambda *_: None) -> FileParts | None:
+    """Take a file apart: a zip of tables, or a table with a column of sessions; None where it is one of its own.
+
+    Args:
+        source: the raw bytes. options: bounds of archives. who: as of `clean`. watch: takes progress.
+
+    Raises:
+        UndecodableFile: its sessions cannot be separated.
+    """
+    with source.open() as stream:
+        if not may_have_parts(stream.read(HEAD)):
+            return None
+    with raw_file() as (_, room):
+        params = {"source": _paths_of(source), "room": _paths_of(room), "archive": asdict(options.archive)}
+        try:
+            found = _run(PARTS, params, who, watch)
+        except (ReaderEnded, ReaderFault) as fault:
+            log.error("file not taken apart", fault=type(fault).__name__)
+            return None  # it is read as a whole, where the same fault is reported with the file
+        if "problem" in found:
+            raise UndecodableFile(*found["problem"])
+        if not found["names"]:
+            return None
+        archive = zipfile.ZipFile(room.open())  # outlives the room, until its last part is read
+        return FileParts([(name, cast(BinaryIO, archive.open(name))) for name in found["names"]], found["ignored"])
 
 
 def _paths_of(raw: RawFile) -> list[str]:

@@ -20,7 +20,7 @@ from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading, recordings
 from app.ingest.uploads.in_progress import not_counted, tell
 from app.ingest.uploads.incoming import Incoming
-from app.ingest.uploads.reading import ReaderEnded, ReaderFault, twice
+from app.ingest.uploads.reading import FileParts, ReaderEnded, ReaderFault, twice
 from app.ingest.uploads.reports import ASIDE, BEGUN, add_redaction, known_recordings, lasting, store_reports, stored_reports
 from app.platform import files, raw_bytes
 from app.platform.database import end_reading
@@ -109,8 +109,8 @@ class Receiver:
     kept: list[int] = field(default_factory=list)
     """Files of which the bytes are safe."""
 
-    def receive(self, one: Incoming) -> FileOutcome:
-        """Keep a file and decode it. Raises TooLarge."""
+    def receive(self, one: Incoming) -> FileOutcome | FileParts:
+        """Keep a file and decode it; return the parts of one that holds several, of which nothing was kept. Raises TooLarge."""
         name = Path(one.name.replace("\\", "/")).name[:255] or "file"
         limit_mb = get_settings().upload_limit_mb
         try:
@@ -119,7 +119,12 @@ class Receiver:
                     mended = self._mended(raw, known)
                     self.db.add(self.upload)
                     return self._keep_outcome(mended)
-                content = self._store(raw) if size else StoredContent("unreadable", None, None, Redaction(), EMPTY)
+                try:
+                    if (several := reading.parts(raw, self.options, str(self.upload.id), self._told)) is not None:
+                        return several
+                    content = self._store(raw) if size else StoredContent("unreadable", None, None, Redaction(), EMPTY)
+                except UndecodableFile as mixed:
+                    content = self._quarantined(raw, files.draft_path(), mixed)
         except OverflowError as error:
             raise TooLarge(f"'{name}' is larger than {limit_mb} MiB.", "Split it, or have BETALOOP_UPLOAD_LIMIT_MB raised.") from error
         row = UploadFile(

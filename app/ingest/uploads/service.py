@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
@@ -20,6 +21,7 @@ from app.ingest.uploads import outcomes as outcomes_intake
 from app.ingest.uploads import reading
 from app.ingest.uploads.in_progress import in_progress, not_counted, place, tell_file
 from app.ingest.uploads.incoming import Incoming, arrange
+from app.ingest.uploads.reading import FileParts
 from app.ingest.uploads.receiving import LETHAL, FileOutcome, Receiver
 from app.ingest.uploads.reports import alike_together, known_recordings, store_reports, stored_reports, unreadable_members
 from app.platform import files
@@ -195,10 +197,19 @@ def receive(
 def _take(receiver: Receiver, outcome: UploadOutcome, incoming: Sequence[Incoming]) -> None:
     """Store and decode each file; those that are too large are reported. Raises TooLarge where all are."""
     refused: list[TooLarge] = []
-    for number, one in enumerate(incoming, start=1):
-        tell_file(outcome.upload.id, number, len(incoming))
+    waiting = deque(incoming)
+    number = 0
+    while waiting:
+        one = waiting.popleft()
+        number += 1
+        tell_file(outcome.upload.id, number, number + len(waiting))
         try:
-            outcome.files.append(receiver.receive(one))
+            taken = receiver.receive(one)
+            if isinstance(taken, FileParts):
+                waiting.extendleft(Incoming(f"{one.name}/{name}", stream) for name, stream in reversed(taken.parts))
+                outcome.asides.append(FileReport(one.name, understood=[wording.count_parts(len(taken.parts))], ignored=taken.ignored))
+            else:
+                outcome.files.append(taken)
         except TooLarge as error:
             refused.append(error)
             problem = Problem(error.detail, "file", f"It was not kept. {error.hint}")

@@ -87,7 +87,8 @@ def _times(columns: Columns, options: DecodeOptions) -> NDArray[np.float64]:
     if back.size:
         i = int(back[0]) + 1
         what = "appears twice" if t_s[i] == t_s[i - 1] else f"comes after {t_s[i - 1]:g} s"
-        raise columns.error(f"times must increase: {t_s[i]:g} s {what}", "t_s", "Sort the rows by t_s; keep one row per time.", i)
+        hint = "Sort the rows by t_s; keep one row per time. A table of several sessions needs a column session."
+        raise columns.error(f"times must increase: {t_s[i]:g} s {what}", "t_s", hint, i)
     check_reach(t_s, columns)
     if not np.any(t_s > GRID_TOLERANCE * options.period_s):
         raise columns.error("no row with t_s > 0", "t_s", "Rows with t_s <= 0 are the window before the session; add the session.")
