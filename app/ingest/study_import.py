@@ -11,16 +11,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import structlog
 from sqlalchemy.orm import Session
 
 from app.accounts.permissions import Caller
 from app.ingest import repository
 from app.ingest.proposals import service as proposals
-from app.ingest.schemas import PartIn, ProposalChange
+from app.ingest.schemas import PartIn
 from app.ingest.sessions import StatedSession
 from app.ingest.stated_beta import BetaStated, decode_options
+from app.ingest.study_rows import enter_row, find_visit
 from app.ingest.uploads import reading, service
 from app.ingest.uploads.incoming import Incoming, arrange
 from app.ingest.uploads.reports import known_recordings
@@ -28,27 +28,19 @@ from app.platform import files, raw_bytes
 from app.platform.database import transaction
 from app.platform.errors import BetaloopError
 from app.settings import get_settings
-from app.study import blinding, visits
+from app.study import blinding
 from app.study import repository as study
 from app.study.recordings.facts import unknown_clock
-from app.study.schemas import ConditionsChange, QocIn, SessionChange, VisitIn
-from app.study.sessions import changes, conditions
 from app.study.sessions.contradictions import control_recording
-from app.study.traces import step_table
 from app.tables.participants import Participant
-from app.tables.sessions import Controller, StudySession
+from app.tables.sessions import Controller
 from app.tables.uploads import UploadFile
-from app.tables.visits import Visit
-from ml.formats import RecordingLog, UndecodableFile
+from ml.formats import DecodeOptions, RecordingLog, UndecodableFile
 from ml.formats.studies.matching import Candidate, Matches, match
 from ml.formats.studies.sheet import Sheet, SheetRow
 from ml.formats.tables.log_head import STATED_FIELDS
 
 log = structlog.get_logger()
-
-REASON = "import of the study's sheet"
-AMPLITUDE_DIFFERS = 0.05
-"""A recorded amplitude under cDBS that differs from the sheet's by more than this share is reported."""
 
 Progress = Callable[[int, int, str], None]
 """Takes how many of how many steps are done, and what is next."""
@@ -121,7 +113,7 @@ def _add_visits(rows: Sequence[SheetRow], caller: Caller, actor: str, report: St
     for row in {(r.participant, r.visit): r for r in reversed(rows)}.values():
         try:
             with transaction(actor) as db:
-                report.changed += bool(_visit(db, study.participant_by_code(db, row.participant, caller), row, caller)[1])
+                report.changed += bool(find_visit(db, study.participant_by_code(db, row.participant, caller), row, caller)[1])
         except BetaloopError as error:
             report.problems.append((f"participant {row.participant}, visit {row.visit}", f"{error.detail} {error.hint}".strip()))
 
@@ -176,26 +168,48 @@ def _take(unit: _Unit, code: str, caller: Caller, actor: str, report: StudyRepor
         participant = study.participant_by_code(db, code, caller)
         arranged = arrange([Incoming(_inner(unit, p), stack.enter_context(p.open("rb"))) for p in unit.paths])
         out: list[Candidate] = []
-        for one in arranged.incoming:
+        for name, one in _parts_of(arranged.incoming, unit.name, decode_options(db, participant, BetaStated())):
             sha256 = hashlib.file_digest(one.stream, "sha256").hexdigest()  # type: ignore[arg-type]
             one.stream.seek(0)
             known = repository.decoded_file(db, participant.id, sha256)
             if known is not None:
                 ids = repository.session_ids_of_file(db, known, known_recordings(known))
-                out += [_of_session(db, i, participant, unit.name, sha256, caller) for i in ids]
+                out += [_of_session(db, i, participant, name, sha256, caller) for i in ids]
             elif (refused := repository.refused_file(db, participant.id, sha256)) is not None:
                 where = f"decide on file {refused.id} on the page of the quarantine of {participant.code}, or correct the file"
-                report.problems.append((unit.name, f"it could not be read before: {where}"))
+                report.problems.append((name, f"it could not be read before: {where}"))
             elif report.dry_run:
-                out += _dry(db, one, participant, unit.name, sha256, offset + len(out))
+                out += _dry(db, one, participant, name, sha256, offset + len(out))
             else:
                 stated = StatedSession(confirm=False)
                 outcome = service.receive(db, participant, stated, [one], caller)
                 report.changed += 1
                 for file in outcome.files:
-                    report.problems += [(unit.name, f"{r.problem.what} ({r.problem.where})") for r in file.reports if r.problem]
-                out += [_of_session(db, i, participant, unit.name, sha256, caller) for i in outcome.session_ids]
+                    report.problems += [(name, f"{r.problem.what} ({r.problem.where})") for r in file.reports if r.problem]
+                out += [_of_session(db, i, participant, name, sha256, caller) for i in outcome.session_ids]
         return out
+
+
+def _parts_of(incoming: Sequence[Incoming], name: str, options: DecodeOptions) -> Iterator[tuple[str, Incoming]]:
+    """List files with the names that a sheet may call them by; the parts of one that holds several in its place.
+
+    Raises:
+        UndecodableFile: its sessions cannot be separated.
+    """
+    for one in incoming:
+        several = None
+        may_have = reading.may_have_parts(one.stream.read(reading.HEAD))
+        one.stream.seek(0)
+        if may_have:
+            with raw_bytes.received(one.stream, get_settings().upload_limit_mb * 1024 * 1024) as (raw, _, _):
+                several = reading.parts(raw, options)
+            one.stream.seek(0)
+        if several is None:
+            yield name, one
+        else:
+            inner = [Incoming(f"{one.name}/{part}", stream) for part, stream in several.parts]
+            for part in inner:
+                yield from _parts_of([part], f"{name}/{Path(part.name).name}", options)
 
 
 def _inner(unit: _Unit, path: Path) -> str:
@@ -253,7 +267,7 @@ def _confirm(matches: Matches, caller: Caller, actor: str, report: StudyReport) 
         for number, row in zip(numbers, rows, strict=True):
             try:
                 with transaction(actor) as db:
-                    said = _enter(db, study.session(db, number, caller), row, caller, report.dry_run)
+                    said = enter_row(db, study.session(db, number, caller), row, caller, report.dry_run)
                     if report.dry_run:
                         db.rollback()
             except BetaloopError as error:
@@ -280,86 +294,6 @@ def _parts(candidate: Candidate, rows: Sequence[SheetRow], caller: Caller, actor
         ]
         version = repository.proposal(db, session.id, caller).version
         return [s.id for s in proposals.split(db, session, version, parts, caller)]
-
-
-def _enter(db: Session, session: StudySession, row: SheetRow, caller: Caller, dry_run: bool) -> list[str]:
-    """Confirm a session as its row says, and enter outcomes, medication and design. Returns what was done; nothing where all was there."""
-    said: list[str] = []
-    visit, made = _visit(db, session.visit.participant, row, caller)
-    said += made
-    if session.status == "proposed":
-        change: dict[str, Any] = {"visit": visit.number, "controller": row.controller, "reason": REASON}
-        change |= {"policy": row.policy} if row.policy else {}
-        change |= {"hemisphere": row.hemisphere} if row.hemisphere and row.hemisphere != session.hemisphere else {}
-        if session.started_at is None and row.start is not None:
-            change["started_at"] = row.start
-        version = repository.proposal(db, session.id, caller).version
-        notes = proposals.confirm(db, session, ProposalChange(version=version, **change), caller)
-        said += [f"visit {visit.number}, {row.controller}", *notes]
-    else:
-        arm = blinding.visible_arm(session, caller)
-        if session.visit_id != visit.id or (arm is not None and arm.controller != row.controller):
-            ran = arm.controller if arm else "hidden"
-            said.append(f"not changed: it is of visit {session.visit.number}, {ran}, and the sheet says {visit.number}, {row.controller}")
-            return said
-    said += _outcomes(db, session, row, caller)
-    said += _medication(db, session, row, caller)
-    said += _design(db, session, row, caller)
-    return said + _amplitude(db, session, row)
-
-
-def _visit(db: Session, participant: Participant, row: SheetRow, caller: Caller) -> tuple[Visit, list[str]]:
-    visit = study.visit_by_number(db, participant.id, row.visit)
-    if visit is None:
-        visit = visits.add_visit(db, participant, VisitIn(number=row.visit, date=row.day), caller)
-        return visit, [f"visit {row.visit} added" + (f" on {row.day}" if row.day else "")]
-    differs = row.day is not None and visit.date not in (None, row.day)
-    return visit, [f"visit {row.visit} is of {visit.date}, and the sheet says {row.day}"] if differs else []
-
-
-def _outcomes(db: Session, session: StudySession, row: SheetRow, caller: Caller) -> list[str]:
-    known = {name: value for name in row.outcomes if (value := getattr(session.qoc, name, None)) is not None}
-    differ = [
-        f"{name} is {known[name]:g}, and the sheet says {value:g}: not changed"
-        for name, value in row.outcomes.items()
-        if name in known and not np.isclose(known[name], value)
-    ]
-    fresh = {name: value for name, value in row.outcomes.items() if name not in known}
-    if fresh:
-        changes.record_qoc(db, session, QocIn(**fresh, reason=REASON), caller)
-    return [*(f"{name} {value:g}" for name, value in fresh.items()), *differ]
-
-
-def _medication(db: Session, session: StudySession, row: SheetRow, caller: Caller) -> list[str]:
-    hours = row.medication_h
-    if hours is None and row.last_dose is not None and session.started_at is not None:
-        hours = round((session.started_at - row.last_dose).total_seconds() / 3600.0, 3)
-    if hours is None or session.medication_h is not None:
-        return []
-    if not 0 <= hours <= 72:
-        return [f"the last dose would have been {hours:g} h before the start: not entered"]
-    changes.change_session(db, session, SessionChange(medication_h=hours, reason=REASON), caller)
-    return [f"last dose {hours:g} h before"]
-
-
-def _design(db: Session, session: StudySession, row: SheetRow, caller: Caller) -> list[str]:
-    present = session.conditions
-    fresh = {n: v for n, v in row.design.items() if (present is None or getattr(present, n) != v)}
-    if not fresh or row.controller != Controller.RANDOM:
-        return []
-    conditions.change(db, session, ConditionsChange.model_validate({**fresh, "reason": REASON}), caller)
-    return [f"design: {', '.join(fresh)}"]
-
-
-def _amplitude(db: Session, session: StudySession, row: SheetRow) -> list[str]:
-    """Compare the recorded amplitude of a cDBS session with the sheet's."""
-    if row.amplitude_ma is None or row.controller != Controller.CDBS or session.visit.sealed:
-        return []
-    values = step_table(db, session, session.visit.participant.current_settings).amplitude_ma
-    known = values[np.isfinite(values)]
-    if not known.size or abs(np.median(known) - row.amplitude_ma) <= AMPLITUDE_DIFFERS * max(row.amplitude_ma, 0.1):
-        return []
-    return [f"look at this: the sheet says {row.amplitude_ma:g} mA, and the recording {float(np.median(known)):g} mA"]
 
 
 def sheet_of(db: Session, participant: Participant, caller: Caller) -> list[dict[str, Any]]:

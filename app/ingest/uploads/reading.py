@@ -18,7 +18,6 @@ from app.platform.jobs.children.limited import ChildEnded, run_limited
 from app.platform.raw_bytes import RawFile, raw_file
 from app.settings import get_settings
 from ml.formats import DecodedFile, DecodeOptions, Redaction, UndecodableFile, transfer
-from ml.formats.studies.parts import HEAD, may_have_parts
 from ml.formats.tables.mapping import TableMapping
 
 log = structlog.get_logger()
@@ -26,6 +25,7 @@ log = structlog.get_logger()
 CLEAN, PARTS, DECODE = (f"app.ingest.uploads.compute:{name}" for name in ("clean", "parts", "decode"))
 """What the children run."""
 
+HEAD = 65_536
 _Read = TypeVar("_Read")
 Told = Callable[[float | None, str | None], None]
 """Takes progress: a share, 0 to 1, and a few words; None where it did not change."""
@@ -106,6 +106,14 @@ class FileParts:
 
     parts: list[tuple[str, BinaryIO]]
     ignored: list[str]
+
+
+def may_have_parts(head: bytes) -> bool:
+    """Decide by the first `HEAD` bytes of a file whether `parts` may find any."""
+    if head.startswith((b"PK\x03\x04", b"PAR1")):
+        return True
+    words = head.replace(b"\0", b"").lower()
+    return not words.lstrip(b"\xef\xbb\xbf\xff\xfe \t\r\n").startswith((b"{", b"[")) and (b"session" in words or b"run" in words)
 
 
 def parts(source: RawFile, options: DecodeOptions, who: str = "", watch: Told = lambda *_: None) -> FileParts | None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 
+from ml.formats.studies.parts import name_part
 from ml.formats.studies.sheet import SheetRow
 
 EARLY_S = 300.0
@@ -97,6 +98,10 @@ def _choose(row: SheetRow, mine: Sequence[Candidate], rows: Sequence[SheetRow]) 
         return None, f"no file of participant {row.participant} holds a session"
     if row.sha256 or row.file:
         named = [c for c in mine if (c.sha256 == row.sha256 if row.sha256 else _is_named(row.file or "", c.file))]
+        if not named and not row.sha256:
+            named = [c for c in mine if _is_named(row.file or "", c.file.rsplit("/", 1)[0])]  # a file of several parts
+        if row.session is not None and len(named) > 1:
+            named = [c for c in named if _is_named(name_part(row.session), c.file)]
         if row.start is not None and len(named) > 1:
             named = _nearest(row.start, named) or named
         if len(named) == 1:

@@ -48,14 +48,6 @@ class Parts:
     ignored: list[str] = field(default_factory=list)
 
 
-def may_have_parts(head: bytes) -> bool:
-    """Decide by a file's first bytes whether `find_parts` may find any."""
-    if head.startswith((*_ZIP, b"PAR1")):
-        return True
-    words = head[:HEAD].replace(b"\0", b"").lower()
-    return not words.lstrip(b"\xef\xbb\xbf \t\r\n").startswith((b"{", b"[")) and any(n.encode() in words for n in ("session", "run"))
-
-
 def find_parts(source: Source, sink: BinaryIO, limits: ArchiveLimits) -> Parts:
     """Write the parts of a file into a zip.
 
@@ -128,7 +120,10 @@ def _is_part(files: Files, name: str) -> bool:
 
 def _text(source: Source, sink: BinaryIO) -> Parts:
     """Take a text table apart by its column of sessions. A part keeps its rows on their lines, so that reports name those."""
-    head = read_head(source, "t_s")
+    try:
+        head = read_head(source, "t_s")
+    except UndecodableFile:
+        return Parts()  # no text: an archive, or a file that its own reader knows or refuses
     names = [column_name(header)[0] for header in head.headers]
     column = next((i for i, name in enumerate(names) if name in SESSION_COLUMNS), None)
     time = next((i for i, name in enumerate(names) if name in TIME_COLUMNS), None)
@@ -225,10 +220,14 @@ def _float(cell: str) -> float | None:
         return None
 
 
+def name_part(session: str) -> str:
+    """Name the part of a session, without its ending, by what the table calls it."""
+    text = re.sub(r"[^\w+-]+", "_", shown(session.strip().removesuffix(".0")).strip("'\"")) or "_"
+    return f"session {text}"
+
+
 def _name(session: str, ending: str) -> str:
-    """Name the part of a session by what the table calls it."""
-    text = re.sub(r"[^\w.+-]+", "_", shown(session).strip("'\"")) or "_"
-    return f"session {text.removesuffix('.0')}.{ending}"
+    return f"{name_part(session)}.{ending}"
 
 
 @contextmanager

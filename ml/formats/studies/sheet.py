@@ -31,6 +31,7 @@ ROLES: dict[str, tuple[str, ...]] = {
     "amplitude_ma": ("amplitude", "amplitude_ma", "cdbs_amplitude", "cdbs_amplitude_ma"),
     "file": ("file", "file_name", "filename", "recording"),
     "sha256": ("sha256", "file_sha256"),
+    "session": ("session", "session_id", "session_no", "session_nr", "session_number", "run"),
     "medication_h": ("medication_h", "hours_since_dose", "hours_since_last_dose"),
     "last_dose": ("last_dose", "last_dose_at", "medication_time", "last_medication"),
     **{name: (name,) for name in STATED_FIELDS},
@@ -62,6 +63,7 @@ class SheetRow:
 
     Attributes:
         line: of the sheet. day: of the visit. start: UTC. minutes: length.
+        session: what the file calls it, where it holds several.
         outcomes: by field of `OUTCOMES`. last_dose: UTC. has_note: whether a note was given, which is not kept.
         design: of a random session, by field of `STATED_FIELDS`.
     """
@@ -78,6 +80,7 @@ class SheetRow:
     amplitude_ma: float | None = None
     file: str | None = None
     sha256: str | None = None
+    session: str | None = None
     medication_h: float | None = None
     last_dose: datetime | None = None
     design: Mapping[str, Any] = field(default_factory=dict)
@@ -223,6 +226,7 @@ def _row(line: int, cells: Mapping[str, Any], zone: tzinfo | None) -> SheetRow:
         policy=texts.get("policy"),
         file=texts.get("file"),
         sha256=texts.get("sha256"),
+        session=_code(cells["session"]) if "session" in cells else None,
         design={name: _design_field(name, cells[name]) for name in STATED_FIELDS if name in cells},
     )
 

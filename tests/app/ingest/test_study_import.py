@@ -24,6 +24,7 @@ from app.tables.uploads import Upload
 from ml.formats.studies.sheet import read_sheet, write_sheet
 from tests.app.ingest.conftest import DAY, device_zip, steady
 from tests.app.ingest.test_clocks import report as percept_report
+from tests.app.ingest.test_parts import make_table
 
 HEADER = "participant,visit,date,start,controller,file,minutes,rating,grasp_hz,medication_h,notes"
 
@@ -161,3 +162,25 @@ def test_the_command_prints_the_report_and_exports_the_sheet(folder: Path, tmp_p
     assert CliRunner().invoke(app, ["export", "P1", "--sheet", "--to", str(out)]).exit_code == 0
     (row,) = read_sheet(out.read_bytes()).rows
     assert (row.participant, row.controller, row.outcomes) == ("P1", "random", {"rating": 7.0, "grasp_hz": 2.5})
+
+
+def test_a_table_of_many_sessions_is_matched_by_file_and_session(tmp_path: Path, participant_code: str, db: Session) -> None:
+    root = tmp_path / "study"
+    root.mkdir()
+    (root / "all.csv").write_bytes(make_table({"1": 0.4, "2": 0.8, "3": 1.0}))
+    parameters = '{""level"": 0.4}'
+    lines = ["participant,visit,date,controller,file,session,rating,lower_bound,design,design_parameters"]
+    lines += [f'P1,1,2026-03-02,random,all.csv,{n},{n + 4},0.4,ladder,"{parameters}"' for n in (1, 2, 4)]
+    rows = read_sheet("\n".join(lines).encode())
+    dry = import_study([root], rows, SYSTEM, "test", True)
+    assert [line for line, *_ in dry.sessions] == [2, 3], dry
+    done = import_study([root], rows, SYSTEM, "test")
+    assert [line for line, *_ in done.sessions] == [2, 3], done
+    assert dict(done.rows) == {4: "no session is in all.csv"}
+    assert [name for name, _ in done.files] == ["study/all.csv/session 3.csv"]
+    confirmed = db.scalars(select(StudySession).where(StudySession.status == "confirmed").order_by(StudySession.id)).all()
+    assert [s.qoc.rating for s in confirmed if s.qoc] == [5, 6]
+    assert [(s.conditions.lower_bound, s.conditions.design) for s in confirmed if s.conditions] == [(0.4, "ladder")] * 2
+    before = counts(db)
+    import_study([root], rows, SYSTEM, "test")
+    assert counts(db) == before
