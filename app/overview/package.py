@@ -20,7 +20,6 @@ from app.analysis.standing import standing_sentences
 from app.evaluation import wording
 from app.evaluation.estimates.coverage import coverage_by_policy
 from app.evaluation.estimates.service import estimate_of
-from app.ingest.study_import import sheet_of
 from app.overview import repository
 from app.overview.package_dictionary import FIELDS, TITLES, Days, descriptor
 from app.platform.audit import record
@@ -30,14 +29,18 @@ from app.study import repository as study
 from app.study.adverse_events import events_of_participant, policy_of
 from app.study.characteristics import CharacteristicsOut
 from app.study.doses import hours_since_dose, levodopa_equivalent_mg
+from app.study.sessions.contradictions import control_recording
 from app.study.sessions.repository import policy_shares
 from app.study.sessions.usable_steps import session_data
 from app.study.settings_types import SettingsOut
 from app.tables.adverse_events import AdverseEvent
 from app.tables.learning import Policy
 from app.tables.participants import Participant
+from app.tables.sessions import Controller
+from app.tables.uploads import UploadFile
 from app.tables.visits import Drug
 from ml.formats.studies.sheet import write_sheet
+from ml.formats.tables.log_head import STATED_FIELDS
 from ml.outcomes import BY_KEY, OUTCOMES
 from ml.outcomes.records import Outcome
 from ml.qoc import Margins
@@ -51,6 +54,35 @@ def export_sheet(db: Session, participant: Participant, caller: Caller) -> bytes
     access.require(caller, can.READ, participant)
     record(db, "export", "participant", participant.id)
     return write_sheet(sheet_of(db, participant, caller)).encode()
+
+
+def sheet_of(db: Session, participant: Participant, caller: Caller) -> list[dict[str, Any]]:
+    """List a participant's confirmed sessions as rows of a sheet that `import_study` reads; without what must stay hidden."""
+    out = []
+    for session in study.sessions_of_participant(db, participant.id):
+        arm = blinding.visible_arm(session, caller)
+        if arm is None or not session.segments:
+            continue
+        control, stated = control_recording(session), session.conditions
+        file = db.get(UploadFile, control.upload_file_id) if control.upload_file_id is not None else None
+        random = arm.controller == Controller.RANDOM and stated is not None
+        out.append(
+            {
+                "participant": participant.code,
+                "visit": session.visit.number,
+                "date": session.visit.date,
+                "start": session.started_at.isoformat() if session.started_at else None,
+                "minutes": round(session.duration_s / 60.0, 4),
+                "controller": arm.controller.value,
+                "policy": study.policy_name(db, arm.policy_id),
+                "hemisphere": session.hemisphere,
+                "sha256": file.original_sha256 if file else None,
+                "medication_h": session.medication_h,
+                **{name: getattr(stated, name) or None for name in STATED_FIELDS if random},
+                **{o.field: getattr(session.qoc, o.field, None) for o in OUTCOMES},
+            }
+        )
+    return out
 
 
 def export_participant(db: Session, participant: Participant, caller: Caller) -> bytes:

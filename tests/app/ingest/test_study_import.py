@@ -15,8 +15,9 @@ from typer.testing import CliRunner
 
 from app.accounts.permissions import SYSTEM
 from app.cli import app
-from app.ingest.study_import import StudyReport, import_study, sheet_of
+from app.ingest.study_import import StudyReport, import_study
 from app.ingest.uploads import service
+from app.overview.package import sheet_of
 from app.study import repository as study
 from app.tables.audit import AuditEvent
 from app.tables.sessions import StudySession
