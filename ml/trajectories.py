@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -172,6 +172,22 @@ class SessionTrajectory:
         whole = np.asarray(np.isfinite(self.states()).all(axis=1))
         amplitude_ok = (self.amplitude >= -AMPLITUDE_TOLERANCE) & (self.amplitude <= 1 + AMPLITUDE_TOLERANCE)
         return whole[:-1] & whole[1:] & amplitude_ok
+
+    def from_first_window(self) -> SessionTrajectory:
+        """Cut the steps before the first whole state off where beta begins less than W steps before the session; else return it as it is.
+
+        None of those steps is usable. `lead_amplitude` stays, as its effect lasts minutes. Of an amplitude that lasts across the cut
+        the rest stays, which was drawn like the whole.
+        """
+        known, window = np.flatnonzero(~np.isnan(self.measured_beta)), self.lead_beta.size
+        k = int(known[0]) if known.size else 0
+        if not 0 < k <= window or k >= self.steps or not np.isfinite(self.states()[k]).all():
+            return self
+        holds = tuple(
+            replace(h, start=max(h.start - k, 0), steps=h.steps - max(k - h.start, 0)) for h in self.holds if h.start + h.steps > k
+        )
+        lead, beta, amplitude = self.measured_beta[k : k + window], self.beta[k:], self.amplitude[k:]
+        return replace(self, lead_beta=lead, beta=beta, amplitude=amplitude, holds=holds)
 
     def rewards(self, settings: MdpSettings) -> Floats:
         """Compute r_k, shape [T]; NaN where beta or amplitude is unknown."""

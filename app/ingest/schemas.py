@@ -86,6 +86,7 @@ class UsableStepsOut(Model):
     valid: int = Field(description="Steps with a valid beta.")
     usable: int = Field(description="Steps that may enter a replay buffer.")
     reason: str | None = Field(description="Why there are none; null where there are some.")
+    late_s: float = Field(description="Seconds of the session before its first whole state, as beta begins too late; 0 where none.")
 
 
 class ProposalOut(Model):

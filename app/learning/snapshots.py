@@ -253,7 +253,7 @@ def _read(db: Session, session: StudySession, version: SettingsVersion, traces: 
         return Member(session, table, None, trajectory)
     if not trajectory.usable().any():
         return Member(session, table, None, _why_unusable(trajectory, table))
-    return Member(session, table, replace(trajectory, medication_h=hours_since_dose(session)), None)
+    return Member(session, table, replace(trajectory.from_first_window(), medication_h=hours_since_dose(session)), None)
 
 
 def _why_unusable(trajectory: SessionTrajectory, table: StepTable) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ml.formats.archive import ZipFiles
 from ml.formats.facts.clocks import lead_in_words
-from ml.formats.labs.meanings import AMPLITUDE_UNITS, CHANNEL_KEY, LEVER_KEY, Meaning, Means
+from ml.formats.labs.meanings import AMPLITUDE_UNITS, CHANNEL_KEY, LEVER_KEY, Meaning, Means, Question
 from ml.formats.options import ArchiveLimits, BetaMeasure, DecodeOptions
 from ml.formats.recording import (
     DECODE_VERSION,
@@ -62,6 +62,7 @@ __all__ = [
     "Means",
     "OutcomeLog",
     "Problem",
+    "Question",
     "RecordingLog",
     "Redaction",
     "SampleLog",

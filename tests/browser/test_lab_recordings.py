@@ -1,4 +1,4 @@
-"""A lab with one XDF per session and a sheet of ratings, from its files to a ranking in the browser.
+"""A lab with one XDF per session and a sheet of ratings, from its folder to a ranking without a line of code.
 
 Each XDF has a local field potential, a gyroscope at the wrist, and markers of the stimulation in the lab's own words.
 """
@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from typer.testing import CliRunner
 
+from app.cli import app
 from tests.app.conftest import worker
 from tests.browser.conftest import Watched
 from tests.ml.formats.peers.xdf import Stream, write
@@ -54,28 +56,20 @@ def test_a_lab_s_recordings_and_ratings_become_a_ranking(
     home = f"/participants/{participant_code}"
     settings = {"design": "stratified", "cdbs_amplitude_ma": 3.0, "xi_beta": 3.0, "beta_unit": "uV", "beta_source": "time_domain"}
     assert client.put(f"/api/v1{home}/settings", json={"settings": settings}).status_code == 200
-    made = [recording(tmp_path / f"{i}.xdf", controller, i) for controller, i in SESSIONS]
+    study = tmp_path / "study"
+    study.mkdir()
+    for number, (controller, hour) in enumerate(SESSIONS):
+        recording(study / f"{number}.xdf", controller, hour)
+    rows = [f"{participant_code},1,{c},{n}.xdf,{RATINGS[n]}" for n, (c, _) in enumerate(SESSIONS)]
+    (tmp_path / "sheet.csv").write_text("\n".join(["participant,visit,controller,file,rating", *rows]), "utf-8")
+    done = CliRunner().invoke(app, ["import", str(study), "--study", str(tmp_path / "sheet.csv")])
+    assert done.exit_code == 0, done.output
+    (visit,) = client.get(f"/api/v1{home}/visits").json()["items"]
+    kept = sorted(client.get(f"/api/v1/visits/{visit['id']}/sessions").json()["items"], key=lambda s: s["started_at"])
+    ids = [s["id"] for s in kept]
+    assert [s["controller"] for s in kept] == [c for c, _ in SESSIONS]
     lab = window(1280, 900)
     lab.signed_in()
-    lab.open(f"{home}/upload")
-    lab.page.set_input_files("#f-file", made)
-    lab.page.click("form[data-upload] button.primary")
-    for _ in range(240):
-        waiting = client.get(f"/api/v1{home}/proposals").json()
-        if len(waiting) == len(SESSIONS):
-            break
-        lab.page.wait_for_timeout(500)
-
-    # each session begins after the window of beta that its first decision needs
-    ids = [p["session"]["id"] for p in sorted(waiting, key=lambda p: p["session"]["started_at"])]
-    lab.open(f"{home}/proposals")
-    for number, (controller, hour) in zip(ids, SESSIONS, strict=True):
-        lab.page.select_option(f"#visit-{number}", "1")
-        lab.page.select_option(f"#controller-{number}", controller)
-        lab.page.click(f"summary:has-text('Details of session {number}:')")
-        lab.page.fill(f"#from-{number}", f"2026-03-02T{10 + hour}:00:30")
-    lab.page.click("button[value='confirm:all']")
-    lab.page.wait_for_selector(".note.good:has-text('Confirmed.')")
 
     # the lab's words and the gyroscope's lever are explained once, for every file of the upload
     lab.open(f"/sessions/{ids[0]}")
@@ -85,15 +79,12 @@ def test_a_lab_s_recordings_and_ratings_become_a_ranking(
     lab.page.click("button:has-text('State for the study')")
     lab.page.wait_for_selector(".note.good:has-text('Stated for the study')")
 
-    # the sheet of ratings, row by row
-    for number, rating in zip(ids, RATINGS, strict=True):
-        lab.open(f"/sessions/{number}")
-        lab.page.fill("#qocs [name=rating]", str(rating))
-        lab.page.fill("#qocs [name=reason]", "from the lab's sheet")
-        lab.page.click("#qocs form[action$='/qoc'] button.primary")
-        lab.page.wait_for_selector(f"#qocs [name=rating][value='{rating}']")
-    tremors = [client.get(f"/api/v1/sessions/{i}/qoc").json()["tremor_percent"] for i in ids]
-    assert all(t is not None for t in tremors)
+    # the recordings begin with their sessions: the page says from where on they are learned from
+    lab.open(f"/sessions/{ids[0]}")
+    assert lab.page.locator(".note:has-text('Learning starts within the session')").count() == 1
+    outcomes = [client.get(f"/api/v1/sessions/{i}/qoc").json() for i in ids]
+    assert [o["rating"] for o in outcomes] == list(RATINGS)
+    assert all(o["tremor_percent"] is not None for o in outcomes), [o["tremor_percent"] for o in outcomes]
 
     # from the jobs page to the ranking
     lab.open(f"{home}/jobs")

@@ -234,3 +234,34 @@ def test_a_buffer_that_says_of_a_session_only_that_it_was_stopped_takes_the_wors
     sink = io.BytesIO()
     pq.write_table(stored.replace_schema_metadata({"betaloop": json.dumps(meta)}), sink)
     assert [s.counted_qoc for s in from_parquet(sink.getvalue()).sessions] == [Qoc(1.8, 1, 100.0), Qoc(2.4, 8, 0.0)]
+
+
+def test_a_session_that_starts_with_its_recording_begins_at_its_first_window() -> None:
+    whole = session(steps=9, lead_beta=np.full(3, np.nan))
+    assert not np.isfinite(whole.states()[0]).any()
+    cut = whole.from_first_window()
+    np.testing.assert_allclose(cut.lead_beta, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(cut.amplitude, 0.1 * np.arange(3, 9))
+    assert cut.usable().sum() == whole.usable().sum() == 6
+    assert readable_transitions(cut) == readable_transitions(whole)
+
+
+def test_the_rest_of_a_held_amplitude_stays_from_the_first_window_on() -> None:
+    holds = (Hold(0, 2, 0.1), Hold(2, 3, 0.2), Hold(5, 4, 0.3))
+    cut = session(steps=9, lead_beta=np.full(3, np.nan), holds=holds).from_first_window()
+    assert cut.holds == (Hold(0, 2, 0.2), Hold(2, 4, 0.3))
+    np.testing.assert_allclose(cut.lead_beta, [0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize(
+    "lead", [np.array([-0.2, -0.1, 0.0]), np.array([-0.2, np.nan, 0.0])], ids=["a whole window", "a gap before the session"]
+)
+def test_a_recording_that_began_early_enough_is_not_cut(lead: np.ndarray) -> None:
+    whole = session(steps=9, lead_beta=lead)
+    assert whole.from_first_window() is whole
+
+
+def test_a_session_without_a_whole_window_soon_is_not_cut() -> None:
+    for beta in (np.full(9, np.nan), 0.1 * np.array([1, np.nan, 3, 4, 5, 6, 7, 8, 9])):
+        whole = session(steps=9, lead_beta=np.full(3, np.nan), beta=beta)
+        assert whole.from_first_window() is whole

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 from fastapi import APIRouter, Request
@@ -27,7 +28,7 @@ from app.study.visits import require_unlocked
 from app.tables.recordings import Recording
 from app.tables.sessions import StudySession
 from app.tables.uploads import SignalMeaning, UploadFile
-from ml.formats import AMPLITUDE_UNITS, CHANNEL_KEY, LEVER_KEY, Meaning, Means
+from ml.formats import AMPLITUDE_UNITS, CHANNEL_KEY, LEVER_KEY, Meaning, Means, Question
 
 api = APIRouter(tags=["proposals"], responses=problems(401, 403, 404, 422))
 pages = APIRouter()
@@ -54,19 +55,10 @@ class MeaningIn(Model):
     lever_cm: Number | None = Field(None, ge=1, le=100, description="From a gyroscope's joint to the fingertip, cm; with `lever` alone.")
 
 
-class QuestionOut(Model):
-    """Marker or channel of a session's recordings, and what it means.
+@dataclass(frozen=True, slots=True)
+class QuestionOut(Question):
+    """Marker or channel of a session's recordings, and what it means; null where it is not stated."""
 
-    `shown` has the words that may be shown. `asked`: the amplitude is unknown for want of its meaning.
-    """
-
-    key: str
-    shown: str
-    count: int
-    first_s: float | None
-    last_s: float | None
-    states_ma: float | None
-    asked: bool
     meaning: dict[str, Any] | None
     stated_by: str | None
 
@@ -95,11 +87,11 @@ def questions_of(db: Session, session: StudySession, caller: Caller) -> list[Que
             row = known.get(key)
             at = asked.get(key) or {"shown": row.shown if row else key, "count": 0, "asked": False}
             stated = row is not None and not row.removed
+            asks: dict[str, Any] = {f.name: at.get(f.name) for f in fields(Question)} | {"key": key}
             found.setdefault(
                 key,
                 QuestionOut(
-                    key=key,
-                    **{name: at.get(name) for name in ("shown", "count", "first_s", "last_s", "states_ma", "asked")},
+                    **asks,
                     meaning=dict(row.meaning) if stated and row else None,
                     stated_by=row.created_by if stated and row else None,
                 ),
@@ -165,22 +157,26 @@ def _meaning(one: MeaningIn) -> dict[str, Any]:
 
 
 def _read_files_again(db: Session, session: StudySession, caller: Caller) -> list[str]:
-    """Read the files of a session's recordings again, and others of the same uploads. Raises Conflict where its own visit is locked."""
+    """Read the participant's files again that the meanings change, a session's own first. Raises Conflict where its visit is locked."""
     own = {r.upload_file_id for r in _recordings(session) if r.upload_file_id is not None}
-    uploads = dict.fromkeys(db.get_one(UploadFile, number).upload_id for number in sorted(own))
+    meanings = repository.meanings_in_force(db, session.visit.participant.site.study_id)
+    numbers = repository.readable_files(db, session.visit.participant_id, None)
     said: list[str] = []
-    for file in [f for number in uploads for f in repository.files_of_upload(db, number) if f.status == "decoded" and f.stored_sha256]:
+    for file in [db.get_one(UploadFile, n) for n in sorted(numbers, key=lambda n: (n not in own, n))]:
+        changes = any(redecode.explained_otherwise(r, meanings) for r in repository.recordings_of_file(db, file.id))
+        if file.id not in own and not changes:
+            continue
         sessions = repository.sessions_of_file(db, file.id)
         try:
             for one in sessions:
                 require_unlocked(one.visit)
-            changed, doses = redecode.read_again(db, file, session.visit.participant, caller.label)
+            read, doses = redecode.read_again(db, file, session.visit.participant, caller.label)
         except (Conflict, redecode.Refused) as error:
             if file.id in own:
                 raise Conflict(f"The recording cannot be read by these meanings: {error}", "Nothing was changed.") from error
             said.append(f"file {file.id} was not read again: {error}")
             continue
-        said += [*changed, *doses]
+        said += [*read, *doses]
         for one in sessions:
             if one.status == "proposed":
                 renew(db, one)

@@ -35,7 +35,7 @@ from app.study.sessions import view as session_view
 from app.study.sessions.charts import beta_by_amplitude, in_chart_table, notes, operator_conflicts, stimulation_steps
 from app.study.sessions.contradictions import contradictions, control_recording
 from app.study.sessions.stimulation import beside, delivered, has_markers, open_questions
-from app.study.sessions.usable_steps import SessionData, session_data
+from app.study.sessions.usable_steps import SessionData, late_s, late_words, session_data
 from app.study.sessions.wording import ACTIVITIES, drawn_words, sentences
 from app.study.settings_form import Shown, own_changes
 from app.study.traces import NO_CONTROL, control_programs, session_offset_s
@@ -298,6 +298,7 @@ def _page(
         trouble=trouble,
         summary=summarise(data) if data else None,
         contradictions=sentences(contradictions(db, session, steps_shown=True)),
+        late=late_words(late_s(data)) if data else "",
         control=control_recording(session),
         view=view,
         steps=steps,

@@ -87,6 +87,7 @@ class UsableSteps:
         steps: of the session. valid: with a valid beta. usable: that may enter a replay buffer.
         reason: why there are none; None where there are some.
         at: which steps are usable, numbers from 0.
+        late_s: seconds of the session before its first whole state, as beta begins too late; 0 where none.
     """
 
     stream: str
@@ -98,6 +99,12 @@ class UsableSteps:
     usable: int
     reason: str | None
     at: frozenset[int] = frozenset()
+    late_s: float = 0.0
+
+    @property
+    def why(self) -> str:
+        """Explain why there are none, or why learning starts late."""
+        return self.reason or late_words(self.late_s)
 
 
 @dataclass(frozen=True)
@@ -170,7 +177,26 @@ def sentence(found: Sequence[UsableSteps]) -> str:
         said += f"; {', '.join(others)}"
     elif rest:
         said += f"; none on {len(rest)} other channel{'s' if len(rest) > 1 else ''}"
-    return said + "."
+    return f"{said}. {late_words(first.late_s)}".rstrip()
+
+
+def late_words(late_s: float) -> str:
+    """Explain that learning starts within the session, as beta was not recorded early enough before it; empty where it was."""
+    if not late_s:
+        return ""
+    return (
+        f"Beta is not recorded long enough before the session for its first state, so learning starts {late_s:g} s into it, with the first "
+        "full window of beta."
+    )
+
+
+def late_s(data: SessionData) -> float:
+    """Compute the seconds of a session before its first whole state, where beta begins too late; 0 where none."""
+    table, settings = data.table, data.settings
+    if not np.any(table.t_s > 0):
+        return 0.0
+    whole = _trajectory(0, 0, table.beta, table.fraction, settings)
+    return (whole.steps - whole.from_first_window().steps) * settings.period_s
 
 
 def _name(u: UsableSteps) -> str:
@@ -191,7 +217,9 @@ def _of_channel(
     trajectory = _trajectory(session.id, session.visit.number, table.beta, table.fraction, settings)
     at = frozenset(np.flatnonzero(trajectory.usable()).tolist())
     valid = int(np.sum(~np.isnan(trajectory.beta)))
-    return UsableSteps(*named, steps, valid, len(at), None if at else _reason(session, trajectory, table, settings, valid), at)
+    why = None if at else _reason(session, trajectory, table, settings, valid)
+    late = (trajectory.steps - trajectory.from_first_window().steps) * settings.period_s
+    return UsableSteps(*named, steps, valid, len(at), why, at, late)
 
 
 def _trajectory(

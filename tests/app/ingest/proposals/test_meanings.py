@@ -89,16 +89,18 @@ def test_a_meaning_that_ends_makes_the_dose_unknown_again_and_the_trail_has_both
         db.execute(text("update signal_meaning set shown = 'x'"))
 
 
-def test_files_that_came_before_are_read_by_it_at_the_next_redecode(
+def test_files_that_came_before_are_read_by_it_at_once_and_others_stay_as_they_are(
     client: TestClient, session_id: int, send: Send, tmp_path: Path, db: Session
 ) -> None:
     other = send(("b.xdf", recording(tmp_path / "b.xdf", *MARKS, seed=1, day="2026-03-03"))).json()["files"][0]["session_ids"][0]
-    explain(client, session_id, questions(client, session_id)[0]["key"], means="amplitude", amplitude_ma=2.5)
+    apart = send(("c.xdf", recording(tmp_path / "c.xdf", (4.0, "stim 1 mA"), seed=2, day="2026-03-04"))).json()["files"][0]["session_ids"][
+        0
+    ]
     assert doses(db, other)[2:14] == [None] * 12
-    changes = list(redecode(None, None, False, "test"))
-    assert sorted(c.state for c in changes) == ["read again", "up to date"]
-    assert [c.sessions for c in changes if c.state == "read again"] != [[]]
+    answer = explain(client, session_id, questions(client, session_id)[0]["key"], means="amplitude", amplitude_ma=2.5)
+    assert len([s for s in answer.json()["said"] if "as markers and channels are explained now" in s]) == 2
     assert doses(db, other)[2:14] == [2.5] * 12
+    assert doses(db, apart)[3:] == [1.0] * 27
     assert all(c.state == "up to date" for c in redecode(None, None, False, "test"))
 
 

@@ -80,14 +80,24 @@ def test_a_damaged_snapshot_is_made_anew_from_the_same_data(upload: Upload, db: 
         assert files.read(first.file_sha256) == whole
 
 
-def test_a_short_lead_makes_the_first_steps_unusable(upload: Upload, db: Session) -> None:
-    upload("random", steps=40, lead=4)
+@pytest.mark.parametrize(("lead", "cut"), [(4, 6), (0, 10)])
+def test_a_session_that_starts_with_its_recording_is_learned_from_its_first_window(
+    lead: int, cut: int, upload: Upload, client: TestClient, db: Session
+) -> None:
+    number = upload("random", steps=40, lead=lead)
     snapshot, buffer = taken(db)
-    usable = buffer.sessions[0].usable()
-    assert np.isnan(buffer.sessions[0].lead_beta[:6]).all()
-    assert not usable[:6].any()
-    assert usable[6:].all()
-    assert snapshot.steps == 34
+    (one,) = buffer.sessions
+    assert np.isfinite(one.lead_beta).all()
+    assert one.usable().all()
+    assert snapshot.steps == one.steps == 40 - cut
+    trace = client.get(f"/api/v1/sessions/{number}/trace").json()
+    np.testing.assert_allclose(one.beta, trace["beta"][10 + cut :])
+    page = client.get(f"/sessions/{number}").text
+    assert f"learning starts {2 * cut} s into it, with the first full window of beta" in " ".join(page.split())
+
+
+def test_a_session_with_a_whole_window_before_it_has_no_such_note(upload: Upload, client: TestClient) -> None:
+    assert "Learning starts within the session" not in client.get(f"/sessions/{upload('random', steps=40)}").text
 
 
 def test_an_excluded_session_stays_out_with_its_reason(upload: Upload, client: TestClient, db: Session) -> None:
