@@ -297,7 +297,7 @@ PROMISES = [
     ),
     *_of(
         "ingest/uploads/receiving",
-        ("bytes that come again replace damaged ones", "return self._keep_outcome(self._mended(raw, known))", "return known",
+        ("bytes that come again replace damaged ones", "mended = self._mended(raw, known)", "mended = known",
          f"{DAMAGED}::test_the_same_bytes_sent_again_take_the_place_of_a_damaged_file"),
     ),
     *_of(

@@ -37,7 +37,8 @@ CONTENTS: list[Promise] = [
     ),
     *of(
         "ingest/uploads/receiving",
-        ("no machine keeps a copy of quarantined bytes", "encryption.encrypt(raw), copy=False)", "encryption.encrypt(raw))", GONE),
+        ("no machine keeps a copy of quarantined bytes", "files.store(self.db, encryption.encrypt(raw), copy=False)",
+         "files.store(self.db, encryption.encrypt(raw))", GONE),
     ),
     *of(
         "ingest/quarantine/service",

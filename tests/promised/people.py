@@ -59,8 +59,8 @@ PEOPLE: list[Promise] = [
     ),
     *of(
         "planning/bundles/service",
-        ("a bundle that is taken again writes no file", "    if sha256 is not None and files.is_whole(sha256):\n",
-         "    if False:\n",
+        ("a bundle that is taken again writes no file", "    if sha256 is None or not files.is_whole(sha256):\n",
+         "    if True:\n",
          f"{BUNDLES}::test_the_same_bundle_taken_twice_is_one_file_and_stands_twice_in_the_audit_trail"),
         ("viewers take no bundles", "    access.require(caller, can.TAKE_BUNDLES, participant)\n", "",
          f"{BUNDLES}::test_who_may_only_read_takes_no_bundle_and_leaves_no_trace"),

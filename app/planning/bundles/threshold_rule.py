@@ -335,7 +335,7 @@ def promise_rows(sheet: RuleSheetOut) -> list[tuple[str, str, str]]:
 def pdf_response(db: Session, participant: Participant, policy: Policy, caller: Caller) -> Response:
     """Return the sheet as a PDF, and record who took it. Raises as `printable`."""
     sheet = printable(db, participant, policy, caller)
-    record(db, "print", "policy", policy.id, {"threshold_rule": sheet.job_id})
+    record(db, "download", "policy", policy.id, {"threshold_rule": sheet.job_id})
     name = f"{participant.code}-policy-{policy.id}-threshold-rule.pdf"
     headers = {"Content-Disposition": f'inline; filename="{name}"'}
     return Response(render_pdf(sheet, caller.label, now()), media_type="application/pdf", headers=headers)

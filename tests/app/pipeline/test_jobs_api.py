@@ -94,7 +94,7 @@ def test_a_job_is_accepted_with_its_defaults_and_listed(client: TestClient, uplo
         ({"kind": "train", "surprise": 1}, 422, "surprise"),
         ({"kind": "distill", "policies": [999]}, 404, "999"),
         ({"kind": "distill"}, 422, "no trained policy"),
-        ({"kind": "evaluate"}, 422, "no policy to rank"),
+        ({"kind": "evaluate"}, 422, "There is no policy yet"),
         ({"kind": "evaluate", "policies": [999]}, 404, "999"),
         ({"kind": "evaluate", "methods": ["magic"]}, 422, "methods"),
         ({"kind": "evaluate", "methods": ["wis", "aggregate"]}, 422, "at least two other methods"),

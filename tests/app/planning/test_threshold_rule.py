@@ -70,7 +70,7 @@ def test_a_rule_is_found_shown_checked_and_printed(client: TestClient, db: Sessi
         assert printed.content.startswith(b"%PDF-")
         assert printed.content.count(b"/Type /Page\n") == 1, "one page"
         assert client.get(f"{api}/sheet").headers["content-type"] == "application/pdf"
-        assert db.scalar(select(AuditEvent.id).where(AuditEvent.action == "print", AuditEvent.entity_id == str(policy))) is not None
+        assert db.scalar(select(AuditEvent.id).where(AuditEvent.action == "download", AuditEvent.entity_id == str(policy))) is not None
     job = db.get_one(Job, done["id"])
     assert job.result is not None
     as_percept = {
