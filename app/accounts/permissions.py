@@ -208,6 +208,7 @@ _PAGE_NEEDS = tuple(
         ("/participants/new|/participants/[^/]+/visits/new", WRITE_STUDY),
         ("/participants/[^/]+/upload", UPLOAD),
         ("/participants/[^/]+/next-generation", RUN_JOBS),
+        (r"/participants/[^/]+/policies/[0-9]+/threshold-rule\.pdf", TAKE_BUNDLES),
         ("/uploaded-files/[0-9]+/mapping", UPLOAD),
     )
 )

@@ -110,7 +110,7 @@ class World:
         small = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "distilled")
         retired = next(p["id"] for p in self.read("/participants/P1/policies")["items"] if p["kind"] == "trained")
         elsewhere = next(p["id"] for p in self.read("/participants/P4/policies")["items"] if p["kind"] == "external")
-        with transaction("test") as db:
+        with transaction("admin@clinic.example") as db:
             add_found_rule(db, db.get_one(Policy, small), 1)
         visit = self.read("/participants/P4/visits")["items"][0]["id"]
         session, graspless = (s["id"] for s in self.read(f"/visits/{visit}/sessions")["items"][:2])

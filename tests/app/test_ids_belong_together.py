@@ -23,6 +23,7 @@ from app.tables.jobs import Job
 from app.tables.learning import Policy
 from ml.rl import MlpPolicy
 from tests.app.planning.bundles.port_answers import port_answers
+from tests.app.planning.found_rule import add_found_rule
 from tests.conftest import PASSWORD
 
 BUNDLE_FORM = {"data": {"min_ma": "0", "max_ma": "3", "ramp_ma_per_s": "1.5"}}
@@ -32,6 +33,13 @@ PAIRS: dict[tuple[str, str], dict[str, Any]] = {
     # every route with two or more ids in its path, and what makes the call of a matched pair succeed
     ("GET", "/participants/{code}/policies/{policy_id}"): {},
     ("POST", RELEASE): {"data": BUNDLE_FORM["data"] | {"password": PASSWORD}},
+    ("GET", "/participants/{code}/policies/{policy_id}/threshold-rule"): {},
+    ("GET", "/participants/{code}/policies/{policy_id}/threshold-rule.pdf"): {},
+    ("POST", "/participants/{code}/policies/{policy_id}/threshold-rule"): {
+        "data": {"min_ma": "0", "preset": "quick", "device": "percept_pc"}
+    },
+    ("GET", "/api/v1/participants/{code}/policies/{policy_id}/threshold-rule"): {},
+    ("GET", "/api/v1/participants/{code}/policies/{policy_id}/threshold-rule/sheet"): {},
     ("POST", "/participants/{code}/policies/{policy_id}/retire"): {"data": {"reason": "worn out"}},
     ("GET", "/participants/{code}/policies/{policy_id}/bundle"): {},
     ("GET", "/api/v1/policies/{policy_id}/port-checks/{check_id}/page"): {},
@@ -119,8 +127,12 @@ def clinician(client_as: Callable[[str], TestClient]) -> TestClient:
 
 
 @pytest.fixture
-def both(client: TestClient, clinician: TestClient, sign_plan: Callable[..., Any]) -> tuple[Ids, Ids]:
-    return study_world(client, "P1", 1, sign_plan), study_world(client, "P2", 2, sign_plan)
+def both(client: TestClient, clinician: TestClient, sign_plan: Callable[..., Any], db: Session) -> tuple[Ids, Ids]:
+    found = study_world(client, "P1", 1, sign_plan), study_world(client, "P2", 2, sign_plan)
+    for one in found:
+        add_found_rule(db, db.get_one(Policy, one["policy_id"]), 1)
+    db.commit()
+    return found
 
 
 def test_every_route_with_two_ids_refuses_another_participants(

@@ -21,7 +21,7 @@ from sqlalchemy.orm import Session
 
 from app.platform.jobs.registry import Priority
 
-PROTOCOL = 4
+PROTOCOL = 5
 """Version of the job protocol. Raise it when orchestrations change the keys of their steps, the meaning of recorded results or the params
 of a kind. A worker runs jobs of its own protocol, and adopts those of older ones that no live worker speaks.
 """

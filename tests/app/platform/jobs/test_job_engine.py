@@ -147,7 +147,7 @@ def test_params_of_a_kind_change_with_the_protocol():
         name: kind.params.model_json_schema() for name, kind in sorted(registry.kinds().items()) if kind.orchestration.startswith("app.")
     }
     digest = hashlib.sha256(json.dumps(schemas, sort_keys=True).encode()).hexdigest()[:12]
-    assert (engine.PROTOCOL, digest) == (4, "62ab31bfbb7e"), (
+    assert (engine.PROTOCOL, digest) == (5, "08dd74d3f1c7"), (
         "a worker of before cannot run these params: raise engine.PROTOCOL, and note both here"
     )
 
