@@ -36,7 +36,8 @@ def look(part: str, what: str, release: str | None = None, file: Path = FILE) ->
             raise LookError("part C is run once, before a release: name it with --release VERSION, or take --part A")
         if any(seen["release"] == release for seen in known["C"]):
             raise LookError(f"part C has been run for release {release}; it can be run once more for another release only")
-    known[part].append({"what": what, "release": release})
+    anywhere = " ".join("FOLDER" if word.startswith("/") else word for word in what.split(" "))  # a path says nothing to other machines
+    known[part].append({"what": anywhere, "release": release})
     file.write_text(json.dumps(known, indent=1) + "\n")
 
 

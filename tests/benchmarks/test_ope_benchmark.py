@@ -90,6 +90,8 @@ def test_looks_at_b_and_c_are_counted_and_c_is_run_once_per_release(module, tmp_
     with pytest.raises(looks.LookError, match=r"release 1\.0"):
         looks.look("C", "c", "1.0", file=file)
     assert looks.said(file) == "part B has been looked at 2 times; part C has been looked at 1 time"
+    looks.look("B", f"ope.py --part B --out {tmp_path}", file=file)
+    assert looks.counts(file)["B"][-1]["what"] == "ope.py --part B --out FOLDER"
 
 
 def test_the_count_in_the_repository_can_be_read(module):
