@@ -301,11 +301,11 @@ def setting_rows(rule: ThresholdRule, result: dict[str, Any], own_unit: bool) ->
     rows += [
         ("onset_s", "Upper threshold onset", seconds(rule.onset_s), "", onset),
         ("termination_s", "Lower threshold onset (termination)", seconds(rule.termination_s), "", onset),
-        ("ramp_up_s", "Transition up, lower to upper limit", f"{seconds(rule.ramp_up_s)} ({ma(rule.up_ma_per_s)} mA/s)", "", ramp),
+        ("ramp_up_s", "Transition up, lower to upper limit", seconds(rule.ramp_up_s), "", ramp),
         (
             "ramp_down_s",
             "Transition down, upper to lower limit",
-            f"{seconds(rule.ramp_down_s)} ({ma(rule.down_ma_per_s)} mA/s)",
+            seconds(rule.ramp_down_s),
             "",
             ramp,
         ),

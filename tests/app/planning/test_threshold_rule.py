@@ -58,6 +58,7 @@ def test_a_rule_is_found_shown_checked_and_printed(client: TestClient, db: Sessi
     # beta of a table is no power of the device: no number may be typed in
     assert not sheet["thresholds_in_device_unit"]
     values = {s["name"]: s["value"] for s in sheet["settings"]}
+    assert not any("(0 mA" in value for value in values.values()), "a slow ramp is no ramp of 0"
     assert values["upper_threshold"].startswith("set in clinic")
     assert any("must be set in clinic" in text for text in sheet["warnings"])
     assert values["upper_ma"] == f"{rule['upper_ma']:.1f}"
